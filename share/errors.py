@@ -1,0 +1,31 @@
+"""Errors that reach a person. One place (`share.cli.main`) turns them into a line and an exit code."""
+
+from __future__ import annotations
+
+
+class ShareError(Exception):
+    """A failure that can be said in one line: what is wrong and how to mend it. Exit code 1."""
+
+    exit_code = 1
+
+
+class UsageError(ShareError):
+    """What the user typed or pointed at cannot be used (no such folder, bad address). Exit code 2."""
+
+    exit_code = 2
+
+
+class ConfigError(UsageError):
+    """A configuration or calibration file says something that SHARE does not understand."""
+
+
+class DataError(ShareError):
+    """A recording is damaged or does not fit its calibration."""
+
+
+class WireError(ShareError):
+    """Bytes from a peer that are not a valid message. Counted by the receiver, never fatal."""
+
+
+class TransportError(ShareError):
+    """A socket cannot be opened or used (port in use, address not local)."""

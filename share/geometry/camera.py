@@ -1,0 +1,158 @@
+"""Pinhole cameras with radial-tangential distortion, and the rig that holds them.
+
+Pixel centres are at integers: the centre of the top-left pixel is (0, 0). Distortion is OpenCV's
+plumb-bob model k1 k2 p1 p2 [k3] (Brown 1966), Kalibr's `radtan` and EuRoC's `radial-tangential`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.types import F64, checked_pose
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics in pixels; `distortion` is () or (k1, k2, p1, p2) or (k1, k2, p1, p2, k3)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.width <= 0 or self.height <= 0:
+            raise ValueError(f"resolution: {self.width}x{self.height} is not positive")
+        if not (self.fx > 0 and self.fy > 0):
+            raise ValueError(f"intrinsics: focal lengths {self.fx}, {self.fy} must be positive")
+        if len(self.distortion) not in (0, 4, 5):
+            raise ValueError(f"distortion: {len(self.distortion)} coefficients, expected 0, 4 or 5")
+        if not np.isfinite([self.fx, self.fy, self.cx, self.cy, *self.distortion]).all():
+            raise ValueError("intrinsics: has values that are not finite")
+
+    @property
+    def K(self) -> F64:
+        """The 3x3 matrix of intrinsics."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    @property
+    def focal(self) -> float:
+        """Mean focal length, px: turns an error in normalised coordinates into pixels."""
+        return (self.fx + self.fy) / 2
+
+    def project(self, points: F64) -> F64:
+        """Points (..., 3) in the camera frame -> pixels (..., 2). Behind the camera gives NaN."""
+        z = np.where(points[..., 2:] > 1e-6, points[..., 2:], np.nan)
+        return self.distort(points[..., :2] / z)
+
+    def distort(self, uv: F64) -> F64:
+        """Normalised coordinates (..., 2) -> pixels (..., 2)."""
+        if self.distortion:
+            uv = self._radtan(uv)
+        return uv * (self.fx, self.fy) + (self.cx, self.cy)
+
+    def normalise(self, px: F64) -> F64:
+        """Pixels (..., 2) -> undistorted normalised coordinates (x/z, y/z), to 1e-9 inside the image."""
+        observed = (px - (self.cx, self.cy)) / (self.fx, self.fy)
+        if not self.distortion:
+            return observed
+        uv = observed.copy()
+        for _ in range(8):  # Newton on the 2x2 system; converges quadratically inside the image
+            J = self._radtan_jacobian(uv)
+            r = observed - self._radtan(uv)
+            det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+            uv[..., 0] += (J[..., 1, 1] * r[..., 0] - J[..., 0, 1] * r[..., 1]) / det
+            uv[..., 1] += (J[..., 0, 0] * r[..., 1] - J[..., 1, 0] * r[..., 0]) / det
+            if np.nanmax(np.abs(r), initial=0.0) < 1e-12:
+                break
+        return uv
+
+    def inside(self, px: F64, border: float = 0.0) -> np.ndarray:
+        """Which pixels (..., 2) lie in the image, at least `border` px from its edge."""
+        upper = (self.width - 1 - border, self.height - 1 - border)
+        return np.asarray(((px >= border) & (px <= upper)).all(axis=-1))
+
+    def _coefficients(self) -> tuple[float, float, float, float, float]:
+        k1, k2, p1, p2, *k3 = self.distortion
+        return k1, k2, p1, p2, k3[0] if k3 else 0.0
+
+    def _radtan(self, uv: F64) -> F64:
+        k1, k2, p1, p2, k3 = self._coefficients()
+        x, y = uv[..., 0], uv[..., 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        return np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ],
+            axis=-1,
+        )
+
+    def _radtan_jacobian(self, uv: F64) -> F64:
+        """d(distorted)/d(undistorted), (..., 2, 2)."""
+        k1, k2, p1, p2, k3 = self._coefficients()
+        x, y = uv[..., 0], uv[..., 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # d(radial)/d(r2) * 2, so d/dx = slope * x
+        J = np.empty((*uv.shape, 2))
+        J[..., 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+        J[..., 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+        J[..., 0, 1] = J[..., 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
+        return J
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Continuous-time noise: densities in rad/s/sqrt(Hz), m/s^2/sqrt(Hz); walks per Kalibr."""
+
+    gyro_density: float
+    accel_density: float
+    gyro_walk: float
+    accel_walk: float
+    rate_hz: float
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """All cameras of one agent in its body frame (the IMU's; cam0's where there is no IMU).
+
+    cam1 makes it stereo, depth makes it RGB-D; a depth camera need not be registered to cam0.
+    """
+
+    cam0: Camera
+    T_body_cam0: F64
+    cam1: Camera | None = None
+    T_cam1_cam0: F64 | None = None
+    depth: Camera | None = None
+    T_depth_cam0: F64 | None = None
+    imu: ImuNoise | None = None
+
+    def __post_init__(self) -> None:
+        if (self.cam1 is None) != (self.T_cam1_cam0 is None):
+            raise ValueError("cam1: needs its extrinsics T_cam1_cam0, and the other way round")
+        if (self.depth is None) != (self.T_depth_cam0 is None):
+            raise ValueError("depth: needs its extrinsics T_depth_cam0, and the other way round")
+        for name in ("T_body_cam0", "T_cam1_cam0", "T_depth_cam0"):
+            T = getattr(self, name)
+            if T is not None:
+                object.__setattr__(self, name, checked_pose(name, T))
+
+    @property
+    def kind(self) -> str:
+        """`stereo`, `rgbd` or `mono`, with `+imu` where there is one."""
+        eyes = "stereo" if self.cam1 else "rgbd" if self.depth else "mono"
+        return eyes + ("+imu" if self.imu else "")
+
+    @property
+    def baseline(self) -> float:
+        """Distance of cam0 and cam1, m; 0 without cam1."""
+        return (
+            0.0 if self.T_cam1_cam0 is None else float(np.linalg.norm(se3.inverse(self.T_cam1_cam0)[:3, 3]))
+        )

@@ -1,0 +1,164 @@
+"""SO(3) and SE(3) as plain matrices, vectorised over leading axes.
+
+Tangent vectors are xi = (phi, rho): rotation [rad] first, then translation [m]. Perturbations are
+on the right: T = T_mean Exp(xi), so a covariance lives in the frame on the right (the body of
+`T_odom_body`). Source: Barfoot, *State Estimation for Robotics* (2017), ch. 7; Sola et al., *A
+micro Lie theory* (2018).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from share.types import F64
+
+_SMALL = 1e-6  # rad; below, Taylor series replace sin(x)/x and its kin
+
+
+def hat(v: F64) -> F64:
+    """Cross-product matrix: (..., 3) -> (..., 3, 3) with hat(v) w = v x w."""
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    out[..., 0, 1], out[..., 0, 2] = -z, y
+    out[..., 1, 0], out[..., 1, 2] = z, -x
+    out[..., 2, 0], out[..., 2, 1] = -y, x
+    return out
+
+
+def _coefficients(phi: F64) -> tuple[F64, F64, F64]:
+    """sin(a)/a, (1 - cos a)/a^2, (a - sin a)/a^3 for a = |phi|, each (..., 1, 1)."""
+    a = np.linalg.norm(phi, axis=-1)[..., None, None]
+    small = a < _SMALL
+    s = np.where(small, 1.0, a)
+    return (
+        np.where(small, 1 - a**2 / 6, np.sin(s) / s),
+        np.where(small, 0.5 - a**2 / 24, (1 - np.cos(s)) / s**2),
+        np.where(small, 1 / 6 - a**2 / 120, (s - np.sin(s)) / s**3),
+    )
+
+
+def so3_exp(phi: F64) -> F64:
+    """Rodrigues' formula: (..., 3) rad -> (..., 3, 3)."""
+    A, B, _ = _coefficients(phi)
+    K = hat(phi)
+    return np.eye(3) + A * K + B * (K @ K)
+
+
+def so3_log(R: F64) -> F64:
+    """Inverse of `so3_exp`, angle in [0, pi]: (..., 3, 3) -> (..., 3). Goes by the quaternion, so
+    that it is exact near pi too."""
+    q = quat_from_matrix(R)
+    q = np.where(q[..., 3:] < 0, -q, q)
+    n = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    scale = np.where(n < 1e-9, 2.0, 2 * np.arctan2(n, q[..., 3:]) / np.maximum(n, 1e-300))
+    return scale * q[..., :3]
+
+
+def so3_right_jacobian(phi: F64) -> F64:
+    """Jr with Exp(phi + d) = Exp(phi) Exp(Jr d) to first order: (..., 3) -> (..., 3, 3)."""
+    _, B, C = _coefficients(phi)
+    K = hat(phi)
+    return np.eye(3) - B * K + C * (K @ K)
+
+
+def quat_from_matrix(R: F64) -> F64:
+    """Unit quaternions (..., 4), order x y z w, of rotations (..., 3, 3).
+
+    The eigenvector form of Bar-Itzhack (2000): no branch on the trace, well-conditioned everywhere.
+    """
+    m = R
+    K = np.empty((*R.shape[:-2], 4, 4))
+    K[..., 0, 0] = m[..., 0, 0] - m[..., 1, 1] - m[..., 2, 2]
+    K[..., 1, 1] = m[..., 1, 1] - m[..., 0, 0] - m[..., 2, 2]
+    K[..., 2, 2] = m[..., 2, 2] - m[..., 0, 0] - m[..., 1, 1]
+    K[..., 3, 3] = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    K[..., 0, 1] = K[..., 1, 0] = m[..., 0, 1] + m[..., 1, 0]
+    K[..., 0, 2] = K[..., 2, 0] = m[..., 0, 2] + m[..., 2, 0]
+    K[..., 1, 2] = K[..., 2, 1] = m[..., 1, 2] + m[..., 2, 1]
+    K[..., 0, 3] = K[..., 3, 0] = m[..., 2, 1] - m[..., 1, 2]
+    K[..., 1, 3] = K[..., 3, 1] = m[..., 0, 2] - m[..., 2, 0]
+    K[..., 2, 3] = K[..., 3, 2] = m[..., 1, 0] - m[..., 0, 1]
+    q: F64 = np.linalg.eigh(K)[1][..., :, -1]
+    return np.where(q[..., 3:] < 0, -q, q)
+
+
+def matrix_from_quat(q: F64) -> F64:
+    """Rotations (..., 3, 3) of quaternions (..., 4) in order x y z w, normalised here."""
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    K = hat(q[..., :3])
+    return np.eye(3) + 2 * (q[..., 3, None, None] * K + K @ K)
+
+
+def compose(R: F64, t: F64) -> F64:
+    """(..., 3, 3) and (..., 3) -> (..., 4, 4)."""
+    T = np.zeros((*R.shape[:-2], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
+    return T
+
+
+def from_quat(t: F64, q: F64) -> F64:
+    """Positions (..., 3) and quaternions (..., 4, xyzw) -> (..., 4, 4)."""
+    return compose(matrix_from_quat(q), t)
+
+
+def inverse(T: F64) -> F64:
+    """T_b_a of T_a_b: (..., 4, 4)."""
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    return compose(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
+
+
+def exp(xi: F64) -> F64:
+    """(..., 6) -> (..., 4, 4)."""
+    phi, rho = xi[..., :3], xi[..., 3:]
+    _, B, C = _coefficients(phi)
+    K = hat(phi)
+    V = np.eye(3) + B * K + C * (K @ K)
+    return compose(so3_exp(phi), (V @ rho[..., None])[..., 0])
+
+
+def log(T: F64) -> F64:
+    """(..., 4, 4) -> (..., 6)."""
+    phi = so3_log(T[..., :3, :3])
+    _, B, C = _coefficients(phi)
+    K = hat(phi)
+    V = np.eye(3) + B * K + C * (K @ K)
+    rho = np.linalg.solve(V, T[..., :3, 3, None])[..., 0]
+    return np.concatenate([phi, rho], axis=-1)
+
+
+def adjoint(T: F64) -> F64:
+    """Ad with T Exp(xi) = Exp(Ad xi) T: (..., 4, 4) -> (..., 6, 6)."""
+    R = T[..., :3, :3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., 3:, :3] = hat(T[..., :3, 3]) @ R
+    return out
+
+
+def compose_cov(T_b_c: F64, cov_a_b: F64, cov_b_c: F64) -> F64:
+    """Covariance of T_a_b T_b_c, the two being independent (Barfoot eq. 7.286, right form)."""
+    Ad = adjoint(inverse(T_b_c))
+    return Ad @ cov_a_b @ np.swapaxes(Ad, -1, -2) + cov_b_c
+
+
+def inverse_cov(T_a_b: F64, cov: F64) -> F64:
+    """Covariance of T_b_a given that of T_a_b."""
+    Ad = adjoint(T_a_b)
+    return Ad @ cov @ np.swapaxes(Ad, -1, -2)
+
+
+def transform(T: F64, points: F64) -> F64:
+    """Points (..., 3) in frame b -> frame a by T_a_b (4, 4)."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def angle(R: F64) -> F64:
+    """Rotation angle [rad] of (..., 3, 3) or (..., 4, 4)."""
+    out: F64 = np.linalg.norm(so3_log(R[..., :3, :3]), axis=-1)
+    return out
+
+
+def orthonormal(T: F64) -> F64:
+    """The rigid transform nearest to T (..., 4, 4): removes drift of repeated products."""
+    U, _, Vt = np.linalg.svd(T[..., :3, :3])
+    return compose(U @ Vt, T[..., :3, 3])

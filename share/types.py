@@ -1,0 +1,205 @@
+"""The frozen values that every layer speaks. Frames and units follow docs/architecture.md.
+
+Arrays are validated for shape and dtype and made read-only on construction, so a value can be
+handed to another thread without a copy. Poses are 4x4 matrices `T_a_b` with p_a = T_a_b p_b;
+covariances are 6x6 over (rotation [rad], translation [m]), perturbed on the right:
+T = T_mean Exp(xi) (see `share.geometry.se3`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
+I64 = NDArray[np.int64]
+
+DESCRIPTOR_BYTES = 32  # ORB: 256 bits
+MAX_KEYPOINTS = 2000  # per keyframe; bounds what a peer can make us allocate
+
+
+class AgentKind(StrEnum):
+    """Who is served: a headset wearer notices 20 ms of lag, a robot does not."""
+
+    AR = "ar"
+    ROBOT = "robot"
+
+
+class TrackState(StrEnum):
+    """What an agent knows of its own pose. Only OK, WEAK, VISION_ONLY and INERTIAL_ONLY carry one."""
+
+    INITIALISING = "INITIALISING"
+    OK = "OK"
+    WEAK = "WEAK"
+    LOST = "LOST"
+    VISION_ONLY = "VISION_ONLY"
+    INERTIAL_ONLY = "INERTIAL_ONLY"
+
+    @property
+    def has_pose(self) -> bool:
+        return self not in (TrackState.INITIALISING, TrackState.LOST)
+
+
+def checked(
+    name: str, value: ArrayLike, shape: tuple[int | None, ...], dtype: DTypeLike, finite: bool = True
+) -> NDArray[Any]:
+    """`value` as a read-only array of `dtype`; None in `shape` admits any length.
+
+    Raises ValueError naming the field if the shape differs or (unless `finite=False`) a value is
+    not finite.
+    """
+    array = np.asarray(value, dtype)
+    if len(array.shape) != len(shape) or any(
+        want is not None and have != want for have, want in zip(array.shape, shape, strict=True)
+    ):
+        raise ValueError(f"{name}: shape {array.shape}, expected {shape}")
+    if finite and array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError(f"{name}: has values that are not finite")
+    array = array.view()
+    array.flags.writeable = False
+    return array
+
+
+def checked_pose(name: str, value: ArrayLike) -> F64:
+    """`value` as a read-only rigid transform (4, 4). Raises ValueError if it is not one (1e-3)."""
+    T = checked(name, value, (4, 4), np.float64)
+    R = T[:3, :3]
+    if (
+        np.abs(R @ R.T - np.eye(3)).max() > 1e-3
+        or np.linalg.det(R) < 0
+        or np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-9
+    ):
+        raise ValueError(f"{name}: is not a rigid transform")
+    return T
+
+
+def _set(obj: object, **values: object) -> None:
+    """Replace fields of a frozen dataclass during its own __post_init__."""
+    for key, value in values.items():
+        object.__setattr__(obj, key, value)
+
+
+@dataclass(frozen=True, eq=False)
+class ImuBatch:
+    """Consecutive IMU samples: stamps (N,) ns, gyro (N, 3) rad/s, accel (N, 3) m/s^2, body frame."""
+
+    stamps_ns: I64
+    gyro: F64
+    accel: F64
+
+    def __post_init__(self) -> None:
+        n = len(self.stamps_ns)
+        _set(
+            self,
+            stamps_ns=checked("stamps_ns", self.stamps_ns, (n,), np.int64),
+            gyro=checked("gyro", self.gyro, (n, 3), np.float64),
+            accel=checked("accel", self.accel, (n, 3), np.float64),
+        )
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @staticmethod
+    def empty() -> ImuBatch:
+        return ImuBatch(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One moment of all cameras, and the IMU samples in (previous frame, this frame].
+
+    image0, image1: (H, W) uint8. depth: (Hd, Wd) float32 m in the depth camera, 0 = no reading.
+    gap_ns: time since the previous frame where that is longer than the stream's rate explains, else 0.
+    """
+
+    stamp_ns: int
+    index: int
+    image0: U8
+    image1: U8 | None = None
+    depth: F32 | None = None
+    imu: ImuBatch = field(default_factory=ImuBatch.empty)
+    gap_ns: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What one camera image looks like to another agent: enough to recognise and verify a place.
+
+    uv (N, 2) float32: undistorted normalised coordinates (x/z, y/z) in cam0. points (N, 3)
+    float32: m, in cam0, NaN rows where depth is unknown. descriptors (N, 32) uint8: ORB.
+    """
+
+    uv: F32
+    points: F32
+    descriptors: U8
+
+    def __post_init__(self) -> None:
+        n = len(self.uv)
+        if n > MAX_KEYPOINTS:
+            raise ValueError(f"uv: {n} keypoints, at most {MAX_KEYPOINTS}")
+        _set(
+            self,
+            uv=checked("uv", self.uv, (n, 2), np.float32),
+            points=checked("points", self.points, (n, 3), np.float32, finite=False),
+            descriptors=checked("descriptors", self.descriptors, (n, DESCRIPTOR_BYTES), np.uint8),
+        )
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """What an agent sends: where it was, relative to its previous sent keyframe, and what it saw.
+
+    id: per agent run, rising from 0. reference: id of the sent keyframe that T_ref_body (4, 4) and
+    its covariance (6, 6) are relative to, or -1: then T_ref_body is T_odom_body and a new stretch
+    of odometry begins. up (3,): unit vector against gravity in the body frame, zeros if unknown.
+    """
+
+    id: int
+    reference: int
+    stamp_ns: int
+    T_ref_body: F64
+    cov: F64
+    up: F64
+    view: View
+
+    def __post_init__(self) -> None:
+        if not -1 <= self.reference < self.id:
+            raise ValueError(f"reference: {self.reference} must lie in -1 .. {self.id - 1}")
+        _set(
+            self,
+            T_ref_body=checked_pose("T_ref_body", self.T_ref_body),
+            cov=checked("cov", self.cov, (6, 6), np.float64),
+            up=checked("up", self.up, (3,), np.float64),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """The edge's word on where an agent's odometry lies in the shared map.
+
+    map_id: names the map; a pose is comparable only with poses in the same map. revision: rises
+    with every correction to this agent. answers: id of the agent's keyframe that led to it, or -1
+    when another agent's did.
+    """
+
+    T_map_odom: F64
+    cov: F64
+    map_id: str
+    revision: int
+    answers: int = -1
+
+    def __post_init__(self) -> None:
+        _set(
+            self,
+            T_map_odom=checked_pose("T_map_odom", self.T_map_odom),
+            cov=checked("cov", self.cov, (6, 6), np.float64),
+        )
