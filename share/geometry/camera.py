@@ -153,6 +153,4 @@ class Rig:
     @property
     def baseline(self) -> float:
         """Distance of cam0 and cam1, m; 0 without cam1."""
-        return (
-            0.0 if self.T_cam1_cam0 is None else float(np.linalg.norm(se3.inverse(self.T_cam1_cam0)[:3, 3]))
-        )
+        return 0.0 if self.T_cam1_cam0 is None else float(np.linalg.norm(self.T_cam1_cam0[:3, 3]))
