@@ -1,0 +1,63 @@
+"""Truth at the stamps of an estimate. A trajectory is (stamps_ns (N,) int64 rising, T (N, 4, 4))."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from share.errors import DataError
+from share.geometry.se3 import compose, so3_exp, so3_log
+from share.types import F64, I64
+
+Trajectory = tuple[I64, F64]
+
+MAX_GAP_NS = 100_000_000  # truth is never interpolated across more than this; room truth comes at >= 20 Hz
+
+
+def associate(estimate: Trajectory, truth: Trajectory, max_gap_ns: int = MAX_GAP_NS) -> tuple[I64, F64, F64]:
+    """(stamps_ns, T_estimate, T_truth) at every stamp of the estimate where the truth is known.
+
+    Known is: at a sample of the truth, or between two that are at most `max_gap_ns` apart; never
+    outside its span. Raises ValueError where a trajectory is not one (shapes, stamps not rising).
+    """
+    stamps, T_estimate = _checked("estimate", estimate)
+    truth_ns, T_truth = _checked("truth", truth)
+    known, T = interpolate(truth_ns, T_truth, stamps, max_gap_ns)
+    return stamps[known], T_estimate[known], T
+
+
+def interpolate(stamps_ns: I64, T: F64, at_ns: I64, max_gap_ns: int = MAX_GAP_NS) -> tuple[np.ndarray, F64]:
+    """(known (M,) bool, poses (K, 4, 4) at the K known of the M stamps `at_ns`).
+
+    Position on the straight line between two samples, rotation on the great arc (slerp).
+    """
+    if len(stamps_ns) == 0:
+        return np.zeros(len(at_ns), bool), np.zeros((0, 4, 4))
+    right = np.searchsorted(stamps_ns, at_ns, side="left").clip(0, len(stamps_ns) - 1)
+    exact = stamps_ns[right] == at_ns
+    left = np.where(exact, right, right - 1).clip(0)
+    inside = (stamps_ns[left] <= at_ns) & (at_ns <= stamps_ns[right])
+    known = inside & (stamps_ns[right] - stamps_ns[left] <= max_gap_ns)
+    a, b, at_ns = left[known], right[known], at_ns[known]
+    step = np.maximum(stamps_ns[b] - stamps_ns[a], 1)
+    u = ((at_ns - stamps_ns[a]) / step)[:, None]
+    Ra, Rb, ta, tb = T[a, :3, :3], T[b, :3, :3], T[a, :3, 3], T[b, :3, 3]
+    phi = so3_log(np.swapaxes(Ra, -1, -2) @ Rb)
+    return known, compose(Ra @ so3_exp(u * phi), (1 - u) * ta + u * tb)
+
+
+def require(n: int, least: int, what: str) -> None:
+    """Raises DataError where fewer than `least` associated poses leave nothing to measure."""
+    if n < least:
+        raise DataError(
+            f"{what}: {n} poses of the estimate have a truth at their time, at least {least} are needed; "
+            "check that both use the same clock"
+        )
+
+
+def _checked(name: str, trajectory: Trajectory) -> Trajectory:
+    stamps, T = np.asarray(trajectory[0], np.int64), np.asarray(trajectory[1], np.float64)
+    if stamps.ndim != 1 or T.shape != (len(stamps), 4, 4):
+        raise ValueError(f"{name}: stamps {stamps.shape} and poses {T.shape}, expected (N,) and (N, 4, 4)")
+    if (np.diff(stamps) <= 0).any():
+        raise ValueError(f"{name}: stamps do not rise")
+    return stamps, T

@@ -1,0 +1,95 @@
+"""Absolute trajectory error: how far the estimate lies from the truth, once laid over it.
+
+Source: Sturm et al., *A Benchmark for the Evaluation of RGB-D SLAM Systems*, IROS 2012, eq. 3;
+Zhang & Scaramuzza, *A Tutorial on Quantitative Trajectory Evaluation*, IROS 2018. Protocol:
+docs/evaluation.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from share.geometry.align import umeyama
+from share.geometry.se3 import inverse, transform
+from share.metrics.association import MAX_GAP_NS, Trajectory, associate, require
+from share.metrics.spread import Spread, spread
+from share.types import F64
+
+Alignment = Literal["se3", "origin", "none"]
+
+_LEAST = {"se3": 3, "origin": 1, "none": 1}  # associated poses without which there is no alignment
+
+
+@dataclass(frozen=True, eq=False)
+class Ate:
+    """Position errors in m under the alignment T_truth_est (4, 4): p_truth ~ T_truth_est p_est."""
+
+    rmse: float
+    mean: float
+    median: float
+    max: float
+    n: int
+    T_truth_est: F64
+
+
+@dataclass(frozen=True, eq=False)
+class JointAte:
+    """Of all agents' frames together, and of each agent, all under the one alignment of `joint`."""
+
+    joint: Ate
+    agents: dict[str, Ate]
+
+
+def ate(
+    estimate: Trajectory,
+    truth: Trajectory,
+    alignment: Alignment = "se3",
+    max_gap_ns: int = MAX_GAP_NS,
+) -> Ate:
+    """ATE of one trajectory. `se3`: least squares over all positions; `origin`: first poses made
+    equal; `none`: as given. Raises DataError where too few poses have a truth at their time."""
+    _, T_est, T_truth = associate(estimate, truth, max_gap_ns)
+    require(len(T_est), _LEAST[alignment], "ATE")
+    T = _align(T_est, T_truth, alignment)
+    return _ate(spread(_errors(T, T_est, T_truth)), T)
+
+
+def joint_ate(
+    pairs: Mapping[str, tuple[Trajectory, Trajectory]],
+    alignment: Literal["se3", "none"] = "se3",
+    max_gap_ns: int = MAX_GAP_NS,
+) -> JointAte:
+    """ATE of agents in one map: {name: (estimate, truth)}, one alignment over all their frames.
+
+    An agent that was joined wrongly therefore shows. One without an associated pose is left out of
+    `agents`. Raises DataError where all together are too few.
+    """
+    associated = {name: associate(*pair, max_gap_ns)[1:] for name, pair in pairs.items()}
+    associated = {name: pair for name, pair in associated.items() if len(pair[0])}
+    require(sum(len(T) for T, _ in associated.values()), _LEAST[alignment], "joint ATE")
+    all_est, all_truth = (np.concatenate(side) for side in zip(*associated.values(), strict=True))
+    T = _align(all_est, all_truth, alignment)
+    agents = {name: _ate(spread(_errors(T, *pair)), T) for name, pair in associated.items()}
+    return JointAte(_ate(spread(_errors(T, all_est, all_truth)), T), agents)
+
+
+def _align(T_est: F64, T_truth: F64, alignment: Alignment) -> F64:
+    if alignment == "se3":
+        return umeyama(T_est[:, :3, 3], T_truth[:, :3, 3])
+    if alignment == "origin":
+        T: F64 = T_truth[0] @ inverse(T_est[0])
+        return T
+    return np.eye(4)
+
+
+def _errors(T: F64, T_est: F64, T_truth: F64) -> F64:
+    out: F64 = np.linalg.norm(transform(T, T_est[:, :3, 3]) - T_truth[:, :3, 3], axis=1)
+    return out
+
+
+def _ate(s: Spread, T: F64) -> Ate:
+    return Ate(s.rmse, s.mean, s.median, s.max, s.n, T)

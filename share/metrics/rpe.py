@@ -1,0 +1,72 @@
+"""Relative pose error: drift over one frame, or over a stretch of time.
+
+Source: Sturm et al., IROS 2012, eq. 1-2: E = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j) for truth Q, estimate P.
+Needs no alignment. Protocol: docs/evaluation.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.errors import DataError
+from share.geometry.se3 import angle, inverse
+from share.metrics.association import MAX_GAP_NS, Trajectory, associate
+from share.metrics.spread import Spread, spread
+from share.types import F64, I64
+
+
+@dataclass(frozen=True)
+class Rpe:
+    """translation in m, rotation in rad, over the same pairs of poses."""
+
+    translation: Spread
+    rotation: Spread
+
+
+def rpe_frames(
+    estimate: Trajectory, truth: Trajectory, max_step_ns: int = 200_000_000, max_gap_ns: int = MAX_GAP_NS
+) -> Rpe:
+    """RPE from each frame to the next. A step longer than `max_step_ns` (lost, no truth) is left out.
+
+    Raises DataError where no pair is left.
+    """
+    stamps, T_est, T_truth = associate(estimate, truth, max_gap_ns)
+    i = np.flatnonzero(np.diff(stamps) <= max_step_ns)
+    return _rpe(T_est, T_truth, i, i + 1, "between frames")
+
+
+def rpe_time(
+    estimate: Trajectory,
+    truth: Trajectory,
+    delta_ns: int = 1_000_000_000,
+    tolerance_ns: int = 20_000_000,
+    max_gap_ns: int = MAX_GAP_NS,
+) -> Rpe:
+    """RPE from each frame to the frame nearest to `delta_ns` later, at most `tolerance_ns` off.
+
+    Raises DataError where no pair is left.
+    """
+    stamps, T_est, T_truth = associate(estimate, truth, max_gap_ns)
+    if len(stamps) == 0:
+        raise DataError("RPE: no pose of the estimate has a truth at its time")
+    j = _nearest(stamps, stamps + delta_ns)
+    i = np.flatnonzero(np.abs(stamps[j] - stamps - delta_ns) <= tolerance_ns)
+    return _rpe(T_est, T_truth, i, j[i], f"over {delta_ns / 1e9:g} s")
+
+
+def _nearest(stamps: I64, at: I64) -> I64:
+    right = np.searchsorted(stamps, at).clip(0, len(stamps) - 1)
+    left = (right - 1).clip(0)
+    out: I64 = np.where(np.abs(stamps[left] - at) <= np.abs(stamps[right] - at), left, right)
+    return out
+
+
+def _rpe(T_est: F64, T_truth: F64, i: I64, j: I64, what: str) -> Rpe:
+    if len(i) == 0:
+        raise DataError(f"RPE {what}: no pair of poses of the estimate has a truth at both times")
+    moved_est = inverse(T_est[i]) @ T_est[j]
+    moved_truth = inverse(T_truth[i]) @ T_truth[j]
+    E = inverse(moved_truth) @ moved_est
+    return Rpe(spread(np.linalg.norm(E[:, :3, 3], axis=1)), spread(angle(E)))

@@ -1,0 +1,29 @@
+import json
+import math
+
+import numpy as np
+import pytest
+
+from share.metrics.latency import latency, summary
+
+
+def test_mean_is_over_the_multiset_of_both():
+    found = latency([5.0, 15.0, 25.0, 10.0], [math.nan, 100.0, math.nan, 45.0])
+    assert found.latency_ms.n == 6
+    assert found.latency_ms.mean == pytest.approx(200 / 6)
+    assert found.track_ms.mean == pytest.approx(55 / 4)
+    assert found.corrected_ms.n == 2
+    assert found.over_20ms == 0.25  # a late correction is not a late frame
+
+
+def test_percentiles():
+    s = summary(np.arange(101.0))
+    assert (s.n, s.p50, s.p95, s.p99, s.max) == (101, 50.0, 95.0, 99.0, 100.0)
+
+
+def test_nothing_is_null_in_json_and_nan_is_refused():
+    assert json.loads(json.dumps(summary([]).report(), allow_nan=False)) == {
+        "n": 0, "mean": None, "p50": None, "p95": None, "p99": None, "max": None
+    }  # fmt: skip
+    with pytest.raises(ValueError, match="finite"):
+        latency([1.0, math.nan], [])
