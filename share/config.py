@@ -29,9 +29,35 @@ class SequencerConfig:
 
 
 @dataclass(frozen=True)
+class TrackerConfig:
+    """Tracking by camera alone (`share.estimator.visual`)."""
+
+    corners: int = 250  # tracked at a time
+    spacing_px: float = 14.0  # between corners
+    view_features: int = 500  # ORB features of a keyframe
+    noise_px: float = 1.0  # of one tracked corner
+    ransac_px: float = 3.0
+    gate_sigma: float = 3.0  # an observation further off is an outlier
+    min_inliers: int = 15  # fewer: LOST
+    weak_inliers: int = 40  # fewer: WEAK
+    keyframe_m: float = 0.15  # a keyframe after this much motion,
+    keyframe_rad: float = 0.15
+    keyframe_tracked: float = 0.6  # or when fewer than this part of its points are left
+    keyframe_gap_s: float = 0.1  # but never sooner
+    max_keyframes: int = 60  # of the local map
+    reobserve_hosts: int = 6  # earlier keyframes whose points are looked for again
+    reobserve_m: float = 1.0
+    reobserve_rad: float = 0.5
+    new_stretch_s: float = 3.0  # LOST this long: odometry begins anew
+    max_speed_m_s: float = 5.0  # a pose that implies more is not believed
+    max_turn_rad_s: float = 12.0
+
+
+@dataclass(frozen=True)
 class Config:
     """The whole; one section per part."""
 
+    tracker: TrackerConfig = field(default_factory=TrackerConfig)
     sequencer: SequencerConfig = field(default_factory=SequencerConfig)
 
 

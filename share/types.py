@@ -155,6 +155,30 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
+class Candidate:
+    """A keyframe as the tracker offers it, before it is decided whether it is sent.
+
+    T_odom_body (4, 4). cov (6, 6): of the motion since the previous candidate. up (3,): unit
+    vector against gravity in the body frame, zeros if unknown. new_stretch: odometry broke before
+    this keyframe, so nothing relates it to the ones before.
+    """
+
+    T_odom_body: F64
+    cov: F64
+    up: F64
+    view: View
+    new_stretch: bool = False
+
+    def __post_init__(self) -> None:
+        _set(
+            self,
+            T_odom_body=checked_pose("T_odom_body", self.T_odom_body),
+            cov=checked("cov", self.cov, (6, 6), np.float64),
+            up=checked("up", self.up, (3,), np.float64),
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class Keyframe:
     """What an agent sends: where it was, relative to its previous sent keyframe, and what it saw.
 

@@ -1,0 +1,83 @@
+"""Pose of a camera from points whose place is known: consensus, then weighted least squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from share.geometry import se3
+from share.types import F64
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """T_cam_world (4, 4), its covariance (6, 6) perturbed on the right, and the inliers (N,) bool."""
+
+    T: F64
+    cov: F64
+    inliers: NDArray[np.bool_]
+
+
+def consensus(points: F64, uv: F64, focal: float, threshold_px: float, seed: int) -> PoseEstimate | None:
+    """RANSAC over minimal solutions (P3P, LO-RANSAC; poselib, Larsson 2020), None without a model.
+
+    points: (N, 3) m, world. uv: (N, 2) normalised. focal turns them into px for the threshold.
+    """
+    import poselib
+
+    if len(points) < 4:
+        return None
+    camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
+    options = {"max_reproj_error": threshold_px, "seed": seed, "max_iterations": 1000, "min_iterations": 20}
+    pose, info = poselib.estimate_absolute_pose(uv * focal, points, camera, options, {})
+    inliers = np.asarray(info["inliers"], bool)
+    if inliers.sum() < 4:
+        return None
+    T = se3.compose(np.asarray(pose.R), np.asarray(pose.t))
+    return PoseEstimate(T, np.eye(6), inliers)
+
+
+def refine(
+    T: F64, points: F64, uv: F64, focal: float, sigma_px: F64, gate_px: float, iterations: int = 8
+) -> PoseEstimate:
+    """Gauss-Newton on reprojection errors with Cauchy weights, from T_cam_world.
+
+    sigma_px (N,): standard deviation of each observation. Points that end further than `gate_px`
+    sigmas away are no inliers. The covariance is scaled by the inliers' own residuals, never
+    below what `sigma_px` promises.
+    """
+    scale = focal / sigma_px
+    for _ in range(iterations):
+        r, J = reprojection(T, points, uv, scale)
+        w = 1 / (1 + (r * r).sum(axis=1) / 4.0)  # Cauchy, 2 sigma
+        H = np.einsum("nij,n,nik->jk", J, w, J)
+        g = np.einsum("nij,n,ni->j", J, w, r)
+        step = -np.linalg.solve(H + 1e-9 * np.eye(6), g)
+        T = T @ se3.exp(step)
+        if np.abs(step).max() < 1e-7:
+            break
+    r, J = reprojection(T, points, uv, scale)
+    squared = (r * r).sum(axis=1)
+    inliers = squared < gate_px**2
+    H = np.einsum("nij,n,nik->jk", J, inliers.astype(float), J) + 1e-9 * np.eye(6)
+    excess = squared[inliers].mean() / 2 if inliers.any() else 1.0
+    return PoseEstimate(T, np.linalg.inv(H) * max(1.0, excess), inliers)
+
+
+def reprojection(T: F64, points: F64, uv: F64, scale: F64) -> tuple[F64, F64]:
+    """Residuals (N, 2) = scale (projection - uv), and d/d(xi) (N, 2, 6) for T Exp(xi).
+
+    With p_c = R p + t, T Exp(xi) moves it by R (rho - p x phi): dp_c = R [-hat(p) | I].
+    """
+    R = T[:3, :3]
+    p = points @ R.T + T[:3, 3]
+    iz = 1 / np.where(p[:, 2] > 1e-3, p[:, 2], 1e-3)
+    projected = p[:, :2] * iz[:, None]
+    D = np.zeros((len(p), 2, 3))
+    D[:, 0, 0] = D[:, 1, 1] = iz
+    D[:, :, 2] = -projected * iz[:, None]
+    DR = (D @ R) * scale[:, None, None]
+    J = np.concatenate([-DR @ se3.hat(points), DR], axis=2)
+    return (projected - uv) * scale[:, None], J

@@ -1,0 +1,245 @@
+"""Odometry by cameras alone: stereo or RGB-D. The fallback when an IMU dies, and the whole tracker
+where there is none.
+
+A frame's way: predict -> follow -> pose -> (keyframe: look again for old points -> refine -> add
+corners). Points keep the place that their first keyframe gave them; what holds drift down is that
+points of earlier keyframes are looked for again, by the patch that was seen first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from share.config import TrackerConfig
+from share.estimator import gravity, relocalise
+from share.estimator.localmap import LocalKeyframe, LocalMap
+from share.estimator.pose import PoseEstimate, consensus, refine
+from share.geometry import se3
+from share.geometry.camera import Rig
+from share.types import F32, F64, I64, U8, Candidate, Frame, TrackState
+from share.vision import corners, klt
+from share.vision.view import depth_at, make_view
+
+RESEMBLANCE = 0.8  # NCC below which a re-found patch is another thing
+
+
+@dataclass(frozen=True, eq=False)
+class TrackResult:
+    """What one frame came to. T_odom_body is None where there is no pose to be had."""
+
+    state: TrackState
+    T_odom_body: F64 | None
+    candidate: Candidate | None = None
+    points: int = 0  # inliers behind the pose
+
+
+@dataclass(frozen=True, eq=False)
+class _Tracks:
+    """Points of the local map seen in the last image: ids (N,), px (N, 2)."""
+
+    ids: I64
+    px: F32
+
+    def take(self, keep: NDArray[np.bool_]) -> _Tracks:
+        return _Tracks(self.ids[keep], self.px[keep])
+
+    def join(self, other: _Tracks) -> _Tracks:
+        return _Tracks(np.concatenate([self.ids, other.ids]), np.concatenate([self.px, other.px]))
+
+
+_NO_TRACKS = _Tracks(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+
+
+class VisualTracker:
+    """Feed frames in order to `track`. Deterministic: the same frames give the same poses."""
+
+    def __init__(self, rig: Rig, config: TrackerConfig, seed: int = 0) -> None:
+        if rig.cam1 is None and rig.depth is None:
+            raise ValueError("a camera alone gives no scale: stereo or depth is needed")
+        self._rig, self._config, self._seed = rig, config, seed
+        self._T_cam_body = se3.inverse(rig.T_body_cam0)
+        self._gravity = gravity.AtRest() if rig.imu else None
+        self._map = LocalMap(config.max_keyframes)
+        self._tracks = _NO_TRACKS
+        self._image: U8 | None = None
+        self._stamp_ns = 0
+        self._T_odom_cam: F64 | None = None  # last believed pose
+        self._velocity = np.zeros(6)  # body twist of the camera, rad/s and m/s
+        self._cov = np.zeros((6, 6))  # of the motion since the last keyframe, in the camera frame
+        self._keyframe_ns = self._seen_ns = 0
+        self._keyframe_tracks = 0
+        self._T_odom_keyframe = np.eye(4)
+        self._lost_since_ns: int | None = None
+
+    def track(self, frame: Frame) -> TrackResult:
+        """The pose of this frame, causal. Frames must come with rising stamps."""
+        if self._T_odom_cam is None:
+            result = self._start(frame)
+        elif self._lost_since_ns is not None:
+            result = self._recover(frame, self._T_odom_cam)
+        else:
+            result = self._follow(frame, self._T_odom_cam)
+        self._image, self._stamp_ns = frame.image0, frame.stamp_ns
+        return result
+
+    # ------------------------------------------------------------------ the usual frame
+
+    def _follow(self, frame: Frame, T_last: F64) -> TrackResult:
+        dt = (frame.stamp_ns - self._stamp_ns) * 1e-9
+        T_predicted = T_last @ se3.exp(self._velocity * dt)
+        tracks = self._find(frame.image0, T_predicted)
+        estimate, tracks = self._pose(tracks, T_predicted)
+        if estimate is None or not self._plausible(T_last, estimate, dt):
+            self._lost_since_ns, self._velocity = frame.stamp_ns, np.zeros(6)
+            return TrackResult(TrackState.LOST, None)
+        T_odom_cam = se3.inverse(estimate.T)
+        self._velocity = se3.log(se3.inverse(T_last) @ T_odom_cam) / dt
+        self._tracks, self._T_odom_cam = tracks, T_odom_cam
+        candidate = self._keyframe(frame) if self._wants_keyframe(frame, T_odom_cam) else None
+        return self._result(estimate, candidate)
+
+    def _find(self, image: U8, T_predicted: F64) -> _Tracks:
+        assert self._image is not None
+        rows = self._map.rows(self._tracks.ids)
+        tracks = self._tracks.take(rows >= 0)
+        expected = self._rig.cam0.project(
+            se3.transform(se3.inverse(T_predicted), self._map.points[rows[rows >= 0]])
+        )
+        guess = np.where(np.isnan(expected), tracks.px, expected).astype(np.float32)
+        px, found = klt.follow(self._image, image, tracks.px, guess)
+        return _Tracks(tracks.ids, px).take(found)
+
+    def _pose(
+        self, tracks: _Tracks, T_predicted: F64, threshold_px: float | None = None
+    ) -> tuple[PoseEstimate | None, _Tracks]:
+        """Pose T_cam_odom from tracks; the tracks that agree with it."""
+        config, focal = self._config, self._rig.cam0.focal
+        points = self._map.points[self._map.rows(tracks.ids)]
+        uv = self._rig.cam0.normalise(tracks.px.astype(np.float64))
+        first = consensus(points, uv, focal, threshold_px or config.ransac_px, self._seed)
+        if first is None or first.inliers.sum() < config.min_inliers:
+            return None, _NO_TRACKS
+        sigma = np.full(len(points), config.noise_px)
+        best = refine(first.T, points, uv, focal, sigma, config.gate_sigma)
+        if best.inliers.sum() < config.min_inliers:
+            return None, _NO_TRACKS
+        return best, tracks.take(best.inliers)
+
+    def _plausible(self, T_last: F64, estimate: PoseEstimate, dt: float) -> bool:
+        """Finite, and no faster than a person or robot can be."""
+        if dt <= 0 or not np.isfinite(estimate.T).all():
+            return False
+        motion = se3.log(se3.inverse(T_last) @ se3.inverse(estimate.T)) / dt
+        slow = np.linalg.norm(motion[3:]) < self._config.max_speed_m_s
+        return bool(slow and np.linalg.norm(motion[:3]) < self._config.max_turn_rad_s)
+
+    def _result(self, estimate: PoseEstimate, candidate: Candidate | None) -> TrackResult:
+        assert self._T_odom_cam is not None
+        self._cov = se3.inverse_cov(estimate.T, estimate.cov)
+        count = len(self._tracks.ids)
+        state = TrackState.OK if count >= self._config.weak_inliers else TrackState.WEAK
+        return TrackResult(state, se3.orthonormal(self._T_odom_cam @ self._T_cam_body), candidate, count)
+
+    # ------------------------------------------------------------------ keyframes
+
+    def _wants_keyframe(self, frame: Frame, T_odom_cam: F64) -> bool:
+        config = self._config
+        if frame.stamp_ns - self._keyframe_ns < config.keyframe_gap_s * 1e9:
+            return False
+        motion = se3.log(se3.inverse(self._T_odom_keyframe) @ T_odom_cam)
+        return bool(
+            np.linalg.norm(motion[3:]) > config.keyframe_m
+            or np.linalg.norm(motion[:3]) > config.keyframe_rad
+            or len(self._tracks.ids) < config.keyframe_tracked * self._keyframe_tracks
+        )
+
+    def _keyframe(self, frame: Frame, new_stretch: bool = False) -> Candidate:
+        """Look again for points of earlier keyframes, refine the pose, add corners, show the view."""
+        if not new_stretch:
+            self._reobserve(frame)
+        assert self._T_odom_cam is not None
+        view = make_view(frame, self._rig, self._config.view_features)
+        host = self._map.add_keyframe(LocalKeyframe(frame.image0, self._T_odom_cam, view))
+        self._add_corners(frame, host)
+        self._keyframe_ns, self._keyframe_tracks = frame.stamp_ns, len(self._tracks.ids)
+        self._T_odom_keyframe = self._T_odom_cam
+        T_odom_body = se3.orthonormal(self._T_odom_cam @ self._T_cam_body)
+        up = T_odom_body[2, :3] if self._gravity else np.zeros(3)
+        cov = se3.compose_cov(self._T_cam_body, self._cov + 1e-8 * np.eye(6), np.zeros((6, 6)))
+        return Candidate(T_odom_body, cov, up, view, new_stretch)
+
+    def _reobserve(self, frame: Frame) -> None:
+        config = self._config
+        assert self._T_odom_cam is not None
+        T_cam_odom = se3.inverse(self._T_odom_cam)
+        hosts = self._map.hosts_near(self._T_odom_cam, config.reobserve_m, config.reobserve_rad)
+        found = _NO_TRACKS
+        for host in hosts[: config.reobserve_hosts]:
+            rows, guess = self._map.visible(T_cam_odom, self._rig.cam0, [host])
+            fresh = ~np.isin(self._map.ids[rows], self._tracks.ids)
+            found = found.join(self._look_for(frame.image0, host, rows[fresh], guess[fresh]))
+        estimate, tracks = self._pose(self._tracks.join(found), self._T_odom_cam)
+        if estimate is not None:
+            self._T_odom_cam, self._tracks = se3.inverse(estimate.T), tracks
+
+    def _look_for(self, image: U8, host: int, rows: I64, guess: F32) -> _Tracks:
+        source = self._map.keyframes[host].image
+        px, found = klt.follow(source, image, self._map.host_px[rows], guess, levels=1)
+        found &= klt.resemblance(source, image, self._map.host_px[rows], px) > RESEMBLANCE
+        return _Tracks(self._map.ids[rows], px).take(found)
+
+    def _add_corners(self, frame: Frame, host: int) -> None:
+        assert self._T_odom_cam is not None
+        wanted = self._config.corners - len(self._tracks.ids)
+        px = corners.detect(frame.image0, self._tracks.px, wanted, self._config.spacing_px)
+        uv = self._rig.cam0.normalise(px.astype(np.float64))
+        z = depth_at(frame, self._rig, px, uv)
+        known = ~np.isnan(z)
+        rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)[known]
+        points = se3.transform(self._T_odom_cam, rays * z[known, None])
+        ids = self._map.add_points(host, points, px[known])
+        self._tracks = self._tracks.join(_Tracks(ids, px[known]))
+
+    # ------------------------------------------------------------------ beginnings and losses
+
+    def _start(self, frame: Frame) -> TrackResult:
+        """The first keyframe defines odom: body at the origin, z up as far as that is known."""
+        up = self._gravity.add(frame.imu) if self._gravity else None
+        if self._gravity and up is None and not self._gravity.gave_up:
+            return TrackResult(TrackState.INITIALISING, None)
+        if up is None:
+            self._gravity = None
+            up = self._rig.T_body_cam0[:3, :3] @ np.array([0.0, -1.0, 0.0])
+        forward = self._rig.T_body_cam0[:3, 2]
+        self._T_odom_cam = gravity.level(up, forward) @ self._rig.T_body_cam0
+        candidate = self._keyframe(frame, new_stretch=True)
+        if len(self._tracks.ids) < self._config.min_inliers:
+            self._T_odom_cam, self._tracks = None, _NO_TRACKS
+            self._map = LocalMap(self._config.max_keyframes)
+            return TrackResult(TrackState.INITIALISING, None)
+        return TrackResult(TrackState.OK, candidate.T_odom_body, candidate, len(self._tracks.ids))
+
+    def _recover(self, frame: Frame, T_last: F64) -> TrackResult:
+        """Find ourselves in the local map; after a while, begin a new stretch where we were lost."""
+        assert self._lost_since_ns is not None
+        config = self._config
+        T_found = relocalise.find(self._map, frame, self._rig, config, self._seed)
+        if T_found is not None:
+            self._T_odom_cam, self._tracks, self._lost_since_ns = T_found, _NO_TRACKS, None
+            self._velocity = np.zeros(6)
+            return TrackResult(TrackState.WEAK, self._T_odom_body(), self._keyframe(frame))
+        if frame.stamp_ns - self._lost_since_ns < config.new_stretch_s * 1e9:
+            return TrackResult(TrackState.LOST, None)
+        self._map, self._tracks = LocalMap(config.max_keyframes), _NO_TRACKS
+        candidate = self._keyframe(frame, new_stretch=True)
+        if len(self._tracks.ids) < config.min_inliers:
+            return TrackResult(TrackState.LOST, None)
+        self._lost_since_ns = None
+        return TrackResult(TrackState.WEAK, candidate.T_odom_body, candidate, len(self._tracks.ids))
+
+    def _T_odom_body(self) -> F64:
+        assert self._T_odom_cam is not None
+        return se3.orthonormal(self._T_odom_cam @ self._T_cam_body)

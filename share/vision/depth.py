@@ -1,0 +1,104 @@
+"""Depth of image points: from a depth camera that need not be registered, or from a stereo pair."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from share.geometry import se3
+from share.geometry.camera import Rig
+from share.types import F32, F64, U8
+from share.vision import klt
+
+EDGE = 0.05  # relative depth step within 3x3 px that marks an object's edge
+MIN_DEPTH, MAX_DEPTH = 0.2, 12.0  # m
+
+
+def from_depth_camera(depth: F32, rig: Rig, uv: F64) -> F64:
+    """Depth (N,) m along cam0's axis of normalised points `uv` (N, 2); NaN where there is none.
+
+    The depth camera looks from elsewhere, so which of its pixels answers depends on the depth
+    itself: we guess, look, and go on with what we saw. A fixed point is right if it projects back
+    onto the point asked for; several guesses find it behind a near edge too.
+    """
+    assert rig.depth is not None and rig.T_depth_cam0 is not None
+    T_cam0_depth = se3.inverse(rig.T_depth_cam0)
+    clean = _without_edges(depth)
+    rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
+    out = np.full(len(uv), np.nan)
+    for guess in (2.0, 1.0, 4.0):
+        z = np.where(np.isnan(out), guess, out)
+        for _ in range(4):
+            px = rig.depth.project(se3.transform(rig.T_depth_cam0, rays * z[:, None]))
+            seen = _sample(clean, px)
+            points = _back_project(rig, px, seen)
+            points = se3.transform(T_cam0_depth, points)
+            z = np.where(np.isnan(points[:, 2]), z, points[:, 2])
+        error_px = np.abs(points[:, :2] / points[:, 2:] - uv).max(axis=1) * rig.cam0.focal
+        out = np.where(np.isnan(out) & (error_px < 1.0), points[:, 2], out)
+        if rig.T_depth_cam0[0, 3] == 0 and not np.isnan(out).any():
+            break
+    return out
+
+
+def _without_edges(depth: F32) -> F32:
+    """Depth with holes and object edges set to NaN: an interpolated edge is a point in mid-air."""
+    filled = np.where((depth > MIN_DEPTH) & (depth < MAX_DEPTH), depth, np.float32(0))
+    low = cv2.erode(filled, np.ones((3, 3), np.uint8))  # a hole makes it 0
+    high = cv2.dilate(filled, np.ones((3, 3), np.uint8))
+    out: F32 = np.where((low > 0) & (high - low < EDGE * high), filled, np.float32("nan"))
+    return out
+
+
+def _sample(depth: F32, px: F64) -> F64:
+    """Bilinear depth at (N, 2) px, NaN outside or beside a NaN."""
+    xy = np.nan_to_num(px, nan=-10.0).astype(np.float32).reshape(-1, 1, 2)
+    x, y = np.ascontiguousarray(xy[..., 0]), np.ascontiguousarray(xy[..., 1])
+    seen = cv2.remap(depth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
+    return np.asarray(seen, np.float64).reshape(-1)
+
+
+def _back_project(rig: Rig, px: F64, z: F64) -> F64:
+    assert rig.depth is not None
+    uv = rig.depth.normalise(px)
+    return np.concatenate([uv, np.ones((len(uv), 1))], axis=1) * z[:, None]
+
+
+def from_stereo(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, guess_m: F64 | None = None) -> F64:
+    """Depth (N,) m in cam0 of points `px` (N, 2) by following them into cam1; NaN where that fails.
+
+    guess_m (N,): expected depths, NaN unknown. A match must lie on its epipolar line (1.5 px), in
+    front of both cameras, and look alike (NCC 0.8).
+    """
+    assert rig.cam1 is not None and rig.T_cam1_cam0 is not None
+    out = np.full(len(px), np.nan)
+    if len(px) == 0:
+        return out
+    rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
+    expected = np.full(len(px), np.nan) if guess_m is None else guess_m
+    for fallback in (3.0, 1.2):
+        todo = np.flatnonzero(np.isnan(out))
+        z = np.where(np.isnan(expected[todo]), fallback, expected[todo])
+        guess = rig.cam1.project(se3.transform(rig.T_cam1_cam0, rays[todo] * z[:, None]))
+        start = np.where(np.isnan(guess), px[todo], guess).astype(np.float32)
+        right, found = klt.follow(image0, image1, px[todo], start)
+        depth, error_px = _two_rays(rig, rays[todo], rig.cam1.normalise(right.astype(np.float64)))
+        found &= (error_px < 1.5) & (depth > MIN_DEPTH) & (depth < MAX_DEPTH * 2)
+        found &= klt.resemblance(image0, image1, px[todo], right) > 0.8
+        out[todo[found]] = depth[found]
+    return out
+
+
+def _two_rays(rig: Rig, rays0: F64, uv1: F64) -> tuple[F64, F64]:
+    """Depth in cam0 that best explains uv1 on the epipolar line, and the distance from it in px.
+
+    With p1 = z R r0 + t, uv1 p1_z = p1_xy is two equations linear in z; we take their least squares.
+    """
+    assert rig.T_cam1_cam0 is not None and rig.cam1 is not None
+    a, t = rays0 @ rig.T_cam1_cam0[:3, :3].T, rig.T_cam1_cam0[:3, 3]
+    A = a[:, :2] - uv1 * a[:, 2:]
+    b = uv1 * t[2] - t[:2]
+    z = (A * b).sum(axis=1) / np.maximum((A * A).sum(axis=1), 1e-12)
+    p1 = z[:, None] * a + t
+    error: F64 = np.linalg.norm(p1[:, :2] / p1[:, 2:] - uv1, axis=1) * rig.cam1.focal
+    return z, error

@@ -1,0 +1,75 @@
+"""Following points from one image to another by their patches (Lucas and Kanade 1981; pyramid:
+Bouguet 2000)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from share.types import F32, U8
+
+_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
+
+
+def follow(
+    source: U8,
+    target: U8,
+    px: F32,
+    guess: F32,
+    window: int = 21,
+    levels: int = 3,
+    back_check_px: float = 0.5,
+) -> tuple[F32, NDArray[np.bool_]]:
+    """Where the patches round `px` (N, 2) of `source` lie in `target`, and which were found.
+
+    guess (N, 2): where to begin. A point is found if following it back ends within
+    `back_check_px` of where it came from, and it is inside the image.
+    """
+    if len(px) == 0:
+        return guess.copy(), np.zeros(0, bool)
+    ahead, ok = _lucas_kanade(source, target, px, guess, window, levels)
+    # The way back begins at the answer's own source, so one level is enough to see whether it agrees.
+    back, ok_back = _lucas_kanade(target, source, ahead, px, window, 0)
+    height, width = target.shape
+    found = ok & ok_back
+    found &= np.linalg.norm(back - px, axis=1) <= back_check_px
+    found &= ((ahead >= 1) & (ahead <= (width - 2, height - 2))).all(axis=1)
+    return ahead, found
+
+
+def _lucas_kanade(
+    source: U8, target: U8, px: F32, guess: F32, window: int, levels: int
+) -> tuple[F32, NDArray[np.bool_]]:
+    start = np.array(guess, np.float32).reshape(-1, 1, 2)  # a copy: OpenCV writes into it
+    out, status, _ = cv2.calcOpticalFlowPyrLK(
+        source,
+        target,
+        np.ascontiguousarray(px, np.float32).reshape(-1, 1, 2),
+        start,
+        winSize=(window, window),
+        maxLevel=levels,
+        criteria=_CRITERIA,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    return np.asarray(out, np.float32).reshape(-1, 2), status.ravel() > 0
+
+
+def resemblance(source: U8, target: U8, px: F32, found_px: F32, half: int = 5) -> F32:
+    """Normalised cross-correlation (N,) of the (2 half + 1)^2 patches: 1 is alike up to gain and bias."""
+    a, b = _patches(source, px, half), _patches(target, found_px, half)
+    a = a - a.mean(axis=1, keepdims=True)
+    b = b - b.mean(axis=1, keepdims=True)
+    scale = np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1))
+    out: F32 = (a * b).sum(axis=1) / np.maximum(scale, 1e-6)
+    return out
+
+
+def _patches(image: U8, px: F32, half: int) -> F32:
+    """Bilinear patches (N, (2 half + 1)^2) round `px`, in one remap."""
+    offset = np.arange(-half, half + 1, dtype=np.float32)
+    dx, dy = np.meshgrid(offset, offset)
+    x = px[:, :1].astype(np.float32) + dx.ravel()
+    y = px[:, 1:].astype(np.float32) + dy.ravel()
+    out: F32 = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
+    return out

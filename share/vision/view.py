@@ -1,0 +1,55 @@
+"""What a keyframe shows to other agents: ORB features spread over the image, with their depth."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from share.geometry.camera import Rig
+from share.types import F32, F64, U8, Frame, View
+from share.vision import depth as depths
+
+
+def depth_at(frame: Frame, rig: Rig, px: F32, uv: F64) -> F64:
+    """Depth (N,) m in cam0 of image points, from whatever the frame carries; NaN where unknown."""
+    if frame.depth is not None and rig.depth is not None:
+        return depths.from_depth_camera(frame.depth, rig, uv)
+    if frame.image1 is not None and rig.cam1 is not None:
+        return depths.from_stereo(frame.image0, frame.image1, rig, px, uv)
+    return np.full(len(px), np.nan)
+
+
+def make_view(frame: Frame, rig: Rig, count: int = 500) -> View:
+    """ORB features (Rublee et al. 2011) of cam0 with 3D points where the frame gives depth."""
+    px, descriptors = orb(frame.image0, count)
+    uv = rig.cam0.normalise(px.astype(np.float64))
+    z = depth_at(frame, rig, px, uv)
+    points = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) * z[:, None]
+    return View(uv.astype(np.float32), points.astype(np.float32), descriptors)
+
+
+def orb(image: U8, count: int, grid: tuple[int, int] = (8, 6)) -> tuple[F32, U8]:
+    """Up to `count` ORB keypoints (N, 2) px and descriptors (N, 32), strongest first in each cell.
+
+    OpenCV's detector alone crowds them on the strongest texture; pose from a crowd is weak.
+    """
+    detector = cv2.ORB.create(nfeatures=3 * count, scaleFactor=1.2, nlevels=6, fastThreshold=10)
+    keypoints = detector.detect(image, None)
+    if not keypoints:
+        return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
+    px = np.array([k.pt for k in keypoints], np.float32)
+    chosen = _spread(px, np.array([k.response for k in keypoints]), image.shape, count, grid)
+    kept, descriptors = detector.compute(image, [keypoints[i] for i in chosen])
+    return np.array([k.pt for k in kept], np.float32).reshape(-1, 2), np.asarray(descriptors, np.uint8)
+
+
+def _spread(px: F32, response: F64, shape: tuple[int, ...], count: int, grid: tuple[int, int]) -> np.ndarray:
+    """Indices of up to `count` points, taken in turn from the cells of a grid, strongest first."""
+    height, width = shape[:2]
+    column = np.minimum((px[:, 0] * grid[0] / width).astype(int), grid[0] - 1)
+    row = np.minimum((px[:, 1] * grid[1] / height).astype(int), grid[1] - 1)
+    cell = row * grid[0] + column
+    order = np.lexsort((np.arange(len(px)), -response, cell))
+    first = np.searchsorted(cell[order], np.arange(grid[0] * grid[1]))
+    rank = np.arange(len(px)) - first[cell[order]]  # how many of its own cell are stronger
+    return np.sort(order[np.lexsort((-response[order], rank))[:count]])
