@@ -1,0 +1,5 @@
+"""`python -m share` is `share`."""
+
+from share.cli.main import main
+
+main()

@@ -1,0 +1,84 @@
+"""`share`: one command line. Commands are imported when they are called, so `--help` is quick."""
+
+from __future__ import annotations
+
+from share import process
+
+process.prepare()  # before anything below can import numpy
+
+import importlib  # noqa: E402
+import sys  # noqa: E402
+
+import click  # noqa: E402
+
+from share import __version__  # noqa: E402
+from share.errors import ShareError  # noqa: E402
+
+# name: (module, attribute, one line of help). Literal, so that a freezer sees every module.
+COMMANDS = {
+    "demo": ("share.cli.demo", "demo", "The whole system on this machine, nothing else needed."),
+    "track": ("share.cli.track", "track", "Track one agent, without an edge, as fast as it goes."),
+    "agent": ("share.cli.agent", "agent", "Track one agent at sensor rate and share its map."),
+    "edge": ("share.cli.edge", "edge", "Join the maps of all agents and send corrections back."),
+    "dataset": ("share.cli.dataset", "dataset", "Look into, convert and recover recordings."),
+}
+
+
+class _Lazy(click.Group):
+    """A group whose commands are modules that are not imported until one is called."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        module, attribute, _ = COMMANDS[cmd_name]
+        command: click.Command = getattr(importlib.import_module(module), attribute)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, _, text) in COMMANDS.items()])
+
+
+@click.group(cls=_Lazy, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(__version__, prog_name="share")
+def cli() -> None:
+    """SHARE: several people in AR headsets and robots track themselves in one shared map.
+
+    \b
+    Try it:   share demo
+    A run:    share edge &
+              share agent RECORDING --name ann --kind ar --edge tcp://127.0.0.1:5555 --out out/ann
+    """
+
+
+def main() -> None:
+    """The one place that turns an error into a line and an exit code."""
+    try:
+        code = cli.main(standalone_mode=False)
+        sys.exit(code if isinstance(code, int) else 0)
+    except ShareError as error:
+        _fail(str(error), error.exit_code)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.ctx.get_help() if error.ctx else "", err=True)
+        sys.exit(2)
+    except click.ClickException as error:
+        context = getattr(error, "ctx", None)
+        hint = f" (see `{context.command_path} --help`)" if context else ""
+        _fail(error.format_message().replace("\n", " ") + hint, error.exit_code)
+    except (KeyboardInterrupt, click.Abort):
+        _fail("interrupted", 130)
+    except BrokenPipeError:  # the reader of our output went away; nothing is left to tell it
+        sys.stderr.close()
+        sys.exit(1)
+
+
+def _fail(text: str, code: int) -> None:
+    click.echo(f"share: {text}", err=True)
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""Options that several commands share, and the parsing of what they hold."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from share.errors import UsageError
+
+if TYPE_CHECKING:
+    from share.config import Config
+
+calib = click.option(
+    "--calib",
+    metavar="FILE",
+    help="Kalibr camchain file, or a folder with kalibr_imucam_chain.yaml and kalibr_imu_chain.yaml; "
+    "overrides what the source carries.",
+)
+config = click.option("--config", "config_file", metavar="FILE", help="YAML file of settings.")
+verbose = click.option("-v", "--verbose", is_flag=True, help="Say more.")
+as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
+
+
+class _Frames(click.ParamType):
+    name = "A:B"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> slice:
+        if isinstance(value, slice):
+            return value
+        match = re.fullmatch(r"(\d*):(\d*)", value)
+        start, stop = (int(v) if v else None for v in match.groups()) if match else (None, None)
+        if not match or (stop is not None and stop <= (start or 0)):
+            self.fail(f"'{value}' is not a range of frames such as 0:250, 250: or :100", param, ctx)
+        return slice(start, stop)
+
+
+frames = click.option(
+    "--frames", type=_Frames(), help="Only frames A to B-1, counted by camera images (0:250)."
+)
+
+
+def load_config(path: str | None) -> Config:
+    """The settings of a YAML file, or the defaults. Raises ConfigError or UsageError."""
+    from share import config as settings
+
+    if path is None:
+        return settings.Config()
+    try:
+        text = Path(path).read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not a text file"
+        raise UsageError(f"{path}: cannot read the configuration: {reason}") from None
+    return settings.load(text, path)
