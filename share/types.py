@@ -70,11 +70,13 @@ def checked_pose(name: str, value: ArrayLike) -> F64:
     """`value` as a read-only rigid transform (4, 4). Raises ValueError if it is not one (1e-3)."""
     T = checked(name, value, (4, 4), np.float64)
     R = T[:3, :3]
-    if (
-        np.abs(R @ R.T - np.eye(3)).max() > 1e-3
-        or np.linalg.det(R) < 0
-        or np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-9
-    ):
+    rigid = (
+        np.abs(R).max() < 2  # first, so that nothing below overflows
+        and np.abs(R @ R.T - np.eye(3)).max() <= 1e-3
+        and np.linalg.det(R) > 0
+        and np.abs(T[3] - (0, 0, 0, 1)).max() <= 1e-9
+    )
+    if not rigid:
         raise ValueError(f"{name}: is not a rigid transform")
     return T
 
@@ -149,6 +151,8 @@ class View:
             points=checked("points", self.points, (n, 3), np.float32, finite=False),
             descriptors=checked("descriptors", self.descriptors, (n, DESCRIPTOR_BYTES), np.uint8),
         )
+        if np.isinf(self.points).any():
+            raise ValueError("points: has infinite values (unknown depth is NaN)")
 
     def __len__(self) -> int:
         return len(self.uv)
@@ -185,6 +189,8 @@ class Keyframe:
     id: per agent run, rising from 0. reference: id of the sent keyframe that T_ref_body (4, 4) and
     its covariance (6, 6) are relative to, or -1: then T_ref_body is T_odom_body and a new stretch
     of odometry begins. up (3,): unit vector against gravity in the body frame, zeros if unknown.
+    follows: id of the keyframe to be applied before this one, -1 for none; at least the reference,
+    and more where a new stretch begins, so that a reordering network cannot overtake with it.
     """
 
     id: int
@@ -194,10 +200,14 @@ class Keyframe:
     cov: F64
     up: F64
     view: View
+    follows: int = -1
 
     def __post_init__(self) -> None:
         if not -1 <= self.reference < self.id:
             raise ValueError(f"reference: {self.reference} must lie in -1 .. {self.id - 1}")
+        _set(self, follows=max(self.reference, self.follows))
+        if not self.follows < self.id:
+            raise ValueError(f"follows: {self.follows} must lie in -1 .. {self.id - 1}")
         _set(
             self,
             T_ref_body=checked_pose("T_ref_body", self.T_ref_body),

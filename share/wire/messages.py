@@ -6,9 +6,25 @@ so no message repeats who sent it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from share.types import F64, AgentKind, Correction, Keyframe, TrackState, checked_pose
+
+MAX_RATE_HZ = 1000.0
+MAX_HELD = 256  # ids in one Ack: the most keyframes that may wait at the edge for a gap to close
+MAX_TEXT = 512  # characters of anything a person reads
+
+
+def peer_id(run_id: int) -> bytes:
+    """The 8 bytes by which the transport of the edge knows the agent of this run."""
+    return run_id.to_bytes(8, "big", signed=True)
+
+
+def _check_ids(*ids: int) -> None:
+    if min(ids) < 0:
+        raise ValueError(f"keyframe ids: {min(ids)} is negative")
+
 
 # ---------------------------------------------------------------- up: agent -> edge
 
@@ -52,6 +68,12 @@ class Evaluation:
     delay_ms: float
     error_cm: float | None
 
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(x) and x >= 0 for x in (self.delay_ms, self.error_cm or 0.0)):
+            raise ValueError(
+                f"evaluation: {self.delay_ms} ms, {self.error_cm} cm must be finite, not negative"
+            )
+
 
 @dataclass(frozen=True)
 class Ping:
@@ -74,6 +96,9 @@ class Welcome:
     session: int
     next_keyframe: int
 
+    def __post_init__(self) -> None:
+        _check_ids(self.next_keyframe)
+
 
 @dataclass(frozen=True)
 class Refused:
@@ -81,13 +106,25 @@ class Refused:
 
     reason: str
 
+    def __post_init__(self) -> None:
+        if len(self.reason) > MAX_TEXT:
+            raise ValueError(f"reason: {len(self.reason)} characters, at most {MAX_TEXT}")
+
 
 @dataclass(frozen=True)
 class Ack:
-    """Every keyframe below `next_keyframe` is applied; those in `held` wait for a gap to close."""
+    """Nothing below `next_keyframe` is wanted any more: it was applied, or dropped by the agent.
+
+    Those in `held` have arrived and wait for a gap to close.
+    """
 
     next_keyframe: int
     held: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_ids(self.next_keyframe, *self.held)
+        if len(self.held) > MAX_HELD:
+            raise ValueError(f"held: {len(self.held)} ids, at most {MAX_HELD}")
 
 
 @dataclass(frozen=True)
@@ -95,6 +132,10 @@ class Rate:
     """Keyframes per second that the agent may send."""
 
     hz: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.hz <= MAX_RATE_HZ:
+            raise ValueError(f"rate: {self.hz} Hz is outside 0 .. {MAX_RATE_HZ:g}")
 
 
 @dataclass(frozen=True)

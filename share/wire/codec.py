@@ -1,0 +1,241 @@
+"""Messages to frames of bytes and back; docs/wire.md has the byte layout.
+
+The first frame is a small msgpack header: wire version, message code, scalar fields, and dtype and
+shape of each array. Every array follows as a frame of its own, little-endian, C order, not copied.
+Nothing is allocated for a declared size before the bytes that fill it are seen to be there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from math import isfinite, prod
+from operator import attrgetter
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from share.errors import WireError
+from share.types import DESCRIPTOR_BYTES, MAX_KEYPOINTS, AgentKind, Correction, Keyframe, TrackState, View
+from share.wire import messages as m
+
+VERSION = 1
+MAX_HEADER_BYTES = 4096
+MAX_ARRAYS = 8
+MAX_FRAME_BYTES = MAX_KEYPOINTS * DESCRIPTOR_BYTES  # the largest array of any message
+
+Bytes = bytes | memoryview
+Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+Ids = Annotated[tuple[Int64, ...], Meta(max_length=m.MAX_HELD)]
+Text = Annotated[str, Meta(max_length=m.MAX_TEXT)]
+Name = Annotated[str, Meta(max_length=64)]
+
+_DTYPES = {code: np.dtype(code) for code in ("<f8", "<f4", "|u1")}
+
+
+class _Version(msgspec.Struct, array_like=True):
+    """The head of every header, of this and of all other versions."""
+
+    version: int
+
+
+class _Header(msgspec.Struct, array_like=True):
+    version: int
+    code: int
+    scalars: msgspec.Raw
+    arrays: tuple[tuple[str, tuple[int, ...]], ...]
+
+
+_encoder = msgspec.msgpack.Encoder(enc_hook=lambda scalar: scalar.item())  # numpy scalars
+_read_version = msgspec.msgpack.Decoder(_Version).decode
+_read_header = msgspec.msgpack.Decoder(_Header).decode
+
+
+@dataclass(frozen=True)
+class _Scalars:
+    """Named scalar fields, checked alike on the way out and in."""
+
+    names: tuple[str, ...]
+    decoder: msgspec.msgpack.Decoder[Any]
+
+    @staticmethod
+    def of(**fields: Any) -> _Scalars:
+        return _Scalars(tuple(fields), msgspec.msgpack.Decoder(tuple[tuple(fields.values())]))  # type: ignore[misc]
+
+    def encode(self, message: object) -> bytes:
+        raw = _encoder.encode([getattr(message, name) for name in self.names])
+        self.decode(raw)
+        return raw
+
+    def decode(self, raw: msgspec.Raw | bytes) -> dict[str, Any]:
+        values = self.decoder.decode(raw)
+        if not all(isfinite(value) for value in values if isinstance(value, float)):
+            raise ValueError("a number is not finite")
+        return dict(zip(self.names, values, strict=True))
+
+
+@dataclass(frozen=True)
+class _Array:
+    """One array field; `None` in the shape is a length that the message chooses, up to MAX_KEYPOINTS."""
+
+    path: str
+    dtype: str
+    shape: tuple[int | None, ...]
+
+    def get(self, message: object) -> NDArray[Any]:
+        return np.ascontiguousarray(attrgetter(self.path)(message), _DTYPES[self.dtype])
+
+    def decode(self, dtype: str, shape: tuple[int, ...], frame: Bytes) -> NDArray[Any]:
+        if dtype not in _DTYPES:
+            raise ValueError(f"{self.path}: unknown dtype '{dtype[:8]}'")
+        if dtype != self.dtype or not self._admits(shape):
+            raise ValueError(f"{self.path}: {dtype} of shape {shape[:4]}, expected {self.dtype} {self.shape}")
+        size = prod(shape) * _DTYPES[dtype].itemsize
+        data = memoryview(frame)
+        if data.nbytes != size:
+            raise ValueError(f"{self.path}: {data.nbytes} bytes, its shape needs {size}")
+        if not size:
+            return np.empty(shape, _DTYPES[dtype])
+        # a short frame lies unaligned in its message: only then is it copied
+        return np.require(np.frombuffer(data, _DTYPES[dtype]).reshape(shape), requirements="A")
+
+    def _admits(self, shape: tuple[int, ...]) -> bool:
+        return len(shape) == len(self.shape) and all(
+            0 <= have <= MAX_KEYPOINTS if want is None else have == want
+            for want, have in zip(self.shape, shape, strict=True)
+        )
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How one type of message lies on the wire."""
+
+    code: int
+    build: Callable[..., m.Message]
+    scalars: _Scalars = field(default_factory=lambda: _Scalars.of())
+    arrays: tuple[_Array, ...] = ()
+
+
+def _pose(path: str) -> _Array:
+    return _Array(path, "<f8", (4, 4))
+
+
+def _keyframe(*, uv: Any, points: Any, descriptors: Any, **fields: Any) -> Keyframe:
+    return Keyframe(**fields, view=View(uv, points, descriptors))
+
+
+_LAYOUTS: dict[type, _Layout] = {
+    m.Hello: _Layout(
+        1,
+        m.Hello,
+        _Scalars.of(name=Name, kind=AgentKind, run_id=Int64, focal=float),
+        (_pose("T_body_cam0"),),
+    ),
+    m.PoseUpdate: _Layout(
+        2,
+        m.PoseUpdate,
+        _Scalars.of(stamp_ns=Int64, state=TrackState, keyframe=Int64),
+        (_pose("T_keyframe_body"),),
+    ),
+    Keyframe: _Layout(
+        3,
+        _keyframe,
+        _Scalars.of(id=Int64, reference=Int64, stamp_ns=Int64, follows=Int64),
+        (
+            _pose("T_ref_body"),
+            _Array("cov", "<f8", (6, 6)),
+            _Array("up", "<f8", (3,)),
+            _Array("view.uv", "<f4", (None, 2)),
+            _Array("view.points", "<f4", (None, 3)),
+            _Array("view.descriptors", "|u1", (None, DESCRIPTOR_BYTES)),
+        ),
+    ),
+    m.Evaluation: _Layout(
+        4, m.Evaluation, _Scalars.of(keyframe=Int64, delay_ms=float, error_cm=float | None)
+    ),
+    m.Ping: _Layout(5, m.Ping, _Scalars.of(sequence=Int64, sent_ns=Int64)),
+    m.Bye: _Layout(6, m.Bye),
+    m.Welcome: _Layout(16, m.Welcome, _Scalars.of(session=Int64, next_keyframe=Int64)),
+    m.Refused: _Layout(17, m.Refused, _Scalars.of(reason=Text)),
+    m.Ack: _Layout(18, m.Ack, _Scalars.of(next_keyframe=Int64, held=Ids)),
+    Correction: _Layout(
+        19,
+        Correction,
+        _Scalars.of(map_id=Name, revision=Int64, answers=Int64),
+        (_pose("T_map_odom"), _Array("cov", "<f8", (6, 6))),
+    ),
+    m.Rate: _Layout(20, m.Rate, _Scalars.of(hz=float)),
+    m.Pong: _Layout(
+        21, m.Pong, _Scalars.of(sequence=Int64, sent_ns=Int64, received_ns=Int64, replied_ns=Int64)
+    ),
+}
+_BY_CODE = {layout.code: (cls, layout) for cls, layout in _LAYOUTS.items()}
+
+# Everything that msgspec, numpy and the validation of our own types raise on bad bytes.
+_BAD = (msgspec.MsgspecError, ValueError, OverflowError, RecursionError)
+
+
+def encode(message: m.Message) -> list[Bytes]:
+    """Frames of a message; array frames are views on its (read-only) arrays.
+
+    Raises WireError if a field does not fit the wire, so that what is sent can always be decoded.
+    """
+    layout = _LAYOUTS[type(message)]
+    arrays = [spec.get(message) for spec in layout.arrays]
+    table = [(spec.dtype, array.shape) for spec, array in zip(layout.arrays, arrays, strict=True)]
+    try:
+        scalars = msgspec.Raw(layout.scalars.encode(message))
+    except _BAD as error:
+        raise _wire_error(type(message).__name__, error) from None
+    header = _encoder.encode((VERSION, layout.code, scalars, table))
+    return [header, *(array.data.cast("B") if array.size else b"" for array in arrays)]
+
+
+def decode(frames: Sequence[Bytes]) -> m.Message:
+    """The message in `frames`; its arrays may be read-only views on them. Raises WireError only."""
+    if not frames:
+        raise WireError("empty message")
+    if memoryview(frames[0]).nbytes > MAX_HEADER_BYTES:
+        raise WireError(f"header of {memoryview(frames[0]).nbytes} bytes, at most {MAX_HEADER_BYTES}")
+    try:
+        _check_version(_read_version(frames[0]).version)
+        header = _read_header(frames[0])
+    except _BAD as error:
+        raise _wire_error("header", error) from None
+    cls, layout = _BY_CODE.get(header.code, (None, None))
+    if cls is None or layout is None:
+        raise WireError(f"unknown message type {header.code}")
+    try:
+        return layout.build(**layout.scalars.decode(header.scalars), **_arrays(layout, header, frames))
+    except _BAD as error:
+        raise _wire_error(cls.__name__, error) from None
+
+
+def size(frames: Sequence[Bytes]) -> int:
+    """Bytes of a message, without what the transport adds (ZMTP: 2 or 9 bytes a frame)."""
+    return sum(memoryview(frame).nbytes for frame in frames)
+
+
+def _wire_error(where: str, error: Exception) -> WireError:
+    """One short printable line: parts of `error` may be the peer's own text."""
+    line = "".join(c if c.isprintable() else "?" for c in f"{where}: {error}")
+    return WireError(line[:200])
+
+
+def _check_version(version: int) -> None:
+    if version != VERSION:
+        raise ValueError(f"peer speaks version {version}, this is {VERSION}; update the older one")
+
+
+def _arrays(layout: _Layout, header: _Header, frames: Sequence[Bytes]) -> dict[str, NDArray[Any]]:
+    if not len(header.arrays) == len(layout.arrays) == len(frames) - 1:
+        raise ValueError(
+            f"{len(frames) - 1} array frames, {len(header.arrays)} declared, {len(layout.arrays)} expected"
+        )
+    return {
+        spec.path.rpartition(".")[2]: spec.decode(dtype, shape, frame)
+        for spec, (dtype, shape), frame in zip(layout.arrays, header.arrays, frames[1:], strict=True)
+    }

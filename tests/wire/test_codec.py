@@ -1,0 +1,297 @@
+"""The codec: exact round trips, stated sizes, and WireError (nothing else) on anything malformed."""
+
+from __future__ import annotations
+
+import dataclasses
+import tracemalloc
+from collections import Counter
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from wire_strategies import messages
+
+from share.errors import WireError
+from share.types import AgentKind, Correction, Keyframe, TrackState, View
+from share.wire import codec
+from share.wire import messages as m
+
+POSE = np.eye(4)
+EVERY_CLASS = {*m.Up.__args__, *m.Down.__args__}
+
+
+def keyframe(n: int, id_: int = 7) -> Keyframe:
+    rng = np.random.default_rng(n)
+    points = rng.normal(size=(n, 3)).astype(np.float32)
+    points[::3] = np.nan
+    view = View(rng.normal(size=(n, 2)), points, rng.integers(0, 256, (n, 32)))
+    return Keyframe(id_, id_ - 1, 10**18, POSE, np.eye(6), np.array([0, 0, 1.0]), view)
+
+
+EXAMPLES: list[m.Message] = [
+    m.Hello("ann", AgentKind.AR, 2**62, 460.0, POSE),
+    m.PoseUpdate(1_700_000_000_123_456_789, TrackState.INERTIAL_ONLY, 2**31, POSE),
+    keyframe(5),
+    m.Evaluation(3, 12.5, None),
+    m.Ping(1, 10**18),
+    m.Bye(),
+    m.Welcome(2**62, 3),
+    m.Refused("the name 'ann' is taken"),
+    m.Ack(4, (6, 7)),
+    Correction(POSE, np.eye(6), "map-1", 5, 3),
+    m.Rate(4.5),
+    m.Pong(1, 1, 2, 3),
+]
+
+
+def same(a: object, b: object) -> bool:
+    if isinstance(a, np.ndarray):
+        return (
+            isinstance(b, np.ndarray)
+            and a.dtype == b.dtype
+            and np.array_equal(a, b, equal_nan=a.dtype != np.uint8)
+        )
+    if dataclasses.is_dataclass(a):
+        return type(a) is type(b) and all(
+            same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a)
+        )
+    return type(a) is type(b) and a == b
+
+
+def copied(frames: list) -> list[bytes]:
+    return [bytes(frame) for frame in frames]
+
+
+def test_the_examples_cover_every_message() -> None:
+    assert {type(message) for message in EXAMPLES} == EVERY_CLASS == set(codec._LAYOUTS)
+
+
+def test_codes_are_unique() -> None:
+    assert len(codec._BY_CODE) == len(codec._LAYOUTS)
+
+
+@given(messages)
+@settings(max_examples=400, deadline=None)
+def test_round_trip(message: m.Message) -> None:
+    frames = codec.encode(message)
+    assert same(codec.decode(copied(frames)), message)
+    assert same(codec.decode(frames), message)
+
+
+def test_a_pose_fits_into_200_bytes_and_a_keyframe_into_30_kb() -> None:
+    assert codec.size(codec.encode(EXAMPLES[1])) <= 200
+    assert codec.size(codec.encode(keyframe(500, 10**9))) <= 30_000
+
+
+def test_arrays_are_views_on_both_sides() -> None:
+    sent = keyframe(500)
+    frames = codec.encode(sent)
+    assert np.shares_memory(np.frombuffer(frames[6], np.uint8), sent.view.descriptors)
+    got = codec.decode(copied(frames))
+    assert isinstance(got, Keyframe)
+    assert not got.view.descriptors.flags.writeable
+    assert got.view.descriptors.base is not None
+
+
+def test_unaligned_frames_are_copied() -> None:
+    frames = copied(codec.encode(EXAMPLES[1]))
+    shifted = memoryview(b"x" + frames[1])[1:]
+    got = codec.decode([frames[0], shifted])
+    assert isinstance(got, m.PoseUpdate)
+    assert got.T_keyframe_body.flags.aligned
+
+
+def test_numpy_scalars_are_sent_as_plain_ones() -> None:
+    got = codec.decode(codec.encode(m.Ping(np.int64(3), np.int64(4))))  # type: ignore[arg-type]
+    assert got == m.Ping(3, 4)
+
+
+@pytest.mark.parametrize("message", [m.Ping(2**63, 0), m.Refused("\ud800"), m.Ping(0, "x")])  # type: ignore[arg-type]
+def test_what_could_not_be_decoded_is_not_encoded(message: m.Message) -> None:
+    with pytest.raises(WireError):
+        codec.encode(message)
+
+
+def header(version: object = 1, code: object = 5, scalars: object = (1, 2), arrays: object = ()) -> bytes:
+    return msgspec.msgpack.encode((version, code, scalars, arrays))
+
+
+T_FRAMES = [b"\0" * 128]
+POSE_SCALARS = (1, "OK", -1)
+BAD = {
+    "empty message": [],
+    "header of 4097 bytes": [b"\0" * 4097],
+    "header: ": [b""],
+    "peer speaks version 2, this is 1; update the older one": [header(version=2)],
+    "peer speaks version 9": [msgspec.msgpack.encode((9, "some", {"other": "layout"}))],
+    "unknown message type 99": [header(code=99)],
+    "Ping: Expected `int`": [header(scalars=("a", 2))],
+    "Ping: Expected `int` <= ": [header(scalars=(2**63, 2))],
+    "Rate: a number is not finite": [header(code=20, scalars=(float("nan"),))],
+    "Rate: rate: -1.0": [header(code=20, scalars=(-1.0,))],
+    "Ping: 1 array frames, 0 declared, 0 expected": [header(), b""],
+    "PoseUpdate: 0 array frames, 1 declared": [header(1, 2, POSE_SCALARS, [("<f8", (4, 4))])],
+    "unknown dtype '|O'": [header(1, 2, POSE_SCALARS, [("|O", (4, 4))]), *T_FRAMES],
+    "T_keyframe_body: <f4 of shape": [header(1, 2, POSE_SCALARS, [("<f4", (4, 4))]), *T_FRAMES],
+    "T_keyframe_body: <f8 of shape (2, 8)": [header(1, 2, POSE_SCALARS, [("<f8", (2, 8))]), *T_FRAMES],
+    "T_keyframe_body: 127 bytes": [header(1, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\0" * 127],
+    "is not a rigid transform": [header(1, 2, POSE_SCALARS, [("<f8", (4, 4))]), *T_FRAMES],
+    "not finite": [header(1, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\xff" * 128],
+    "Invalid enum value 'LOSTER'": [header(1, 2, (1, "LOSTER", -1), [("<f8", (4, 4))]), *T_FRAMES],
+    "follows: 9": [header(1, 3, (7, -1, 0, 9), codec_table := [
+        ("<f8", (4, 4)), ("<f8", (6, 6)), ("<f8", (3,)), ("<f4", (0, 2)), ("<f4", (0, 3)), ("|u1", (0, 32))]),
+        POSE.tobytes(), np.eye(6).tobytes(), b"\0" * 24, b"", b"", b""],
+    "view.uv: <f4 of shape (2001, 2)": [header(1, 3, (7, -1, 0, 6), [
+        *codec_table[:3], ("<f4", (2001, 2)), *codec_table[4:]]),
+        POSE.tobytes(), np.eye(6).tobytes(), b"\0" * 24, b"\0" * 16008, b"", b""],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("says", BAD)
+def test_says_what_is_wrong(says: str) -> None:
+    with pytest.raises(WireError) as caught:
+        codec.decode(BAD[says])
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_peer_cannot_write_into_our_log() -> None:
+    for text in ("a\nb", "\x1b[2J", "x" * 2000):
+        assert refused([header(1, 2, (1, text, -1), [(text, (4, 4))]), *T_FRAMES])
+        assert refused([header(1, 2, POSE_SCALARS, [(text, (4, 4))]), *T_FRAMES])
+
+
+def test_infinite_points_and_disagreeing_lengths_are_refused() -> None:
+    frames = copied(codec.encode(keyframe(5)))
+    for index, frame in ((5, np.full((5, 3), np.inf, np.float32).tobytes()), (4, frames[4][:-8])):
+        with pytest.raises(WireError):
+            codec.decode([*frames[:index], frame, *frames[index + 1 :]])
+
+
+# ---------------------------------------------------------------- anything at all
+
+
+def refused(frames: list[bytes]) -> bool:
+    """Whether the decoder refuses; whatever else it raises fails the test."""
+    try:
+        codec.decode(frames)
+    except WireError as error:
+        said = str(error)
+    else:
+        return False
+    assert said.isprintable()
+    assert len(said) < 300
+    return True
+
+
+@given(st.lists(st.binary(max_size=200), max_size=8))
+@settings(max_examples=1000, deadline=None)
+def test_random_bytes(frames: list[bytes]) -> None:
+    refused(frames)
+
+
+nested = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=20,
+)
+
+
+@given(
+    st.sampled_from(sorted(codec._BY_CODE)) | st.integers(),
+    nested,
+    st.lists(
+        st.tuples(
+            st.sampled_from(["<f8", "<f4", "|u1", ">f8", "O"]), st.lists(st.integers(-9, 2**62), max_size=4)
+        )
+    ),
+    st.lists(st.binary(max_size=160), max_size=7),
+)
+@settings(max_examples=1500, deadline=None)
+def test_well_formed_headers_with_wrong_content(
+    code: int, scalars: object, table: list, frames: list
+) -> None:
+    code = min(max(code, -(2**63)), 2**64 - 1)
+    refused([header(1, code, scalars, table), *frames])
+
+
+def mutate(rng: np.random.Generator, frames: list[bytes], others: list[list[bytes]]) -> list[bytes]:
+    """One to three random injuries: flipped, cut, grown, replaced, swapped, doubled, lost frames."""
+    frames = list(frames)
+    for _ in range(rng.integers(1, 4)):
+        if not frames:
+            break
+        i, j = rng.integers(len(frames), size=2)
+        at = int(rng.integers(len(frames[i]) + 1))
+        match rng.integers(9):
+            case 0 | 1 if frames[i]:
+                flipped = bytearray(frames[i])
+                flipped[at - 1] ^= 1 << int(rng.integers(8))
+                frames[i] = bytes(flipped)
+            case 2:
+                frames[i] = frames[i][:at]
+            case 3:
+                frames[i] = frames[i][:at] + rng.bytes(int(rng.integers(1, 12))) + frames[i][at:]
+            case 4:
+                frames[i], frames[j] = frames[j], frames[i]
+            case 5:
+                del frames[i]
+            case 6:
+                frames.insert(i, frames[j])
+            case 7:
+                other = others[rng.integers(len(others))]
+                frames[i] = other[rng.integers(len(other))]
+            case _:  # lengths and numbers at their extremes
+                value = [b"\xdd\xff\xff\xff\xff", b"\xcf" + b"\xff" * 8, b"\xdb\x7f\xff\xff\xff"][
+                    rng.integers(3)
+                ]
+                frames[i] = frames[i][:at] + value + frames[i][at + 1 :]
+    return frames
+
+
+def injured(seed: int, cases: int) -> Counter[bool]:
+    """How many of so many injured messages are refused; the others hit where any value is a value."""
+    rng = np.random.default_rng(seed)
+    valid = [copied(codec.encode(message)) for message in EXAMPLES]
+    return Counter(refused(mutate(rng, valid[case % len(valid)], valid)) for case in range(cases))
+
+
+def test_a_hundred_thousand_injured_messages() -> None:
+    assert injured(seed=3, cases=100_000)[True] > 80_000
+
+
+def test_injured_messages_leave_nothing_behind() -> None:
+    injured(seed=4, cases=1000)
+    tracemalloc.start()
+    try:
+        injured(seed=5, cases=10_000)
+        held, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert held < 64 * 1024
+    assert peak < 512 * 1024
+
+
+def test_huge_declarations_allocate_nothing() -> None:
+    huge = [
+        b"\xdd\xff\xff\xff\xff" + b"\x01" * 100,
+        b"\x94\x01\x05\xdd\xff\xff\xff\xff\x01",
+        b"\x94\x01\x05\x90\xdd\xff\xff\xff\xff\x01",
+        b"\x94\x01\x12\x92\x01\xdd\xff\xff\xff\xff\x01\x90",
+        b"\x94\x01\x11\x91\xdb\xff\xff\xff\xff\x90",
+        b"\x94\x01\x05" + b"\x91" * 4000,
+        b"\x91" * 4096,
+        header(1, 3, (1, 0, 0, 0), [("|u1", (2**40, 2**40))] * 6),
+        header(1, 3, (1, 0, 0, 0), [("|u1", (2000, 32))] * 400),
+    ]
+    tracemalloc.start()
+    try:
+        for head in huge:
+            tracemalloc.reset_peak()
+            before = tracemalloc.get_traced_memory()[0]
+            assert refused([head] + [b""] * 6)
+            assert tracemalloc.get_traced_memory()[1] - before < 256 * 1024
+    finally:
+        tracemalloc.stop()

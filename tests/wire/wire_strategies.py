@@ -1,0 +1,61 @@
+"""Hypothesis strategies for every message, shared by the tests of the wire and of the core."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from share.geometry import se3
+from share.types import AgentKind, Correction, Keyframe, TrackState, View
+from share.wire import messages as m
+
+int64 = st.integers(-(2**63), 2**63 - 1)
+ids = st.integers(0, 2**63 - 1)
+finite = st.floats(-1e6, 1e6)
+names = st.text(st.characters(categories=["L", "N"]), min_size=1, max_size=64)
+covs = hnp.arrays(np.float64, (6, 6), elements=finite)
+ups = hnp.arrays(np.float64, 3, elements=finite)
+
+
+@st.composite
+def poses(draw: st.DrawFn) -> np.ndarray:
+    rotation = draw(hnp.arrays(np.float64, 3, elements=st.floats(-3, 3)))
+    position = draw(hnp.arrays(np.float64, 3, elements=finite))
+    return se3.compose(se3.so3_exp(rotation), position)
+
+
+@st.composite
+def views(draw: st.DrawFn, most: int = 40) -> View:
+    n = draw(st.integers(0, most))
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    points = rng.normal(size=(n, 3)).astype(np.float32)
+    points[rng.random(n) < 0.3] = np.nan
+    return View(
+        rng.normal(size=(n, 2)).astype(np.float32), points, rng.integers(0, 256, (n, 32)).astype(np.uint8)
+    )
+
+
+@st.composite
+def keyframes(draw: st.DrawFn) -> Keyframe:
+    id_ = draw(ids)
+    reference = draw(st.integers(-1, id_ - 1))
+    follows = draw(st.integers(reference, id_ - 1))
+    return Keyframe(id_, reference, draw(int64), draw(poses()), draw(covs), draw(ups), draw(views()), follows)
+
+
+amount = st.floats(0, 1e9)
+messages = st.one_of(
+    st.builds(m.Hello, names, st.sampled_from(AgentKind), int64, st.floats(1, 1e5), poses()),
+    st.builds(m.PoseUpdate, int64, st.sampled_from(TrackState), int64, poses()),
+    keyframes(),
+    st.builds(m.Evaluation, int64, amount, st.none() | amount),
+    st.builds(m.Ping, int64, int64),
+    st.just(m.Bye()),
+    st.builds(m.Welcome, int64, ids),
+    st.builds(m.Refused, st.text(st.characters(codec="utf-8"), max_size=m.MAX_TEXT)),
+    st.builds(m.Ack, ids, st.lists(ids, max_size=m.MAX_HELD).map(tuple)),
+    st.builds(Correction, poses(), covs, names, int64, int64),
+    st.builds(m.Rate, st.floats(0, m.MAX_RATE_HZ)),
+    st.builds(m.Pong, int64, int64, int64, int64),
+)
