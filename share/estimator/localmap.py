@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,14 @@ from share.types import F32, F64, I64, U8, View
 
 @dataclass(frozen=True, eq=False)
 class LocalKeyframe:
-    """An image the local map holds on to: its patches are what a point looks like."""
+    """An image the local map holds on to: its patches are what a point looks like.
+
+    view: its ORB features, for relocalisation; None until they are made.
+    """
 
     image: U8
     T_odom_cam: F64
-    view: View
+    view: View | None = None
 
 
 class LocalMap:
@@ -37,14 +40,19 @@ class LocalMap:
         self.hosts: I64 = np.zeros(0, np.int64)
         self.host_px: F32 = np.zeros((0, 2), np.float32)
 
-    def add_keyframe(self, keyframe: LocalKeyframe) -> int:
+    def add_keyframe(self, image: U8, T_odom_cam: F64) -> int:
         """Its number. Where the map is full, the keyframe nearest to another one makes room."""
         if len(self.keyframes) >= self._max_keyframes:
             self._drop(self._most_redundant())
         number = self._next_keyframe
         self._next_keyframe += 1
-        self.keyframes[number] = keyframe
+        self.keyframes[number] = LocalKeyframe(image, T_odom_cam)
         return number
+
+    def set_view(self, view: View) -> None:
+        """The features of the newest keyframe."""
+        newest = self._next_keyframe - 1
+        self.keyframes[newest] = replace(self.keyframes[newest], view=view)
 
     def add_points(self, host: int, points: F64, px: F32) -> I64:
         """Ids (N,) of new points (N, 3) m in odom, seen at px (N, 2) in keyframe `host`."""

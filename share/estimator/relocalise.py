@@ -25,6 +25,8 @@ def find(local_map: LocalMap, frame: Frame, rig: Rig, config: TrackerConfig, see
     best, best_inliers = None, 2 * config.min_inliers - 1
     for keyframe in reversed(local_map.keyframes.values()):
         view = keyframe.view
+        if view is None:
+            continue
         known = np.flatnonzero(~np.isnan(view.points[:, 0]))
         pairs = matcher.knnMatch(descriptors, view.descriptors[known], k=2) if len(px) else ()
         good = [m for m, *n in pairs if n and m.distance < min(MAX_HAMMING, RATIO * n[0].distance)]

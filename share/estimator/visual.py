@@ -2,8 +2,9 @@
 where there is none.
 
 A frame's way: predict -> follow -> pose -> (keyframe: look again for old points -> refine -> add
-corners). Points keep the place that their first keyframe gave them; what holds drift down is that
-points of earlier keyframes are looked for again, by the patch that was seen first.
+corners). What other agents need of a keyframe is made after its pose is out. Points keep the place
+that their first keyframe gave them; what holds drift down is that points of earlier keyframes are
+looked for again, by the patch that was seen first.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from share.config import TrackerConfig
 from share.estimator import gravity, relocalise
-from share.estimator.localmap import LocalKeyframe, LocalMap
+from share.estimator.localmap import LocalMap
 from share.estimator.pose import PoseEstimate, consensus, refine
 from share.geometry import se3
 from share.geometry.camera import Rig
@@ -28,12 +29,16 @@ RESEMBLANCE = 0.8  # NCC below which a re-found patch is another thing
 
 @dataclass(frozen=True, eq=False)
 class TrackResult:
-    """What one frame came to. T_odom_body is None where there is no pose to be had."""
+    """What one frame came to. T_odom_body is None where there is no pose to be had.
+
+    keyframe: this frame became one; `VisualTracker.keyframe` gives what it shows. points: how many
+    the pose rests on.
+    """
 
     state: TrackState
     T_odom_body: F64 | None
-    candidate: Candidate | None = None
-    points: int = 0  # inliers behind the pose
+    keyframe: bool = False
+    points: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +73,11 @@ class VisualTracker:
         self._stamp_ns = 0
         self._T_odom_cam: F64 | None = None  # last believed pose
         self._velocity = np.zeros(6)  # body twist of the camera, rad/s and m/s
-        self._cov = np.zeros((6, 6))  # of the motion since the last keyframe, in the camera frame
-        self._keyframe_ns = self._seen_ns = 0
+        self._cov = np.zeros((6, 6))  # of the last pose against the local map, camera frame
+        self._keyframe_ns = 0
         self._keyframe_tracks = 0
         self._T_odom_keyframe = np.eye(4)
+        self._new_stretch = True  # of the last keyframe
         self._lost_since_ns: int | None = None
 
     def track(self, frame: Frame) -> TrackResult:
@@ -79,11 +85,23 @@ class VisualTracker:
         if self._T_odom_cam is None:
             result = self._start(frame)
         elif self._lost_since_ns is not None:
-            result = self._recover(frame, self._T_odom_cam)
+            result = self._recover(frame)
         else:
             result = self._follow(frame, self._T_odom_cam)
         self._image, self._stamp_ns = frame.image0, frame.stamp_ns
         return result
+
+    def keyframe(self, frame: Frame) -> Candidate:
+        """What the frame just tracked shows to others; call it where `track` said keyframe.
+
+        Apart from `track`, because a headset should have its pose before this is computed.
+        """
+        view = make_view(frame, self._rig, self._config.view_features)
+        self._map.set_view(view)
+        T_odom_body = self._T_odom_body()
+        up = T_odom_body[2, :3] if self._gravity else np.zeros(3)
+        cov = se3.compose_cov(self._T_cam_body, self._cov, np.zeros((6, 6)))
+        return Candidate(T_odom_body, cov, up, view, self._new_stretch)
 
     # ------------------------------------------------------------------ the usual frame
 
@@ -98,8 +116,14 @@ class VisualTracker:
         T_odom_cam = se3.inverse(estimate.T)
         self._velocity = se3.log(se3.inverse(T_last) @ T_odom_cam) / dt
         self._tracks, self._T_odom_cam = tracks, T_odom_cam
-        candidate = self._keyframe(frame) if self._wants_keyframe(frame, T_odom_cam) else None
-        return self._result(estimate, candidate)
+        self._cov = se3.inverse_cov(estimate.T, estimate.cov)
+        wanted = self._wants_keyframe(frame, T_odom_cam)
+        if wanted:
+            self._reobserve(frame)
+            self._anchor(frame)
+        count = len(self._tracks.ids)
+        state = TrackState.OK if count >= self._config.weak_inliers else TrackState.WEAK
+        return TrackResult(state, self._T_odom_body(), wanted, count)
 
     def _find(self, image: U8, T_predicted: F64) -> _Tracks:
         assert self._image is not None
@@ -136,13 +160,6 @@ class VisualTracker:
         slow = np.linalg.norm(motion[3:]) < self._config.max_speed_m_s
         return bool(slow and np.linalg.norm(motion[:3]) < self._config.max_turn_rad_s)
 
-    def _result(self, estimate: PoseEstimate, candidate: Candidate | None) -> TrackResult:
-        assert self._T_odom_cam is not None
-        self._cov = se3.inverse_cov(estimate.T, estimate.cov)
-        count = len(self._tracks.ids)
-        state = TrackState.OK if count >= self._config.weak_inliers else TrackState.WEAK
-        return TrackResult(state, se3.orthonormal(self._T_odom_cam @ self._T_cam_body), candidate, count)
-
     # ------------------------------------------------------------------ keyframes
 
     def _wants_keyframe(self, frame: Frame, T_odom_cam: F64) -> bool:
@@ -156,20 +173,13 @@ class VisualTracker:
             or len(self._tracks.ids) < config.keyframe_tracked * self._keyframe_tracks
         )
 
-    def _keyframe(self, frame: Frame, new_stretch: bool = False) -> Candidate:
-        """Look again for points of earlier keyframes, refine the pose, add corners, show the view."""
-        if not new_stretch:
-            self._reobserve(frame)
+    def _anchor(self, frame: Frame, new_stretch: bool = False) -> None:
+        """Make this frame a keyframe of the local map, and its free corners points."""
         assert self._T_odom_cam is not None
-        view = make_view(frame, self._rig, self._config.view_features)
-        host = self._map.add_keyframe(LocalKeyframe(frame.image0, self._T_odom_cam, view))
+        host = self._map.add_keyframe(frame.image0, self._T_odom_cam)
         self._add_corners(frame, host)
         self._keyframe_ns, self._keyframe_tracks = frame.stamp_ns, len(self._tracks.ids)
-        self._T_odom_keyframe = self._T_odom_cam
-        T_odom_body = se3.orthonormal(self._T_odom_cam @ self._T_cam_body)
-        up = T_odom_body[2, :3] if self._gravity else np.zeros(3)
-        cov = se3.compose_cov(self._T_cam_body, self._cov + 1e-8 * np.eye(6), np.zeros((6, 6)))
-        return Candidate(T_odom_body, cov, up, view, new_stretch)
+        self._T_odom_keyframe, self._new_stretch = self._T_odom_cam, new_stretch
 
     def _reobserve(self, frame: Frame) -> None:
         config = self._config
@@ -215,30 +225,31 @@ class VisualTracker:
             up = self._rig.T_body_cam0[:3, :3] @ np.array([0.0, -1.0, 0.0])
         forward = self._rig.T_body_cam0[:3, 2]
         self._T_odom_cam = gravity.level(up, forward) @ self._rig.T_body_cam0
-        candidate = self._keyframe(frame, new_stretch=True)
+        self._anchor(frame, new_stretch=True)
         if len(self._tracks.ids) < self._config.min_inliers:
             self._T_odom_cam, self._tracks = None, _NO_TRACKS
             self._map = LocalMap(self._config.max_keyframes)
             return TrackResult(TrackState.INITIALISING, None)
-        return TrackResult(TrackState.OK, candidate.T_odom_body, candidate, len(self._tracks.ids))
+        return TrackResult(TrackState.OK, self._T_odom_body(), True, len(self._tracks.ids))
 
-    def _recover(self, frame: Frame, T_last: F64) -> TrackResult:
+    def _recover(self, frame: Frame) -> TrackResult:
         """Find ourselves in the local map; after a while, begin a new stretch where we were lost."""
         assert self._lost_since_ns is not None
         config = self._config
-        T_found = relocalise.find(self._map, frame, self._rig, config, self._seed)
-        if T_found is not None:
-            self._T_odom_cam, self._tracks, self._lost_since_ns = T_found, _NO_TRACKS, None
-            self._velocity = np.zeros(6)
-            return TrackResult(TrackState.WEAK, self._T_odom_body(), self._keyframe(frame))
-        if frame.stamp_ns - self._lost_since_ns < config.new_stretch_s * 1e9:
+        found = relocalise.find(self._map, frame, self._rig, config, self._seed)
+        waited_s = (frame.stamp_ns - self._lost_since_ns) * 1e-9
+        if found is not None:
+            self._T_odom_cam, self._tracks = found, _NO_TRACKS
+            self._reobserve(frame)
+        elif waited_s >= config.new_stretch_s:
+            self._map, self._tracks = LocalMap(config.max_keyframes), _NO_TRACKS
+        else:
             return TrackResult(TrackState.LOST, None)
-        self._map, self._tracks = LocalMap(config.max_keyframes), _NO_TRACKS
-        candidate = self._keyframe(frame, new_stretch=True)
+        self._anchor(frame, new_stretch=found is None)
         if len(self._tracks.ids) < config.min_inliers:
             return TrackResult(TrackState.LOST, None)
         self._lost_since_ns = None
-        return TrackResult(TrackState.WEAK, candidate.T_odom_body, candidate, len(self._tracks.ids))
+        return TrackResult(TrackState.WEAK, self._T_odom_body(), True, len(self._tracks.ids))
 
     def _T_odom_body(self) -> F64:
         assert self._T_odom_cam is not None

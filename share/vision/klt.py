@@ -57,6 +57,8 @@ def _lucas_kanade(
 
 def resemblance(source: U8, target: U8, px: F32, found_px: F32, half: int = 5) -> F32:
     """Normalised cross-correlation (N,) of the (2 half + 1)^2 patches: 1 is alike up to gain and bias."""
+    if len(px) == 0:
+        return np.zeros(0, np.float32)
     a, b = _patches(source, px, half), _patches(target, found_px, half)
     a = a - a.mean(axis=1, keepdims=True)
     b = b - b.mean(axis=1, keepdims=True)
