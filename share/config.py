@@ -23,9 +23,10 @@ class SequencerConfig:
     """How streams are merged by time."""
 
     sync_tolerance_ms: float = 5.0  # cameras of one frame lie within this
-    imu_silent_ms: float = 100.0  # a frame waits this long (stream time) for its IMU samples
+    imu_silent_ms: float = 100.0  # a frame waits this long (stream time) for partners and IMU samples
+    reorder_ms: float = 0.0  # disorder within one stream that is put right; delays frames by as much
     gap_factor: float = 2.5  # a step longer than this many frame intervals is a gap
-    max_jump_s: float = 10.0  # a step longer than this is not believed: refused, or a new stretch
+    max_jump_s: float = 10.0  # a longer step needs three witnesses to be believed, backward never is
 
 
 @dataclass(frozen=True)
@@ -54,11 +55,34 @@ class TrackerConfig:
 
 
 @dataclass(frozen=True)
+class PlaceConfig:
+    """When two views are taken for the same place."""
+
+    max_distance_bits: int = 64  # of 256: a match of two descriptors
+    ratio: float = 0.9  # best distance below this share of the runner-up's
+    min_matches: int = 25
+    ransac_px: float = 6.0  # reprojection error of a consensus
+    ransac_iterations: int = 1000
+    min_direction_inliers: int = 12  # 3D points of either view in the other's image
+    agree_depth_ratio: float = 0.1  # the two directions' positions differ less than this times the depth
+    agree_deg: float = 3.0  # … and their rotations less than this
+    sigma_px: float = 1.5  # of a keypoint
+    sigma_inverse_depth: float = 0.01  # 1/m, of a keypoint's depth: disparity noise / (focal * baseline)
+    inlier_chi2: float = 11.3  # squared Mahalanobis distance of an inlier (99 %, 3 dof)
+    min_inliers: int = 25
+    min_spread: float = 0.06  # narrow side (1 sigma) of the inliers, normalised coordinates
+    gravity_deg: float = 6.0  # rotation must keep "up" within this, where both views know it
+    floor_deg: float = 0.1  # added to what the residuals say: what inliers do not average away
+    floor_m: float = 0.005
+
+
+@dataclass(frozen=True)
 class Config:
     """The whole; one section per part."""
 
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     sequencer: SequencerConfig = field(default_factory=SequencerConfig)
+    place: PlaceConfig = field(default_factory=PlaceConfig)
 
 
 def load(text: str, where: str = "configuration") -> Config:

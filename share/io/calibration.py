@@ -1,0 +1,172 @@
+"""Calibration files to a `Rig`: Kalibr's chains, EuRoC's sensor.yaml, and camera.yaml of RGB-D folders.
+
+The body is the IMU's frame where there is an IMU, else cam0's. Cameras are pinhole with
+radial-tangential distortion or none; other models are refused by name. The files are written down
+in docs/data.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from share.errors import ConfigError
+from share.geometry import se3
+from share.geometry.camera import Camera, ImuNoise, Rig
+from share.io.section import Section, read_yaml
+from share.types import F64
+
+CAMCHAIN = "kalibr_imucam_chain.yaml"
+IMU_CHAIN = "kalibr_imu_chain.yaml"
+_RADTAN = ("radtan", "radial-tangential", "plumb_bob")
+_DEPTH_SCALE = 1000.0  # 16-bit depth in millimetres, as ROS and RealSense have it
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A rig and what else its file says. topics: stream -> ROS topic; depth_scale: units per metre."""
+
+    rig: Rig
+    where: str
+    depth_scale: float = _DEPTH_SCALE
+    topics: dict[str, str] = field(default_factory=dict)
+
+
+def read_calibration(path: Path) -> Calibration:
+    """A Kalibr camchain file, a folder with both Kalibr chains, or a camera.yaml. Raises ConfigError."""
+    if path.is_dir():
+        if not (path / CAMCHAIN).exists():
+            raise ConfigError(f"{path}: has no {CAMCHAIN}; give a Kalibr camchain file or a folder with one")
+        imu = path / IMU_CHAIN
+        return read_kalibr(path / CAMCHAIN, imu if imu.exists() else None)
+    top = read_yaml(path)
+    return read_kalibr(path) if "cam0" in top else read_camera_yaml(path)
+
+
+def read_kalibr(path: Path, imu_path: Path | None = None) -> Calibration:
+    """Kalibr's camchain and, if given, IMU chain. Without the latter the rig has no IMU, body = cam0."""
+    top = read_yaml(path)
+    cam0, topics = top.section("cam0"), {}
+    imu = None
+    if imu_path:
+        section = read_yaml(imu_path).section("imu0")
+        imu, topics["imu"] = _imu_noise(section, "update_rate"), section.text("rostopic", "")
+    rig = Rig(cam0=_camera(cam0), T_body_cam0=_kalibr_T_imu_cam(cam0) if imu else np.eye(4), imu=imu)
+    for name in ("cam0", "cam1", "depth"):
+        if name in top:
+            topics[name] = top.section(name).text("rostopic", "")
+    if "cam1" in top:
+        cam1 = top.section("cam1")
+        rig = replace(rig, cam1=_camera(cam1), T_cam1_cam0=_kalibr_T_cam1_cam0(cam0, cam1))
+    scale = _DEPTH_SCALE
+    if "depth" in top:  # not Kalibr's: an RGB-D sensor's depth camera in the same file
+        depth = top.section("depth")
+        rig = replace(rig, depth=_camera(depth), T_depth_cam0=depth.pose("T_depth_cam0"))
+        scale = depth.number("depth_scale", _DEPTH_SCALE, positive=True)
+    return Calibration(rig, str(path), scale, {k: v for k, v in topics.items() if v})
+
+
+def read_camera_yaml(path: Path) -> Calibration:
+    """camera.yaml of a TUM RGB-D folder: one colour camera and its depth, registered or not."""
+    top = read_yaml(path)
+    cam0 = _camera(top)
+    if "depth_intrinsics" in top:
+        fx, fy, cx, cy = top.numbers("depth_intrinsics", (4,))
+        width, height = _resolution(top, "depth_resolution" if "depth_resolution" in top else "resolution")
+        depth, T = _make(top, width, height, fx, fy, cx, cy, ()), top.pose("T_depth_cam0")
+    else:  # registered: depth lies on the pixels of the undistorted colour image
+        depth, T = replace(cam0, distortion=()), np.eye(4)
+    rig = Rig(cam0=cam0, T_body_cam0=np.eye(4), depth=depth, T_depth_cam0=T)
+    return Calibration(rig, str(path), top.number("depth_scale", positive=True))
+
+
+def read_euroc(cam0: Path, cam1: Path | None, imu0: Path | None) -> Calibration:
+    """sensor.yaml files of an ASL folder. T_BS of every sensor is taken into the IMU's frame."""
+    section = read_yaml(cam0)
+    T_b_cam0 = section.pose("T_BS")
+    rig = Rig(cam0=_camera(section), T_body_cam0=np.eye(4))
+    if cam1:
+        other = read_yaml(cam1)
+        T_cam1_cam0 = se3.inverse(other.pose("T_BS")) @ T_b_cam0
+        rig = replace(rig, cam1=_camera(other), T_cam1_cam0=T_cam1_cam0)
+    if imu0:
+        imu = read_yaml(imu0)
+        T_imu_cam0 = se3.inverse(imu.pose("T_BS")) @ T_b_cam0
+        rig = replace(rig, imu=_imu_noise(imu, "rate_hz"), T_body_cam0=T_imu_cam0)
+    return Calibration(rig, str(cam0))
+
+
+def _camera(section: Section) -> Camera:
+    model = section.text("camera_model", "pinhole")
+    if model != "pinhole":
+        raise ConfigError(f"{section.where}: camera_model '{model}' is not supported; supported: pinhole")
+    fx, fy, cx, cy = section.numbers("intrinsics", (4,))
+    width, height = _resolution(section, "resolution")
+    return _make(section, width, height, fx, fy, cx, cy, _distortion(section))
+
+
+def _make(
+    section: Section,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    distortion: tuple[float, ...],
+) -> Camera:
+    try:
+        return Camera(width, height, fx, fy, cx, cy, distortion)
+    except ValueError as error:
+        raise ConfigError(f"{section.where}: {error}") from None
+
+
+def _resolution(section: Section, key: str) -> tuple[int, int]:
+    width, height = section.numbers(key, (2,))
+    return int(width), int(height)
+
+
+def _distortion(section: Section) -> tuple[float, ...]:
+    model = section.text("distortion_model", "none")
+    if model == "none":
+        return ()
+    if model not in _RADTAN:
+        raise ConfigError(
+            f"{section.where}: distortion_model '{model}' is not supported; supported: {', '.join(_RADTAN)}, "
+            "none (calibrate again with one of these)"
+        )
+    key = "distortion_coeffs" if "distortion_coeffs" in section else "distortion_coefficients"
+    return tuple(section.numbers(key, (4, 5)))
+
+
+def _imu_noise(section: Section, rate: str) -> ImuNoise:
+    def positive(key: str) -> float:
+        return section.number(key, positive=True)
+
+    return ImuNoise(
+        gyro_density=positive("gyroscope_noise_density"),
+        accel_density=positive("accelerometer_noise_density"),
+        gyro_walk=positive("gyroscope_random_walk"),
+        accel_walk=positive("accelerometer_random_walk"),
+        rate_hz=positive(rate),
+    )
+
+
+def _kalibr_T_imu_cam(cam: Section) -> F64:
+    """`T_cam_imu` takes IMU coordinates to the camera (Kalibr's own); `T_imu_cam` the other way."""
+    if "T_cam_imu" in cam:
+        return se3.inverse(cam.pose("T_cam_imu"))
+    if "T_imu_cam" in cam:
+        return cam.pose("T_imu_cam")
+    raise ConfigError(f"{cam.where}: has no extrinsics to the IMU; add T_cam_imu (or T_imu_cam)")
+
+
+def _kalibr_T_cam1_cam0(cam0: Section, cam1: Section) -> F64:
+    """`T_cn_cnm1` takes coordinates of the previous camera, cam0, to cam1; else by way of the IMU."""
+    if "T_cn_cnm1" in cam1:
+        return cam1.pose("T_cn_cnm1")
+    if not ({"T_cam_imu", "T_imu_cam"} & cam1.data.keys()):
+        raise ConfigError(f"{cam1.where}: has no extrinsics to cam0; add T_cn_cnm1, T_cam_imu or T_imu_cam")
+    return se3.inverse(_kalibr_T_imu_cam(cam1)) @ _kalibr_T_imu_cam(cam0)

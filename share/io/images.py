@@ -1,0 +1,154 @@
+"""Encoded images to arrays: gray uint8, or depth as float32 metres. Damage is found, never shown.
+
+libjpeg fills a truncated image with gray and goes on, so end markers are looked for first; PNG
+checksums are verified, because a decoder may hand out half a depth map.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from share.core.sequencer import Bundle
+from share.errors import DataError
+from share.geometry.camera import Camera
+from share.types import F32, U8, Frame
+
+_MEND = "record or copy it again, or take it out of the list"
+_TAIL = 64  # bytes in which an end marker may be followed by padding
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what is wrong is said once, by DataError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EncodedImage:
+    """A JPEG or PNG in a file (`data` is its path) or in memory (bytes), with where it came from.
+
+    width, height: what the calibration says. depth_scale: units per metre of a 16-bit depth PNG,
+    0 for a gray or colour image.
+    """
+
+    data: Path | bytes
+    where: str
+    width: int
+    height: int
+    depth_scale: float = 0.0
+
+    def read(self) -> bytes:
+        """The encoded bytes. Raises DataError if the file is missing or the image is cut short."""
+        data = self.data if isinstance(self.data, bytes) else _read_file(self.data)
+        check_complete(data, self.where)
+        return data
+
+    def load(self) -> NDArray[Any]:
+        data = self.read()
+        image = (
+            decode_depth(data, self.depth_scale, self.where)
+            if self.depth_scale
+            else decode_gray(data, self.where)
+        )
+        return check_size(image, self.width, self.height, self.where)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArrayImage:
+    """An image that needs no decoding: (H, W) uint8 or float32 m."""
+
+    array: NDArray[Any]
+
+    def load(self) -> NDArray[Any]:
+        return self.array
+
+
+def file_image(path: Path, camera: Camera, depth_scale: float = 0.0) -> EncodedImage:
+    """A lazily read image file of `camera`."""
+    return EncodedImage(path, str(path), camera.width, camera.height, depth_scale)
+
+
+def load(bundle: Bundle) -> Frame:
+    """Decode the images of a bundle. Raises DataError naming the image that is damaged."""
+    return Frame(
+        stamp_ns=bundle.stamp_ns,
+        index=bundle.index,
+        image0=bundle.image0.load(),
+        image1=None if bundle.image1 is None else bundle.image1.load(),
+        depth=None if bundle.depth is None else bundle.depth.load(),
+        imu=bundle.imu,
+        gap_ns=bundle.gap_ns,
+    )
+
+
+def decode_gray(data: bytes, where: str) -> U8:
+    """JPEG or PNG, gray or colour -> (H, W) uint8."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise DataError(f"{where}: the image cannot be decoded; {_MEND}")
+    return np.asarray(image, np.uint8)
+
+
+def decode_depth(data: bytes, depth_scale: float, where: str) -> F32:
+    """16-bit PNG -> (H, W) float32 m, 0 = no reading."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise DataError(f"{where}: the depth image cannot be decoded; {_MEND}")
+    return depth_metres(np.asarray(image), depth_scale, where)
+
+
+def depth_metres(raw: NDArray[Any], depth_scale: float, where: str) -> F32:
+    """(H, W) uint16 -> float32 m."""
+    if raw.ndim != 2 or raw.dtype != np.uint16:
+        raise DataError(f"{where}: depth must have one 16-bit channel, found {raw.dtype} {raw.shape}")
+    return np.asarray(raw / np.float32(depth_scale), np.float32)
+
+
+def check_size(image: NDArray[Any], width: int, height: int, where: str) -> NDArray[Any]:
+    """`image` if it is as large as the calibration says, else DataError."""
+    if image.shape != (height, width):
+        raise DataError(
+            f"{where}: is {image.shape[1]}x{image.shape[0]}, but the calibration is for {width}x{height}; "
+            "give the calibration of this recording with --calib"
+        )
+    return image
+
+
+def check_complete(data: bytes, where: str) -> None:
+    """Raises DataError unless `data` is a JPEG or PNG from its first marker to its last."""
+    if data[:2] == b"\xff\xd8":
+        complete = b"\xff\xd9" in data[-_TAIL:]
+    elif data[:8] == _PNG:
+        complete = b"IEND" in data[-_TAIL:] and _png_sound(data)
+    elif not data:
+        raise DataError(f"{where}: the image is empty; {_MEND}")
+    else:
+        raise DataError(f"{where}: is neither JPEG nor PNG; convert it, or record again")
+    if not complete:
+        raise DataError(f"{where}: the image is cut short or damaged; {_MEND}")
+
+
+def _png_sound(data: bytes) -> bool:
+    """Whether every chunk's CRC holds (PNG specification, 5.3)."""
+    at = 8
+    while at + 12 <= len(data):
+        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return False
+        if data[at + 4 : at + 8] == b"IEND":
+            return True
+        at = end + 4
+    return False
+
+
+def _read_file(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise DataError(f"{path}: the image is listed but missing; {_MEND}") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror}") from None

@@ -1,0 +1,106 @@
+"""A mapping of a YAML file that knows where it stands, so that every complaint names file and key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from share.errors import ConfigError
+from share.types import F64, checked_pose
+
+
+class Section:
+    """One mapping of a YAML file. Every reader raises ConfigError naming file and key."""
+
+    def __init__(self, data: Any, where: str) -> None:
+        if not isinstance(data, dict):
+            raise ConfigError(f"{where}: expected keys and values, found {_kind(data)}")
+        self.data: dict[Any, Any] = data
+        self.where = where
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.data
+
+    def get(self, key: str) -> Any:
+        if key not in self.data:
+            raise ConfigError(f"{self.where}: key '{key}' is missing")
+        return self.data[key]
+
+    def section(self, key: str) -> Section:
+        return Section(self.get(key), f"{self.where}: {key}")
+
+    def text(self, key: str, default: str | None = None) -> str:
+        value = self.get(key) if default is None else self.data.get(key, default)
+        if not isinstance(value, str):
+            raise ConfigError(f"{self.where}: {key}: expected a word, found {_kind(value)}")
+        return value
+
+    def number(self, key: str, default: float | None = None, positive: bool = False) -> float:
+        value = self.get(key) if default is None else self.data.get(key, default)
+        number = self._numbers(key, [value])[0]
+        if positive and number <= 0:
+            raise ConfigError(f"{self.where}: {key}: {value} must be positive")
+        return float(number)
+
+    def numbers(self, key: str, lengths: tuple[int, ...]) -> list[float]:
+        value = self.get(key)
+        if not isinstance(value, list) or len(value) not in lengths:
+            have = len(value) if isinstance(value, list) else _kind(value)
+            raise ConfigError(
+                f"{self.where}: {key}: expected {' or '.join(map(str, lengths))} numbers, found {have}"
+            )
+        return self._numbers(key, value)
+
+    def pose(self, key: str) -> F64:
+        """A rigid 4x4: rows, 16 numbers, or OpenCV's {rows, cols, data}."""
+        value = self.get(key)
+        if isinstance(value, dict):
+            value = value.get("data")
+        flat = [x for row in value for x in (row if isinstance(row, list) else [row])] if value else []
+        if len(flat) != 16:
+            raise ConfigError(f"{self.where}: {key}: expected a 4x4 matrix, found {len(flat)} numbers")
+        try:
+            return checked_pose(key, np.reshape(self._numbers(key, flat), (4, 4)))
+        except ValueError:
+            raise ConfigError(
+                f"{self.where}: {key}: is not a rigid transform (a rotation and a translation over 0 0 0 1)"
+            ) from None
+
+    def _numbers(self, key: str, values: list[Any]) -> list[float]:
+        try:
+            numbers = [float(value) for value in values]  # PyYAML reads 1e-3 as text
+        except (TypeError, ValueError):
+            raise ConfigError(f"{self.where}: {key}: expected numbers, found {values}") from None
+        if not np.isfinite(numbers).all():
+            raise ConfigError(f"{self.where}: {key}: has values that are not finite: {values}")
+        return numbers
+
+
+def read_yaml(path: Path) -> Section:
+    """The top mapping of a YAML file, also of one that OpenCV wrote (`%YAML:1.0`, `!!opencv-matrix`)."""
+    import yaml
+
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; give the calibration with --calib") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: is not a text file") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    lines = text.replace("!!opencv-matrix", "").split("\n")
+    if lines[0].startswith("%YAML"):  # not valid YAML: the directive needs a space, and a `---` after it
+        lines[0] = ""
+    try:
+        return Section(yaml.safe_load("\n".join(lines)), str(path))
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark else ""
+        reason = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise ConfigError(f"{path}{line}: not valid YAML: {reason}") from None
+
+
+def _kind(value: Any) -> str:
+    return "nothing" if value is None else f"{type(value).__name__} {value!r:.40}"

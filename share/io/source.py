@@ -1,0 +1,53 @@
+"""A SOURCE on the command line to the reader that knows it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from share.errors import UsageError
+from share.io.calibration import Calibration, read_calibration
+from share.io.euroc import is_euroc, open_euroc
+from share.io.recording import Source
+from share.io.tum import is_tum, open_tum
+
+__all__ = ["READERS", "Source", "open_source"]
+
+
+class Reader(NamedTuple):
+    """One kind of recording: how to know it, and how to open it."""
+
+    what: str
+    knows: Callable[[Path], bool]
+    open: Callable[[Path, Calibration | None, slice | None], Source]
+
+
+READERS = (
+    Reader("an EuRoC/ASL folder (mav0/)", is_euroc, open_euroc),
+    Reader("a TUM RGB-D folder (rgb.txt, depth.txt, camera.yaml)", is_tum, open_tum),
+)
+
+
+def open_source(spec: str, calib: str | None = None, frames: slice | None = None) -> Source:
+    """The recording that `spec` names, with the calibration `calib` in place of its own.
+
+    frames: only these images of cam0 (by number, no step), and the IMU samples since the one before.
+    Raises UsageError, ConfigError or DataError.
+    """
+    if spec == "realsense" or spec.startswith("realsense:"):
+        raise UsageError(f"{spec}: live cameras come with `share capture`, which this version does not have")
+    path = Path(spec)
+    calibration = None if calib is None else read_calibration(_existing(Path(calib), "--calib"))
+    for reader in READERS:
+        if reader.knows(path):
+            return reader.open(path, calibration, frames)
+    _existing(path, "SOURCE")
+    known = "; ".join(reader.what for reader in READERS)
+    raise UsageError(f"{spec}: is none of the recordings that SHARE reads: {known}")
+
+
+def _existing(path: Path, what: str) -> Path:
+    if not path.exists():
+        raise UsageError(f"{what} {path}: no such file or folder")
+    return path
