@@ -90,7 +90,9 @@ class Renderer:
     def _window(self, box: F64, T_world_cam: F64) -> tuple[slice, slice] | None:
         """The part of the image that may show the box, or None."""
         c = self._camera
-        corners = np.array([[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+        corners = np.array(
+            [[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+        )
         seen = transform(inverse(T_world_cam), corners)
         if (seen[:, 2] < _NEAR).all():
             return None

@@ -88,6 +88,8 @@ def _picture(rng: np.random.Generator, boxes: F64, face: int) -> U8:
     picture = draw(rng, size, TEXELS_PER_M) * _SHADE[across]
     if face < 6:
         picture *= _corner_shadow(size)
+    if across < 2 and (across + face) % 2 == (face < 6):
+        picture = picture[:, ::-1]  # columns rise with the world axis: turn what is seen the other way
     return cv2.GaussianBlur(picture.clip(4, 250), (0, 0), 0.7).astype(np.uint8)
 
 

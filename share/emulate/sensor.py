@@ -48,11 +48,15 @@ class Sensor:
         hole = step | (gaps > _HOLE) | (measured < _NEAREST) | (measured > _FARTHEST)
         return np.where(hole, 0, measured * 1000 + 0.5).astype(np.uint16)
 
-    def _read(self, banks: list[np.ndarray], shape: tuple[int, ...], key: tuple[int, ...]) -> list[np.ndarray]:
+    def _read(
+        self, banks: list[np.ndarray], shape: tuple[int, ...], key: tuple[int, ...]
+    ) -> list[np.ndarray]:
         rng = np.random.default_rng((*self._seed, *key))
         out = []
         for bank in banks:
-            top, left = rng.integers(0, [n - m for n, m in zip(bank.shape, shape, strict=True)], endpoint=True)
+            top, left = rng.integers(
+                0, [n - m for n, m in zip(bank.shape, shape, strict=True)], endpoint=True
+            )
             out.append(bank[top : top + shape[0], left : left + shape[1]])
         return out
 

@@ -41,6 +41,16 @@ def courses(rng: Rng, size: Size, height: int, width: int, contrast: float, join
     return out
 
 
+def marks(rng: Rng, surface: F32, per_m2: float, per_m: float) -> None:
+    """Stains and scratches of 1-6 cm, in place: what keeps a bare surface from being blank."""
+    h, w = surface.shape
+    for _ in range(int(per_m2 * h * w / per_m**2)):
+        at = int(rng.integers(w)), int(rng.integers(h))
+        half = int(rng.uniform(0.005, 0.03) * per_m), int(rng.uniform(0.003, 0.01) * per_m)
+        gray = float(surface[at[1], at[0]]) + float(rng.choice([-55, -35, 35]))
+        cv2.ellipse(surface, at, half, float(rng.uniform(0, 180)), 0, 360, gray, -1)
+
+
 def poster(rng: Rng, size: Size) -> F32:
     """A printed sheet: shapes, lines and letters on a plain ground, in a frame."""
     h, w = size
@@ -62,7 +72,9 @@ def poster(rng: Rng, size: Size) -> F32:
         else:
             text = "".join(rng.choice(list("ABCDEFGHKLMNPRSTUVXYZ2345789"), 6))
             scale = float(rng.uniform(0.4, 1.6))
-            cv2.putText(sheet, text, (x - w // 4, y), cv2.FONT_HERSHEY_SIMPLEX, scale, gray, 1 + int(2 * scale))
+            cv2.putText(
+                sheet, text, (x - w // 4, y), cv2.FONT_HERSHEY_SIMPLEX, scale, gray, 1 + int(2 * scale)
+            )
     cv2.rectangle(sheet, (1, 1), (w - 2, h - 2), float(rng.uniform(10, 80)), 3)
     return sheet.astype(np.float32)
 
@@ -81,8 +93,8 @@ def wall(rng: Rng, size: Size, per_m: float) -> F32:
     out = rng.uniform(120, 170) + clouds(rng, size, {256: 14, 64: 7, 16: 4, 4: 3})
     if rng.random() < 0.5:
         out += courses(rng, size, int(0.16 * per_m), int(0.4 * per_m), 9, 14)
-    area = size[0] * size[1] / per_m**2
-    hang(rng, out, int(0.9 * area), 0.25, 0.95, per_m)
+    marks(rng, out, 12, per_m)
+    hang(rng, out, int(0.8 * size[0] * size[1] / per_m**2), 0.25, 0.95, per_m)
     return out
 
 
@@ -90,6 +102,7 @@ def floor(rng: Rng, size: Size, per_m: float) -> F32:
     """Planks with grain."""
     out = rng.uniform(90, 130) + clouds(rng, size, {256: 10, 32: 6, 8: 5, 4: 4})
     out += courses(rng, size, int(0.22 * per_m), int(1.3 * per_m), 14, 18)
+    marks(rng, out, 15, per_m)
     return out
 
 
@@ -97,7 +110,8 @@ def ceiling(rng: Rng, size: Size, per_m: float) -> F32:
     """Pale panels and lamps."""
     out = 175 + clouds(rng, size, {256: 8, 32: 4, 8: 3})
     out += courses(rng, size, int(0.6 * per_m), int(0.9 * per_m), 8, 30)
-    hang(rng, out, 10, 0.2, 0.5, per_m)
+    marks(rng, out, 8, per_m)
+    hang(rng, out, 12, 0.2, 0.5, per_m)
     return out
 
 
@@ -112,9 +126,9 @@ def shelf(rng: Rng, size: Size, per_m: float) -> F32:
             thick = int(rng.uniform(0.025, 0.09) * per_m)
             head = top + board + int(rng.uniform(0.02, 0.12) * per_m)
             if rng.random() < 0.85 and head < foot:
-                out[head:foot, left : left + thick - 1] += rng.uniform(-50, 150)
+                out[head:foot, left : left + thick - 1] += rng.uniform(-20, 100)
                 band = int(rng.integers(head, foot))
-                out[band : band + int(0.04 * per_m), left : left + thick - 1] += rng.uniform(-60, 60)
+                out[band : band + int(0.04 * per_m), left : left + thick - 1] += rng.uniform(-40, 40)
             left += thick
     return out
 
