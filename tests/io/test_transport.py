@@ -1,0 +1,247 @@
+"""One suite for all links: what ZeroMQ does and what the in-process network does must not differ."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from typing import Any
+
+import pytest
+import zmq
+
+from share.errors import TransportError, UsageError
+from share.io.transport import LINGER_MS, QUEUE_MESSAGES, AgentLink, EdgeLink, bind, connect, parse_address
+from share.io.transport.memory import MemoryNetwork
+from share.wire.codec import MAX_FRAME_BYTES, encode
+from share.wire.messages import Bye, Ping, peer_id
+
+
+class Net:
+    """Opens links of one kind and closes them all at the end."""
+
+    def __init__(self, kind: str, stack: ExitStack) -> None:
+        self.kind, self._stack, self._memory = kind, stack, MemoryNetwork()
+
+    def edge(self, at: str | None = None) -> EdgeLink:
+        if self.kind == "zmq":
+            return self._stack.enter_context(closing(bind(at or "tcp://127.0.0.1:0")))
+        return self._stack.enter_context(closing(self._memory.bind(at or "edge")))
+
+    def agent(self, at: str, run_id: int = 1) -> AgentLink:
+        link = connect(at, run_id) if self.kind == "zmq" else self._memory.connect(at, run_id)
+        return self._stack.enter_context(closing(link))
+
+
+@pytest.fixture(params=["zmq", "memory"])
+def net(request: pytest.FixtureRequest) -> Iterator[Net]:
+    with ExitStack() as stack:
+        yield Net(request.param, stack)
+
+
+def eventually(what: Callable[[], Any], within_s: float = 5.0) -> Any:
+    """The first true value of `what()`."""
+    end = time.monotonic() + within_s
+    while not (value := what()):
+        assert time.monotonic() < end, "did not happen in time"
+        time.sleep(0.005)
+    return value
+
+
+def joined(net: Net, edge: EdgeLink, run_id: int = 1) -> AgentLink:
+    """An agent that the edge has heard once."""
+    agent = net.agent(edge.endpoint, run_id)
+    eventually(lambda: agent.send([b"hello"]))
+    assert eventually(lambda: edge.receive(100)) == (peer_id(run_id), [b"hello"])
+    return agent
+
+
+def test_a_message_goes_there_and_back_in_its_frames(net: Net) -> None:
+    edge = net.edge()
+    agent = joined(net, edge)
+    assert agent.send([*encode(Ping(1, 2)), memoryview(bytes(range(256)) * 250), b""])
+    peer, frames = eventually(lambda: edge.receive(100))
+    assert (peer, len(frames), len(frames[1])) == (peer_id(1), 3, 64_000)
+    assert edge.send(peer, frames)
+    assert eventually(lambda: agent.receive(100)) == frames
+
+
+def test_without_an_edge_nothing_is_sent_and_nothing_blocks(net: Net) -> None:
+    edge = net.edge()
+    address = edge.endpoint
+    edge.close()
+    agent = net.agent(address)
+    start = time.monotonic()
+    assert [agent.send([b"x"]) for _ in range(1000)] == [False] * 1000
+    assert agent.receive(0) is None
+    assert time.monotonic() - start < 0.5
+
+
+def test_what_was_sent_to_an_absent_edge_does_not_arrive_later(net: Net) -> None:
+    first = net.edge()
+    agent = joined(net, first)
+    first.close()
+    eventually(lambda: not agent.send([b"gap"]))
+    assert not any(agent.send([b"gap"]) for _ in range(10))
+    second = net.edge(first.endpoint)
+    eventually(lambda: agent.send([b"new"]))
+    assert eventually(lambda: second.receive(100)) == (peer_id(1), [b"new"])
+
+
+def test_a_restarted_edge_is_found_again_and_can_send(net: Net) -> None:
+    edge = net.edge()
+    agent = joined(net, edge)
+    for life in range(3):
+        edge.close()
+        edge = net.edge(edge.endpoint)
+        eventually(lambda: edge.send(peer_id(1), [b"%d" % life]))  # noqa: B023
+        assert eventually(lambda: agent.receive(100)) == [b"%d" % life]
+
+
+def test_sending_to_a_peer_that_is_not_there_says_so(net: Net) -> None:
+    edge = net.edge()
+    assert not edge.send(peer_id(77), [b"x"])
+    agent = joined(net, edge, 77)
+    assert edge.send(peer_id(77), [b"x"])
+    agent.close()
+    eventually(lambda: not edge.send(peer_id(77), [b"x"]))
+
+
+def test_a_slow_reader_costs_bounded_memory_and_blocks_nobody(net: Net) -> None:
+    edge = net.edge()
+    agent = joined(net, edge)
+    payload = [bytes(26_000)]
+    start = time.monotonic()
+    taken = sum(agent.send(payload) for _ in range(5000))
+    assert QUEUE_MESSAGES <= taken < 1500  # two queues and what the kernel holds
+    taken = sum(edge.send(peer_id(1), payload) for _ in range(5000))
+    assert QUEUE_MESSAGES <= taken < 1500
+    assert time.monotonic() - start < 3
+    while edge.receive(50):
+        pass
+    assert eventually(lambda: agent.send([b"again"]))
+
+
+def test_many_agents_are_told_apart(net: Net) -> None:
+    edge = net.edge()
+    agents = {peer_id(k): net.agent(edge.endpoint, k) for k in (-5, 0, 1, 255, 2**62, *range(10, 25))}
+    for peer, agent in agents.items():
+        eventually(lambda agent=agent, peer=peer: agent.send([peer]))
+    heard = [eventually(lambda: edge.receive(100)) for _ in agents]
+    assert {peer: [peer] for peer in agents} == dict(heard)
+    for peer in agents:
+        assert edge.send(peer, [b"to " + peer])
+    for peer, agent in agents.items():
+        assert eventually(lambda agent=agent: agent.receive(100)) == [b"to " + peer]
+
+
+def test_an_agent_that_comes_back_twice_is_still_one_peer(net: Net) -> None:
+    edge = net.edge()
+    stale = joined(net, edge)
+    fresh = net.agent(edge.endpoint, 1)  # the same run over another path: the old one is half open
+    eventually(lambda: fresh.send([b"back"]))
+    assert eventually(lambda: edge.receive(100)) == (peer_id(1), [b"back"])
+    assert edge.send(peer_id(1), [b"welcome"])
+    assert eventually(lambda: fresh.receive(100)) == [b"welcome"]
+    assert stale.receive(20) is None
+
+
+@pytest.mark.parametrize("side", ["edge", "agent"])
+def test_wake_from_another_thread(net: Net, side: str) -> None:
+    edge = net.edge()
+    agent = joined(net, edge)
+    link: Any = edge if side == "edge" else agent
+    timer = threading.Timer(0.1, link.wake)
+    timer.start()
+    start = time.monotonic()
+    assert link.receive(5000) is None
+    assert 0.05 < time.monotonic() - start < 2
+    timer.join()
+    link.wake()
+    link.wake()
+    start = time.monotonic()
+    assert link.receive(5000) is None  # a wake before the call is not lost
+    assert time.monotonic() - start < 1
+    start = time.monotonic()
+    assert link.receive(100) is None  # … and spent once
+    assert time.monotonic() - start > 0.08
+    link.close()
+    link.wake()
+
+
+def test_the_last_message_leaves_before_close(net: Net) -> None:
+    edge = net.edge()
+    agent = joined(net, edge)
+    assert agent.send(encode(Bye()))
+    start = time.monotonic()
+    agent.close()
+    agent.close()
+    assert time.monotonic() - start < LINGER_MS / 1000 + 0.5
+    assert eventually(lambda: edge.receive(100)) == (peer_id(1), encode(Bye()))
+
+
+def test_an_address_in_use_is_said_in_one_line(net: Net) -> None:
+    edge = net.edge()
+    with pytest.raises(TransportError, match="in use; stop the other edge or choose another") as caught:
+        net.edge(edge.endpoint)
+    assert edge.endpoint in str(caught.value)
+    edge.close()
+    net.edge(edge.endpoint)
+
+
+# ---------------------------------------------------------------- ZeroMQ alone
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "127.0.0.1:5555", "tcp://:5", "tcp://h", "tcp://h:x", "tcp://h:70000", "udp://h:5", "tcp://h:0"],
+)
+def test_malformed_addresses(text: str) -> None:
+    with pytest.raises(UsageError, match="is not an address; expected tcp://HOST:PORT"):
+        connect(text, 1)
+
+
+def test_addresses() -> None:
+    assert str(parse_address("tcp://[::1]:5")) == "tcp://[::1]:5"
+    assert parse_address("tcp://localhost:0", bind=True).local
+    assert parse_address("tcp://127.8.9.1:7").local
+    assert not parse_address("tcp://0.0.0.0:7").local
+    assert not parse_address("tcp://example.org:7").local
+
+
+def test_only_loopback_without_keys() -> None:
+    with pytest.raises(TransportError, match=r"0\.0\.0\.0.*without keys"):
+        bind("tcp://0.0.0.0:0")
+
+
+@pytest.mark.parametrize("host", ["localhost", "127.0.0.1"])
+def test_loopback_names(host: str) -> None:
+    with closing(bind(f"tcp://{host}:0")) as edge:
+        assert parse_address(edge.endpoint).port > 0
+
+
+def test_an_oversized_frame_is_not_let_in_and_harms_nobody() -> None:
+    with closing(bind("tcp://127.0.0.1:0")) as edge, closing(connect(edge.endpoint, 2)) as good:
+        context = zmq.Context()
+        rogue = context.socket(zmq.DEALER)
+        rogue.setsockopt(zmq.LINGER, 0)
+        rogue.connect(edge.endpoint)
+        rogue.send(bytes(MAX_FRAME_BYTES + 1))
+        rogue.send_multipart([b"part"] * 5000)
+        eventually(lambda: good.send([b"fine"]))
+        heard = [message for message in (edge.receive(200) for _ in range(4)) if message]
+        assert (peer_id(2), [b"fine"]) in heard
+        assert max(len(frames) for _, frames in heard) < 12
+        rogue.close()
+        context.term()
+
+
+def test_bytes_that_are_not_zeromq_harm_nobody() -> None:
+    with closing(bind("tcp://127.0.0.1:0")) as edge, closing(connect(edge.endpoint, 2)) as agent:
+        raw = socket.create_connection(("127.0.0.1", parse_address(edge.endpoint).port))
+        raw.sendall(b"GET / HTTP/1.1\r\n\r\n" + bytes(range(256)) * 40)
+        eventually(lambda: agent.send([b"fine"]))
+        assert eventually(lambda: edge.receive(100)) == (peer_id(2), [b"fine"])
+        raw.close()
