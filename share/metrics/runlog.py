@@ -47,6 +47,9 @@ class RunLog:
         self.rows.append(row)
         self._by_stamp[stamp_ns] = row
 
+    def add_decode(self, cpu_s: float) -> None:
+        self.decode_s += cpu_s
+
     def mark_sent(self, stamp_ns: int) -> None:
         self._by_stamp[stamp_ns].sent = True
 

@@ -1,0 +1,47 @@
+"""From a source to tracked frames: what `share track` and `share agent` have in common."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+from share.config import Config
+from share.core.sequencer import SequencerCounters, sequence, streams_of
+from share.errors import DataError, UsageError
+from share.estimator.visual import VisualTracker
+from share.io.images import load
+from share.io.source import Source
+from share.types import Frame
+
+
+def frames_of(
+    source: Source,
+    config: Config,
+    counters: SequencerCounters,
+    on_bad: Callable[[DataError], None] | None = None,
+    spent: Callable[[float], None] = lambda cpu_s: None,
+) -> Iterator[Frame]:
+    """Decoded frames in order. A damaged image raises DataError, or goes to `on_bad` and is left out.
+
+    `spent` is told the CPU time of each frame's decoding on this thread.
+    """
+    streams = streams_of(source.rig)
+    bundles = sequence(source.measurements(), streams, source.rate_hz, config.sequencer, counters)
+    for bundle in bundles:
+        began = time.thread_time()
+        try:
+            frame = load(bundle)
+        except DataError as error:
+            if on_bad is None:
+                raise
+            on_bad(error)
+            continue
+        spent(time.thread_time() - began)
+        yield frame
+
+
+def tracker_for(source: Source, config: Config) -> VisualTracker:
+    """The estimator that fits the rig. The inertial one takes this place where there is an IMU."""
+    if source.rig.cam1 is None and source.rig.depth is None:
+        raise UsageError(f"{source.name}: one camera without depth gives no scale; stereo or depth is needed")
+    return VisualTracker(source.rig, config.tracker)

@@ -1,0 +1,59 @@
+"""One agent over one recording, no edge, as fast as it goes, and the same every time."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from share import __version__, config
+from share.core.sequencer import SequencerCounters
+from share.io.source import Source
+from share.io.trajectory import Trajectory
+from share.metrics.runlog import RunLog
+from share.run.pipeline import frames_of, tracker_for
+
+
+@dataclass(frozen=True, eq=False)
+class TrackRun:
+    """Causal poses of the body in odom, one for every frame that had one, and the report."""
+
+    trajectory: Trajectory
+    report: dict[str, Any]
+
+
+def track(source: Source, settings: config.Config, progress: Callable[[int], None]) -> TrackRun:
+    """Track every frame in turn. `progress` is called with 1 after each."""
+    tracker, log, counters = tracker_for(source, settings), RunLog(), SequencerCounters()
+    stamps, poses = [], []
+    for frame in frames_of(source, settings, counters, spent=log.add_decode):
+        began, cpu = time.perf_counter(), time.process_time()
+        result = tracker.track(frame)
+        track_ms = 1e3 * (time.perf_counter() - began)
+        if result.keyframe:
+            tracker.keyframe(frame)
+        log.cpu_s += time.process_time() - cpu
+        log.add(frame.stamp_ns, track_ms, result.state, result.keyframe)
+        if result.T_odom_body is not None:
+            stamps.append(frame.stamp_ns)
+            poses.append(result.T_odom_body)
+        progress(1)
+    trajectory = Trajectory(np.array(stamps, np.int64), np.array(poses).reshape(-1, 4, 4))
+    return TrackRun(trajectory, report_of(log, counters, settings))
+
+
+def report_of(log: RunLog, counters: SequencerCounters, settings: config.Config) -> dict[str, Any]:
+    """report.json of an agent that has not spoken to an edge."""
+    return {
+        **log.report(),
+        "corrections": 0,
+        "bytes_up": 0,
+        "bytes_down": 0,
+        "sequencer": dataclasses.asdict(counters),
+        "version": __version__,
+        "config": config.to_mapping(settings),
+    }

@@ -1,0 +1,72 @@
+import cv2
+import numpy as np
+import pytest
+
+from share.geometry.camera import Camera, Rig
+
+EUROC = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019359, 1.76e-05))
+PLAIN = Camera(640, 480, 385.0, 386.0, 319.5, 239.5)
+
+
+@pytest.mark.parametrize("camera", [EUROC, PLAIN])
+def test_normalise_inverts_projection_everywhere_in_the_image(camera, rng):
+    px = rng.uniform((0, 0), (camera.width - 1, camera.height - 1), (5000, 2))
+    uv = camera.normalise(px)
+    points = np.concatenate([uv, np.ones((5000, 1))], axis=1) * rng.uniform(0.3, 20, (5000, 1))
+    assert np.abs(camera.project(points) - px).max() < 1e-9
+
+
+def test_projection_is_opencvs(rng):
+    points = rng.normal(size=(100, 3)) + (0, 0, 5)
+    want, _ = cv2.projectPoints(
+        points, np.zeros((3, 1)), np.zeros((3, 1)), EUROC.K, np.array(EUROC.distortion)
+    )
+    assert np.abs(EUROC.project(points) - want.reshape(-1, 2)).max() < 1e-9
+
+
+def test_distortion_jacobian_against_differences(rng):
+    uv, eps = rng.uniform(-0.7, 0.7, (50, 2)), 1e-6
+    J = EUROC._radtan_jacobian(uv)
+    for axis, d in enumerate(np.eye(2) * eps):
+        difference = (EUROC._radtan(uv + d) - EUROC._radtan(uv - d)) / (2 * eps)
+        assert np.abs(J[..., axis] - difference).max() < 1e-8
+
+
+def test_behind_the_camera_is_nowhere():
+    assert np.isnan(PLAIN.project(np.array([[0.0, 0, -1], [0, 0, 0]]))).all()
+
+
+def test_inside_counts_pixel_centres():
+    px = np.array([[0, 0], [639, 479], [-0.1, 5], [639.1, 5]], float)
+    assert PLAIN.inside(px).tolist() == [True, True, False, False]
+    assert PLAIN.inside(px, border=1).tolist() == [False, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"width": 0}, "resolution"),
+        ({"fx": -1.0}, "focal"),
+        ({"distortion": (0.1,)}, "distortion"),
+        ({"cx": float("nan")}, "finite"),
+    ],
+)
+def test_nonsense_is_refused_by_name(change, says):
+    values = dict(width=640, height=480, fx=400.0, fy=400.0, cx=320.0, cy=240.0) | change
+    with pytest.raises(ValueError, match=says):
+        Camera(**values)
+
+
+def test_rig_wants_extrinsics_with_every_second_camera():
+    with pytest.raises(ValueError, match="T_cam1_cam0"):
+        Rig(PLAIN, np.eye(4), cam1=PLAIN)
+    with pytest.raises(ValueError, match="rigid"):
+        Rig(PLAIN, 2 * np.eye(4))
+
+
+def test_rig_says_what_it_is():
+    T = np.eye(4)
+    T[0, 3] = -0.05
+    stereo = Rig(PLAIN, np.eye(4), cam1=PLAIN, T_cam1_cam0=T)
+    assert (stereo.kind, stereo.baseline) == ("stereo", pytest.approx(0.05))
+    assert Rig(PLAIN, np.eye(4), depth=PLAIN, T_depth_cam0=np.eye(4)).kind == "rgbd"
