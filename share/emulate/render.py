@@ -9,6 +9,8 @@ so one remap fetches both.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 
@@ -46,7 +48,7 @@ class Renderer:
             window = self._window(self._room.boxes[b], T_world_cam)
             if window is not None:
                 self._cast_box(b, [r[window] for r in rays], centre, window)
-        depth = 1 / self._q
+        depth: F32 = np.reciprocal(self._q)
         return self._texture(rays, depth, centre), depth
 
     def _rays(self, R: F64) -> list[F32]:
@@ -119,7 +121,8 @@ class Renderer:
             at += cv2.LUT(whole, self._corner[k])
         fine, coarse = cv2.split(cv2.remap(self._pyramid, column, row, cv2.INTER_LINEAR))
         level -= whole
-        return cv2.blendLinear(fine, coarse, 1 - level, level)
+        out: U8 = cv2.blendLinear(fine, coarse, 1 - level, level)
+        return out
 
     def _level(self, depth: F32, centre: F64) -> F32:
         """log2 of a pixel's footprint in texels. On a plane at distance d the footprint is z / f
@@ -161,7 +164,7 @@ def _pyramid(atlas: U8) -> tuple[U8, F32]:
     width = sum(level.shape[1] for level in levels[:-1])
     out = np.zeros((atlas.shape[0], width, 2), np.uint8)
     corner, x = np.zeros((LEVELS, 2), np.float32), 0
-    for i, (level, coarser) in enumerate(zip(levels, levels[1:], strict=False)):
+    for i, (level, coarser) in enumerate(pairwise(levels)):
         h, w = level.shape
         out[:h, x : x + w, 0] = level
         out[:h, x : x + w, 1] = cv2.pyrUp(coarser, dstsize=(w, h))

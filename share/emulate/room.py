@@ -34,7 +34,8 @@ class Room:
     @property
     def size(self) -> F64:
         """Extent of the room (3,) m."""
-        return self.boxes[0, 1]
+        size: F64 = self.boxes[0, 1]
+        return size
 
 
 def make_room(seed: int, size: tuple[float, float, float] = (9.0, 6.0, 3.0)) -> Room:
@@ -49,7 +50,7 @@ def make_room(seed: int, size: tuple[float, float, float] = (9.0, 6.0, 3.0)) -> 
 
 def face_axes(face: int) -> tuple[int, int, int]:
     """(axis across the face, axis along its picture's columns, axis along its rows)."""
-    return ((0, 1, 2), (1, 0, 2), (2, 0, 1))[face % 6 // 2]  # type: ignore[return-value]
+    return ((0, 1, 2), (1, 0, 2), (2, 0, 1))[face % 6 // 2]
 
 
 def _column(rng: np.random.Generator, size: tuple[float, float, float]) -> F64:
@@ -90,7 +91,8 @@ def _picture(rng: np.random.Generator, boxes: F64, face: int) -> U8:
         picture *= _corner_shadow(size)
     if across < 2 and (across + face) % 2 == (face < 6):
         picture = picture[:, ::-1]  # columns rise with the world axis: turn what is seen the other way
-    return cv2.GaussianBlur(picture.clip(4, 250), (0, 0), 0.7).astype(np.uint8)
+    out: U8 = cv2.GaussianBlur(picture.clip(4, 250), (0, 0), 0.7).astype(np.uint8)
+    return out
 
 
 def _corner_shadow(size: tuple[int, int]) -> F32:

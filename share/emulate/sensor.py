@@ -11,7 +11,7 @@ _GRAY_SIGMA = 2.0  # gray levels
 _DISPARITY_SIGMA = 0.1  # px
 _DISPARITY_STEP = 1 / 32  # px; the stereo matcher's resolution
 _HOLE = 2.3  # sigmas of smooth noise beyond which the matcher finds nothing
-_OCCLUSION = 0.05  # a relative step in depth that one of the two cameras looks past
+_OCCLUSION = 0.5  # px; a step in disparity that one of the two cameras looks past
 _NEAREST, _FARTHEST = 0.28, 10.0  # m
 _BANK = (1100, 1500)  # noise is drawn once and read at random places: drawing it anew costs 5 ms an image
 
@@ -41,11 +41,11 @@ class Sensor:
         block matching leaves it.
         """
         noise, gaps = self._read([self._smooth, self._smooth], depth.shape, (frame, 2))
-        disparity = focal_baseline / depth + _DISPARITY_SIGMA * noise
-        disparity = np.rint(disparity / _DISPARITY_STEP) * _DISPARITY_STEP
+        exact = focal_baseline / depth
+        disparity = np.rint((exact + _DISPARITY_SIGMA * noise) / _DISPARITY_STEP) * _DISPARITY_STEP
         measured = focal_baseline / np.maximum(disparity, _DISPARITY_STEP)
-        step = cv2.dilate(depth, _THREE) > (1 + _OCCLUSION) * cv2.erode(depth, _THREE)
-        hole = step | (gaps > _HOLE) | (measured < _NEAREST) | (measured > _FARTHEST)
+        step = cv2.dilate(exact, _THREE) - cv2.erode(exact, _THREE)
+        hole = (step > _OCCLUSION) | (gaps > _HOLE) | (measured < _NEAREST) | (measured > _FARTHEST)
         return np.where(hole, 0, measured * 1000 + 0.5).astype(np.uint16)
 
     def _read(
