@@ -24,7 +24,7 @@ verbose = click.option("-v", "--verbose", is_flag=True, help="Say more.")
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
 
 
-class _Frames(click.ParamType):
+class _Frames(click.ParamType[slice]):
     name = "A:B"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> slice:

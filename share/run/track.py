@@ -12,8 +12,10 @@ import numpy as np
 
 from share import __version__, config
 from share.core.sequencer import SequencerCounters
+from share.errors import DataError
 from share.io.source import Source
 from share.io.trajectory import Trajectory
+from share.metrics.ate import Ate, ate
 from share.metrics.runlog import RunLog
 from share.run.pipeline import frames_of, tracker_for
 
@@ -57,3 +59,13 @@ def report_of(log: RunLog, counters: SequencerCounters, settings: config.Config)
         "version": __version__,
         "config": config.to_mapping(settings),
     }
+
+
+def accuracy(run: TrackRun, truth: Trajectory | None) -> Ate | None:
+    """ATE against the recording's own truth (SE3 alignment), None where there is none to speak of."""
+    if truth is None:
+        return None
+    try:
+        return ate(run.trajectory, truth)
+    except DataError:  # too few poses with a truth at their time
+        return None
