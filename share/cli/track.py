@@ -60,7 +60,8 @@ def _summary(report: dict[str, Any], ate: Any) -> str:
     lines = [
         f"{report['tracked']} of {report['frames']} frames tracked, {report['keyframes']} keyframes, "
         f"lost for {report['lost_s']:.1f} s",
-        f"{report['cpu_ms_per_frame']:.1f} ms CPU a frame, and {report['decode_ms_per_frame']:.1f} ms to decode it",
+        f"{report['cpu_ms_per_frame']:.1f} ms CPU a frame, "
+        f"and {report['decode_ms_per_frame']:.1f} ms to decode it",
     ]
     if ate:
         lines.append(

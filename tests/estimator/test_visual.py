@@ -1,0 +1,170 @@
+"""The camera-only tracker on a rendered room: exact truth, and what goes wrong in a real one."""
+
+import numpy as np
+import pytest
+
+from share.config import TrackerConfig
+from share.emulate.motion import STYLES, move
+from share.emulate.render import Renderer
+from share.emulate.room import make_room
+from share.emulate.sensor import Sensor
+from share.estimator import gravity
+from share.estimator.visual import VisualTracker
+from share.geometry import se3
+from share.geometry.camera import Camera, ImuNoise, Rig
+from share.types import Frame, ImuBatch, TrackState
+
+CAMERA = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)
+T_CAM1_CAM0 = np.eye(4)
+T_CAM1_CAM0[0, 3] = -0.05
+STEREO = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
+HZ = 20
+DEFAULT = TrackerConfig()
+
+
+@pytest.fixture(scope="module")
+def walk():
+    """Four seconds of a person's stereo images, and the true poses of cam0."""
+    room, sensor = make_room(5), Sensor((5, 1))
+    renderer = Renderer(room, CAMERA)
+    T = move(STYLES["walker"], room.size, np.arange(0, 4, 1 / HZ), (5, 2))
+    images = [
+        (
+            sensor.gray(renderer.render(x)[0], i, 0),
+            sensor.gray(renderer.render(x @ se3.inverse(T_CAM1_CAM0))[0], i, 1),
+        )
+        for i, x in enumerate(T)
+    ]
+    return images, T
+
+
+def stamp(i):
+    return round(i * 1e9 / HZ)
+
+
+def run(images, config=DEFAULT, stamps=None, rig=STEREO):
+    tracker, results, candidates = VisualTracker(rig, config), [], []
+    for i, (left, right) in enumerate(images):
+        frame = Frame(stamps[i] if stamps else stamp(i), i, left, right)
+        results.append(tracker.track(frame))
+        if results[-1].keyframe:
+            candidates.append(tracker.keyframe(frame))
+    return results, candidates
+
+
+def test_tracks_every_frame_to_the_centimetre(walk):
+    images, T = walk
+    results, candidates = run(images)
+    assert [r.state for r in results] == [TrackState.OK] * len(images)
+    estimate = np.array([r.T_odom_body for r in results])
+    truth = se3.inverse(T[0]) @ T
+    relative = se3.inverse(estimate[0]) @ estimate
+    assert np.linalg.norm(relative[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.03
+    assert np.degrees(se3.angle(se3.inverse(relative) @ truth)).max() < 0.6
+    assert 4 < len(candidates) < 40
+    assert candidates[0].new_stretch
+    assert not any(c.new_stretch for c in candidates[1:])
+
+
+def test_odom_starts_at_the_origin_with_z_up(walk):
+    results, _ = run(walk[0][:1])
+    T = results[0].T_odom_body
+    assert np.allclose(T[:3, 3], 0)
+    assert np.allclose(T[:3, 1], (0, 0, -1))  # the camera's y, down
+    assert np.allclose(T[:3, 2], (1, 0, 0))  # the camera's z, ahead
+
+
+def test_same_frames_same_poses(walk):
+    a, _ = run(walk[0][:30])
+    b, _ = run(walk[0][:30])
+    assert all((x.T_odom_body == y.T_odom_body).all() for x, y in zip(a, b, strict=True))
+
+
+def test_lost_in_the_dark_and_found_again_in_the_same_frame(walk):
+    images, T = walk
+    dark = (np.zeros((480, 640), np.uint8),) * 2
+    results, candidates = run([*images[:40], *[dark] * 10, *images[45:60]])
+    assert [r.state for r in results[40:50]] == [TrackState.LOST] * 10
+    assert all(r.T_odom_body is None for r in results[40:50])
+    back = results[50:]
+    assert all(r.state.has_pose for r in back)
+    truth = se3.inverse(T[0]) @ T[45:60]
+    found = np.array([se3.inverse(results[0].T_odom_body) @ r.T_odom_body for r in back])
+    assert np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.04
+    assert not any(c.new_stretch for c in candidates[1:])
+
+
+def test_carried_away_while_blind_begins_a_new_stretch(walk):
+    images, _ = walk
+    elsewhere = Renderer(make_room(77), CAMERA)
+    T = move(STYLES["stroller"], make_room(77).size, np.arange(0, 1, 1 / HZ), (7, 2))
+    other = [(elsewhere.render(x)[0], elsewhere.render(x @ se3.inverse(T_CAM1_CAM0))[0]) for x in T]
+    config = TrackerConfig(new_stretch_s=0.3)
+    results, candidates = run([*images[:20], *other], config)
+    states = [r.state for r in results]
+    assert TrackState.LOST in states[20:30]
+    assert states[-1].has_pose
+    assert sum(c.new_stretch for c in candidates) == 2
+
+
+def test_a_pose_that_implies_a_leap_is_not_believed(walk):
+    """The same images a hundred times as fast: the geometry fits, the speed does not."""
+    images, _ = walk
+    stamps = [round(i * 1e9 / HZ / 100) for i in range(40)]
+    results, _ = run(images[20:60], stamps=stamps)
+    assert TrackState.LOST in [r.state for r in results]
+
+
+def test_waits_for_something_to_see(walk):
+    dark = (np.zeros((480, 640), np.uint8),) * 2
+    results, _ = run([dark, dark, *walk[0][:3]])
+    assert [r.state for r in results] == [TrackState.INITIALISING] * 2 + [TrackState.OK] * 3
+
+
+def test_memory_is_bounded(walk):
+    config = TrackerConfig(max_keyframes=5, keyframe_m=0.02, keyframe_rad=0.02)
+    tracker = VisualTracker(STEREO, config)
+    for i, (left, right) in enumerate(walk[0]):
+        frame = Frame(stamp(i), i, left, right)
+        if tracker.track(frame).keyframe:
+            tracker.keyframe(frame)
+        local_map = tracker._map
+        assert len(local_map.keyframes) <= 5
+        assert len(local_map.ids) <= 5 * config.corners
+        assert set(local_map.hosts) <= set(local_map.keyframes)
+
+
+def test_one_camera_alone_is_refused():
+    with pytest.raises(ValueError, match="scale"):
+        VisualTracker(Rig(CAMERA, np.eye(4)), TrackerConfig())
+
+
+def test_up_comes_from_the_accelerometer(walk):
+    """Body tilted against the camera: odom's z is what the accelerometer says, not the image."""
+    noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, 200.0)
+    rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0, imu=noise)
+    up = se3.so3_exp(np.array([0.1, 0, 0.2])) @ np.array([0.0, -1, 0])
+    imu = ImuBatch(np.arange(30), np.zeros((30, 3)), np.tile(9.81 * up, (30, 1)))
+    tracker = VisualTracker(rig, TrackerConfig())
+    frame = Frame(0, 0, *walk[0][0], imu=imu)
+    result = tracker.track(frame)
+    assert np.allclose(result.T_odom_body[2, :3], up, atol=1e-9)
+    assert np.allclose(tracker.keyframe(frame).up, up, atol=1e-9)
+
+
+def test_without_gravity_in_the_accelerometer_up_stays_unknown(walk):
+    noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, 200.0)
+    rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0, imu=noise)
+    results, candidates = run(walk[0][:15], rig=rig)  # the IMU says nothing at all
+    assert [r.state for r in results[:9]] == [TrackState.INITIALISING] * 9
+    assert results[9].state is TrackState.OK
+    assert (candidates[0].up == 0).all()
+
+
+def test_level_looks_ahead_and_survives_looking_down():
+    T = gravity.level(np.array([0, -1.0, 0]), np.array([0, 0, 1.0]))
+    assert np.allclose(T[:3, :3] @ [0, -1, 0], (0, 0, 1))
+    assert np.allclose(T[:3, :3] @ [0, 0, 1], (1, 0, 0))
+    down = gravity.level(np.array([0, 0, -1.0]), np.array([0, 0, 1.0]))
+    assert np.allclose(down[:3, :3] @ [0, 0, -1], (0, 0, 1))
+    assert np.linalg.det(down[:3, :3]) == pytest.approx(1)

@@ -1,0 +1,120 @@
+"""Front-end parts against images whose geometry is known exactly."""
+
+import numpy as np
+import pytest
+
+from share.emulate.motion import STYLES, move
+from share.emulate.render import Renderer
+from share.emulate.room import make_room
+from share.geometry import se3
+from share.geometry.camera import Camera, Rig
+from share.types import Frame
+from share.vision import corners, depth, klt
+from share.vision.view import make_view, orb
+
+CAMERA = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)
+T_CAM1_CAM0 = np.eye(4)
+T_CAM1_CAM0[0, 3] = -0.05
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Left image, its exact depth, right image, and an image from 8 cm and 3 degrees away."""
+    room = make_room(3)
+    renderer = Renderer(room, CAMERA)
+    T = move(STYLES["walker"], room.size, np.array([0.0, 3.0]), (3,))[1]
+    near = T @ se3.exp(np.array([0.01, 0.05, 0.0, 0.05, 0.01, 0.06]))
+    left, exact = renderer.render(T)
+    right, _ = renderer.render(T @ se3.inverse(T_CAM1_CAM0))
+    other, _ = renderer.render(near)
+    return left, exact, right, other, se3.inverse(near) @ T
+
+
+def test_corners_fill_what_is_empty(scene):
+    image = scene[0]
+    first = corners.detect(image, np.zeros((0, 2), np.float32), 100, 15)
+    more = corners.detect(image, first, 100, 15)
+    gap = np.linalg.norm(more[:, None] - first[None], axis=2).min()
+    assert len(first) == 100
+    assert len(more) > 20
+    assert gap > 12  # spacing, less what sub-pixel refinement moves
+
+
+def test_no_corners_on_a_blank_wall():
+    blank = np.full((480, 640), 128, np.uint8)
+    assert corners.detect(blank, np.zeros((0, 2), np.float32), 100, 15).shape == (0, 2)
+    assert orb(blank, 100)[0].shape == (0, 2)
+
+
+def test_following_is_subpixel_exact(scene):
+    left, exact, _, other, T_other_left = scene
+    px = corners.detect(left, np.zeros((0, 2), np.float32), 200, 15)
+    uv = CAMERA.normalise(px.astype(float))
+    z = exact[np.rint(px[:, 1]).astype(int), np.rint(px[:, 0]).astype(int)]
+    points = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) * z[:, None]
+    want = CAMERA.project(se3.transform(T_other_left, points))
+    found_px, found = klt.follow(left, other, px, px)
+    error = np.linalg.norm(found_px - want, axis=1)[found]
+    assert found.mean() > 0.7
+    assert np.median(error) < 0.15
+    alike = klt.resemblance(left, other, px, found_px)
+    assert np.median(alike[found]) > 0.9
+    assert np.median(klt.resemblance(left, other, px, px[::-1].copy())) < 0.5
+
+
+def test_stereo_depth(scene):
+    left, exact, right, _, _ = scene
+    rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
+    px = corners.detect(left, np.zeros((0, 2), np.float32), 200, 15)
+    z = depth.from_stereo(left, right, rig, px, CAMERA.normalise(px.astype(float)))
+    truth = exact[np.rint(px[:, 1]).astype(int), np.rint(px[:, 0]).astype(int)]
+    known = ~np.isnan(z)
+    disparity_error = np.abs(385 * 0.05 * (1 / z - 1 / truth))[known]
+    assert known.mean() > 0.8
+    assert np.median(disparity_error) < 0.1  # px
+    assert (disparity_error < 1).mean() > 0.95
+
+
+def test_depth_of_an_unregistered_camera():
+    """A slanted plane seen by a depth camera 2.5 cm aside with another focal length, as a Kinect's."""
+    T_depth_cam0 = np.eye(4)
+    T_depth_cam0[0, 3] = 0.025
+    depth_camera = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
+    rig = Rig(CAMERA, np.eye(4), depth=depth_camera, T_depth_cam0=T_depth_cam0)
+    normal, offset = np.array([0.3, 0.1, 1.0]), 2.0  # n . p = offset, in the depth camera
+    grid = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), axis=-1)
+    rays = np.concatenate([depth_camera.normalise(grid), np.ones((480, 640, 1))], axis=2)
+    image = (offset / (rays @ normal)).astype(np.float32)
+    px = np.random.default_rng(0).uniform((150, 120), (490, 360), (300, 2))
+    uv = CAMERA.normalise(px)
+    z = depth.from_depth_camera(image, rig, uv)
+    points = se3.transform(T_depth_cam0, np.concatenate([uv, np.ones((300, 1))], axis=1) * z[:, None])
+    assert (~np.isnan(z)).all()
+    assert np.abs(points @ normal - offset).max() < 1e-3
+    assert np.abs(image[px[:, 1].astype(int), px[:, 0].astype(int)] - z).max() > 0.01  # not its own pixel
+
+
+def test_no_depth_in_mid_air():
+    """Beside an object's edge, and in a hole, there is no depth; elsewhere there is."""
+    image = np.full((480, 640), 3.0, np.float32)
+    image[:, :320] = 1.0
+    image[100:140, 500:540] = 0.0
+    rig = Rig(CAMERA, np.eye(4), depth=CAMERA, T_depth_cam0=np.eye(4))
+    px = np.array([[320, 200], [200, 200], [520, 120], [450, 300]], float)
+    z = depth.from_depth_camera(image, rig, CAMERA.normalise(px))
+    assert np.isnan(z[[0, 2]]).all()
+    assert z[[1, 3]] == pytest.approx([1.0, 3.0])
+
+
+def test_a_view_is_spread_and_has_depth(scene):
+    left, _, right, _, _ = scene
+    rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
+    view = make_view(Frame(0, 0, left, right), rig, 300)
+    assert 250 < len(view) <= 300
+    cells = np.unique((CAMERA.distort(view.uv.astype(float)) // 80).astype(int), axis=0)
+    assert len(cells) > 30  # of 48
+    known = ~np.isnan(view.points[:, 0])
+    assert known.mean() > 0.7
+    assert np.allclose(view.points[known, :2] / view.points[known, 2:], view.uv[known], atol=1e-5)
+    again = make_view(Frame(0, 0, left, right), rig, 300)
+    assert (again.descriptors == view.descriptors).all()
