@@ -14,11 +14,12 @@ from share.types import F64, AgentKind, Correction, Keyframe, TrackState, checke
 MAX_RATE_HZ = 1000.0
 MAX_HELD = 256  # ids in one Ack: the most keyframes that may wait at the edge for a gap to close
 MAX_TEXT = 512  # characters of anything a person reads
+PEER_BYTES = 8
 
 
 def peer_id(run_id: int) -> bytes:
-    """The 8 bytes by which the transport of the edge knows the agent of this run."""
-    return run_id.to_bytes(8, "big", signed=True)
+    """The PEER_BYTES by which the transport of the edge knows the agent of this run."""
+    return run_id.to_bytes(PEER_BYTES, "big", signed=True)
 
 
 def _check_ids(*ids: int) -> None:

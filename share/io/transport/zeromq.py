@@ -11,7 +11,7 @@ import zmq
 from share.errors import TransportError
 from share.io.transport import LINGER_MS, QUEUE_MESSAGES, Address, parse_address
 from share.wire.codec import MAX_ARRAYS, MAX_FRAME_BYTES, Bytes
-from share.wire.messages import peer_id
+from share.wire.messages import PEER_BYTES, peer_id
 
 _MAX_PARTS = 2 + MAX_ARRAYS  # peer, header, arrays; parts beyond are read and thrown away
 _COMMON: dict[int, int] = {
@@ -135,6 +135,7 @@ class ZmqEdgeLink:
             self._link.close()
             raise _bind_error(target, error) from None
         bound = self._link.socket.get_string(zmq.LAST_ENDPOINT).rstrip("\0")
+        self.strangers = 0  # messages dropped because their sender is no agent
         self.endpoint = str(Address(target.host, parse_address(bound).port))
 
     def send(self, peer: bytes, frames: Sequence[Bytes]) -> bool:
@@ -142,6 +143,9 @@ class ZmqEdgeLink:
 
     def receive(self, timeout_ms: int) -> tuple[bytes, list[bytes]] | None:
         parts = self._link.receive(timeout_ms)
+        if parts and len(parts[0]) != PEER_BYTES:  # libzmq still takes most bytes for ZMTP 1.0
+            self.strangers += 1
+            return None
         return (parts[0], parts[1:]) if parts else None
 
     def wake(self) -> None:
