@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 CAM0, CAM1, DEPTH, IMU = "cam0", "cam1", "depth", "imu"
 STREAMS = (CAM0, CAM1, DEPTH, IMU)
 
-ImuSample = tuple[float, float, float, float, float, float]  # gyro rad/s, accel m/s^2, body frame
+ImuSample = Sequence[float]  # six: gyro rad/s, accel m/s^2, body frame
 
 
 class LazyImage(Protocol):

@@ -108,6 +108,11 @@ def depth_metres(raw: NDArray[Any], depth_scale: float, where: str) -> F32:
     return np.asarray(raw / np.float32(depth_scale), np.float32)
 
 
+def encode_jpeg(image: U8, quality: int) -> bytes:
+    """(H, W) uint8 -> JPEG."""
+    return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
+
+
 def check_size(image: NDArray[Any], width: int, height: int, where: str) -> NDArray[Any]:
     """`image` if it is as large as the calibration says, else DataError."""
     if image.shape != (height, width):

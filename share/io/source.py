@@ -10,6 +10,7 @@ from share.errors import UsageError
 from share.io.calibration import Calibration, read_calibration
 from share.io.euroc import is_euroc, open_euroc
 from share.io.recording import Source
+from share.io.session import is_session, recording_of
 from share.io.tum import is_tum, open_tum
 
 __all__ = ["READERS", "Source", "open_source"]
@@ -23,7 +24,28 @@ class Reader(NamedTuple):
     open: Callable[[Path, Calibration | None, slice | None], Source]
 
 
+def _open_mcap(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
+    from share.io.ros_mcap import open_mcap  # rosbags and mcap only where they are needed
+
+    return open_mcap(path, calibration, frames)
+
+
+def _is_mcap(path: Path) -> bool:
+    return path.suffix == ".mcap" and path.is_file()
+
+
+def _is_agent(path: Path) -> bool:
+    return is_session(path.parent) and path.suffix != ".mcap" and not path.is_dir()
+
+
+def _open_agent(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
+    recording, own = recording_of(path.parent, path.name)
+    return _open_mcap(recording, calibration or (read_calibration(own) if own else None), frames)
+
+
 READERS = (
+    Reader("SESSION/NAME (a folder with session.yaml)", _is_agent, _open_agent),
+    Reader("an MCAP recording (.mcap)", _is_mcap, _open_mcap),
     Reader("an EuRoC/ASL folder (mav0/)", is_euroc, open_euroc),
     Reader("a TUM RGB-D folder (rgb.txt, depth.txt, camera.yaml)", is_tum, open_tum),
 )

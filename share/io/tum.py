@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from share.core.measurement import CAM0, DEPTH
+from share.core.measurement import CAM0, DEPTH, LazyImage
 from share.errors import ConfigError, DataError
 from share.geometry.camera import Rig
 from share.io import tables
@@ -44,7 +44,7 @@ def open_tum(path: Path, calibration: Calibration | None, frames: slice | None) 
     depth = rig.depth
     rig = Rig(cam0=rig.cam0, T_body_cam0=np.eye(4), depth=depth, T_depth_cam0=rig.T_depth_cam0)
     pairs, note = _pairs(path)
-    images = {
+    images: dict[str, list[tuple[int, LazyImage]]] = {
         CAM0: [(stamp, file_image(path / colour, rig.cam0)) for stamp, colour, _ in pairs],
         DEPTH: [(stamp, file_image(path / file, depth, scale)) for stamp, _, file in pairs],
     }

@@ -1,0 +1,71 @@
+"""Writing files so that nobody ever finds half of one, and finding out first whether we may."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from pathlib import Path
+
+from share.errors import UsageError
+
+
+def atomic_write(path: Path, data: bytes | str) -> None:
+    """Write beside `path`, make it durable, then take its name: `path` is old or new, never between.
+
+    Raises UsageError if the folder cannot be written to.
+    """
+    content = data.encode() if isinstance(data, str) else data
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(name, 0o666 & ~_umask())  # mkstemp makes it private
+        os.replace(name, path)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(name)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make a rename in `folder` durable, where the system can."""
+    with contextlib.suppress(OSError):  # not every file system opens folders
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def check_writable(path: Path) -> Path:
+    """`path`, if a file of that name can be made (its folder may have to be made). Else UsageError."""
+    if path.is_dir():
+        raise UsageError(f"{path}: is a folder; give the name of a file")
+    writable_dir(path.parent)
+    return path
+
+
+def writable_dir(path: Path) -> Path:
+    """`path`, made if need be and tried with a file of its own. Else UsageError."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            return path
+    except (FileExistsError, NotADirectoryError):
+        raise UsageError(f"{path}: is not a folder, or lies below a file; give another --out") from None
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written to: {error.strerror}; give another --out") from None
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

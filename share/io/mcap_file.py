@@ -1,0 +1,145 @@
+"""One MCAP file, read by its index: never more than a few chunks in memory."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterable, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+
+from share.errors import DataError, UsageError
+from share.types import I64
+
+MAGIC = b"\x89MCAP0\r\n"
+_MESSAGE_INDEX = 0x07
+_RECORD_HEADER = struct.Struct("<BQ")
+_INDEX_HEADER = struct.Struct("<HI")  # channel id, bytes of entries
+
+
+class Topic(NamedTuple):
+    """kind: ROS message type, e.g. sensor_msgs/msg/Image."""
+
+    name: str
+    kind: str
+    channels: tuple[int, ...]
+
+
+def damage() -> tuple[type[Exception], ...]:
+    """What the mcap library raises on a damaged file."""
+    import zstandard
+    from mcap.exceptions import McapError
+    from mcap.stream_reader import CRCValidationError
+
+    return (McapError, CRCValidationError, zstandard.ZstdError, zlib.error, struct.error, UnicodeDecodeError,
+            EOFError, RuntimeError, KeyError, OverflowError)  # fmt: skip
+
+
+class McapFile:
+    """Opened anew for every pass. Raises DataError if it was not closed in good order or is damaged."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            with open(path, "rb") as file:
+                head = file.read(len(MAGIC))
+        except OSError as error:
+            raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+        if head != MAGIC:
+            raise DataError(f"{path}: is not an MCAP file, or is empty")
+        self._check_index()
+
+    @cached_property
+    def topics(self) -> dict[str, Topic]:
+        """By name; only those in CDR."""
+        found: dict[str, Topic] = {}
+        for channel in self._summary.channels.values():
+            schema = self._summary.schemas.get(channel.schema_id)
+            if channel.message_encoding == "cdr" and schema is not None:
+                known = found.get(channel.topic)
+                ids = (*known.channels, channel.id) if known else (channel.id,)
+                found[channel.topic] = Topic(channel.topic, schema.name, ids)
+        return found
+
+    @cached_property
+    def log_times(self) -> dict[str, I64]:
+        """Stamps (N,) ns of each topic's messages as logged, in order; read from the index alone."""
+        per_channel: dict[int, list[I64]] = {}
+        with open(self.path, "rb") as file:
+            for chunk in self._summary.chunk_indexes:
+                for channel, offset in chunk.message_index_offsets.items():
+                    per_channel.setdefault(channel, []).append(self._read_index(file, offset))
+        return {
+            topic.name: np.sort(
+                np.concatenate([t for c in topic.channels for t in per_channel.get(c, [_NONE])])
+            )
+            for topic in self.topics.values()
+        }
+
+    def metadata(self, name: str) -> dict[str, str]:
+        """The metadata record `name`, or {}."""
+        with open(self.path, "rb") as file:
+            records = [r for r in self._reader(file).iter_metadata() if r.name == name]
+        return dict(records[-1].metadata) if records else {}
+
+    def messages(
+        self, topics: Iterable[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """(topic, log time, CDR bytes) in order of log time, within [start_ns, end_ns)."""
+        names = list(topics)
+        with open(self.path, "rb") as file:
+            try:
+                for _, channel, message in self._reader(file).iter_messages(names, start_ns, end_ns):
+                    yield channel.topic, message.log_time, message.data
+            except damage() as error:
+                raise self._broken(str(error) or type(error).__name__) from None
+
+    @cached_property
+    def _summary(self) -> Any:
+        with open(self.path, "rb") as file:
+            try:
+                return self._reader(file).get_summary()
+            except damage() as error:
+                raise self._broken(str(error) or type(error).__name__) from None
+            except OSError:  # shorter than a footer
+                raise self._broken("it ends too soon") from None
+
+    def _check_index(self) -> None:
+        summary = self._summary
+        if summary is None or (not summary.chunk_indexes and _message_count(summary) != 0):
+            raise self._broken("it has no index")
+
+    def _broken(self, reason: str) -> DataError:
+        return DataError(
+            f"{self.path}: is damaged or was not closed in good order ({reason}); "
+            f"try `share dataset recover {self.path} --out GOOD.mcap`"
+        )
+
+    def _reader(self, file: IO[bytes]) -> Any:
+        from mcap.reader import SeekingReader
+
+        return SeekingReader(file, validate_crcs=True, record_size_limit=2**30)
+
+    def _read_index(self, file: IO[bytes], offset: int) -> I64:
+        """Log times of one MessageIndex record (MCAP specification, op 0x07)."""
+        file.seek(offset)
+        head = file.read(_RECORD_HEADER.size + _INDEX_HEADER.size)
+        try:
+            opcode, _ = _RECORD_HEADER.unpack_from(head)
+            _, size = _INDEX_HEADER.unpack_from(head, _RECORD_HEADER.size)
+        except struct.error:
+            raise self._broken("its index ends too soon") from None
+        data = file.read(size)
+        if opcode != _MESSAGE_INDEX or len(data) != size or size % 16:
+            raise self._broken("its index is wrong")
+        return np.frombuffer(data, "<i8").reshape(-1, 2)[:, 0].astype(np.int64)
+
+
+_NONE = np.zeros(0, np.int64)
+
+
+def _message_count(summary: Any) -> int | None:
+    return None if summary.statistics is None else int(summary.statistics.message_count)

@@ -1,0 +1,105 @@
+"""Recordings that were cut off: every message that is still whole goes into a good file.
+
+A file that was not closed has no index, and its last chunk may be half written. It is read from the
+start, record by record, as far as it goes.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from share.errors import DataError, UsageError
+from share.io.files import check_writable, sync_folder
+from share.io.mcap_file import MAGIC, damage
+
+
+class Recovered(NamedTuple):
+    """messages by topic, bytes that could not be read, and why reading stopped (empty: at a good end)."""
+
+    messages: dict[str, int]
+    lost_bytes: int
+    reason: str
+
+
+def recover(path: Path, out: Path, progress: Callable[[int], None] = lambda _: None) -> Recovered:
+    """Copy what is whole from `path` to `out`; `progress` is told the bytes read so far.
+
+    Raises UsageError for paths that cannot be used, DataError if nothing can be saved.
+    """
+    if out.exists() and out.samefile(path):
+        raise UsageError(f"--out {out}: is the broken file itself; give another name")
+    part = check_writable(out).with_name(out.name + ".part")
+    if part.exists() and part.samefile(path):
+        part = out.with_name(out.name + ".recovering")
+    try:
+        result = _copy(path, part, progress)
+        if not result.messages:
+            raise DataError(f"{path}: holds no complete message ({result.reason or 'it is empty'})")
+        os.replace(part, out)
+        sync_folder(out.parent)
+    finally:
+        part.unlink(missing_ok=True)
+    return result
+
+
+def _copy(path: Path, part: Path, progress: Callable[[int], None]) -> Recovered:
+    from mcap.writer import Writer
+
+    with open(path, "rb") as file, open(part, "wb") as target:
+        size = os.fstat(file.fileno()).st_size
+        if file.read(len(MAGIC)) != MAGIC:
+            raise DataError(f"{path}: is not an MCAP file, or is empty")
+        file.seek(0)
+        writer = Writer(target, chunk_size=256 * 1024)
+        writer.start(profile="ros2", library="share")
+        copier, reason, good = _Copier(writer), "", 0
+        try:
+            for record in _records(file):
+                copier.copy(record)
+                good = file.tell()
+                progress(good)
+        except damage() as error:
+            reason = str(error) or type(error).__name__
+        writer.finish()
+        target.flush()
+        os.fsync(target.fileno())
+    return Recovered(copier.counts, size - good if reason else 0, reason)
+
+
+def _records(file: Any) -> Iterator[Any]:
+    from mcap.stream_reader import StreamReader
+
+    yield from StreamReader(file, validate_crcs=True, record_size_limit=2**30).records
+
+
+class _Copier:
+    """Writes schemas, channels, metadata and messages under the numbers of the new file."""
+
+    def __init__(self, writer: Any) -> None:
+        self._writer = writer
+        self._schemas: dict[int, int] = {0: 0}
+        self._channels: dict[int, int] = {}
+        self._names: dict[int, str] = {}
+        self.counts: dict[str, int] = {}
+
+    def copy(self, record: Any) -> None:
+        kind = type(record).__name__
+        if kind == "Schema" and record.id not in self._schemas:
+            self._schemas[record.id] = self._writer.register_schema(record.name, record.encoding, record.data)
+        elif kind == "Channel" and record.id not in self._channels:
+            self._channels[record.id] = self._writer.register_channel(
+                record.topic, record.message_encoding, self._schemas[record.schema_id], record.metadata
+            )
+            self._names[record.id] = record.topic
+        elif kind == "Metadata":
+            self._writer.add_metadata(record.name, record.metadata)
+        elif kind == "Message":
+            name = self._names[record.channel_id]
+            self._writer.add_message(
+                self._channels[record.channel_id], record.log_time, record.data, record.publish_time,
+                record.sequence,
+            )  # fmt: skip
+            self.counts[name] = self.counts.get(name, 0) + 1
