@@ -1,0 +1,30 @@
+"""Run every tools/bench_*.py and keep what it says as one JSON file: `make bench`."""
+
+from __future__ import annotations
+
+import json
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+OUT = HERE.parent / "build" / "bench.json"
+
+
+def main() -> None:
+    results = {}
+    for script in sorted(HERE.glob("bench_*.py")):
+        print(f"{script.stem} …", file=sys.stderr, flush=True)
+        done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+        if done.returncode:
+            sys.exit(f"{script.name} failed:\n{done.stderr}")
+        results[script.stem.removeprefix("bench_")] = json.loads(done.stdout)
+    machine = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.platform()}
+    OUT.parent.mkdir(exist_ok=True)
+    OUT.write_text(json.dumps({"machine": machine, **results}, indent=2) + "\n")
+    print(OUT.read_text(), end="")
+
+
+if __name__ == "__main__":
+    main()
