@@ -58,9 +58,13 @@ class TrackerConfig:
 class PlaceConfig:
     """When two views are taken for the same place."""
 
+    candidates: int = 8  # verified per query, best first
+    tables: int = 16  # hash tables of the index
+    hash_bits: int = 16  # descriptor bits that make a word in each of them
+    index_seed: int = 1  # which bits
     max_distance_bits: int = 64  # of 256: a match of two descriptors
-    ratio: float = 0.9  # best distance below this share of the runner-up's
-    min_matches: int = 25
+    ratio: float = 1.0  # best distance below this share of the runner-up's; below 1 loses half of the recall
+    min_matches: int = 25  # mutual nearest neighbours, before any geometry
     ransac_px: float = 6.0  # reprojection error of a consensus
     ransac_iterations: int = 1000
     min_direction_inliers: int = 12  # 3D points of either view in the other's image
@@ -69,11 +73,63 @@ class PlaceConfig:
     sigma_px: float = 1.5  # of a keypoint
     sigma_inverse_depth: float = 0.01  # 1/m, of a keypoint's depth: disparity noise / (focal * baseline)
     inlier_chi2: float = 11.3  # squared Mahalanobis distance of an inlier (99 %, 3 dof)
-    min_inliers: int = 25
+    min_inliers: int = 20
+    max_sigma_deg: float = 0.6  # a pose more uncertain than this is refused: false ones begin at 0.75
     min_spread: float = 0.06  # narrow side (1 sigma) of the inliers, normalised coordinates
     gravity_deg: float = 6.0  # rotation must keep "up" within this, where both views know it
     floor_deg: float = 0.1  # added to what the residuals say: what inliers do not average away
     floor_m: float = 0.005
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """What an agent keeps, sends and makes of corrections."""
+
+    keep_keyframes: int = 600  # sent ones too: a restarted edge is given them again
+    rate_burst: float = 2.0  # keyframes that may be saved up under a rate limit
+    blend_jump_m: float = 0.05  # a correction that moves the body further, or turns it more,
+    blend_jump_rad: float = 0.02  # is blended in
+    blend_s: float = 0.5  # over this time
+    finish_s: float = 5.0  # how long the end of a run waits for acknowledgements
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "keep_keyframes", "blend_s")
+        if self.rate_burst < 1:
+            raise ValueError(f"rate_burst: {self.rate_burst} must be at least 1")
+
+
+@dataclass(frozen=True)
+class LinkConfig:
+    """The rhythm of an agent's talk with its edge."""
+
+    hello_s: float = 0.5  # until welcomed
+    refused_s: float = 5.0  # a refused agent that already runs asks again after this
+    ping_s: float = 0.5
+    silent_s: float = 3.0  # nothing heard for this long: the edge is taken as gone
+    window: int = 16  # keyframes in flight
+    resend_s: float = 1.0  # first wait for an acknowledgement; doubles
+    resend_max_s: float = 8.0
+    gap_s: float = 0.1  # the same, for a keyframe that later ones have overtaken
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "hello_s", "ping_s", "silent_s", "window", "resend_s", "resend_max_s")
+
+
+@dataclass(frozen=True)
+class ClockConfig:
+    """The filter of the edge's clock against the agent's."""
+
+    noise_us: float = 30.0  # of an exchange that met no queue
+    asymmetry: float = 0.5  # one-way error of an exchange per delay beyond the least; 0.5 is all of it
+    offset_walk_us: float = 2.0  # per sqrt(s)
+    drift_walk_ppm: float = 0.05  # per sqrt(s)
+    drift_ppm: float = 100.0  # before anything is known (1 sigma)
+    least_of: int = 64  # exchanges among which the least delay is sought
+    gate_sigma: float = 4.0  # an exchange further off is not believed
+    step_after: int = 5  # but so many in a row are: the clock was set
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "noise_us", "drift_ppm", "least_of", "gate_sigma", "step_after")
 
 
 @dataclass(frozen=True)
@@ -83,6 +139,15 @@ class Config:
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     sequencer: SequencerConfig = field(default_factory=SequencerConfig)
     place: PlaceConfig = field(default_factory=PlaceConfig)
+    agent: AgentConfig = field(default_factory=AgentConfig)
+    link: LinkConfig = field(default_factory=LinkConfig)
+    clock: ClockConfig = field(default_factory=ClockConfig)
+
+
+def _require_positive(config: Any, *names: str) -> None:
+    for name in names:
+        if not getattr(config, name) > 0:
+            raise ValueError(f"{name}: {getattr(config, name)} must be positive")
 
 
 def load(text: str, where: str = "configuration") -> Config:

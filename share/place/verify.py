@@ -1,0 +1,176 @@
+"""Is this the same place, and where does the one camera stand as seen from the other?
+
+Two views agree if descriptors match, if either view's 3D points give a pose in the other's image,
+if the two poses are the same one, and if the result does not contradict gravity. Every refusal
+says which of these failed and by how much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from share.config import PlaceConfig
+from share.geometry import se3
+from share.place.matching import match
+from share.place.refine import Mask, Noise, refine
+from share.types import F64, View
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A view, and what must be known of who saw it.
+
+    focal of cam0 [px]; T_body_cam0 (4, 4); up (3,): against gravity in the body frame, zeros if
+    unknown (as in `Keyframe.up`).
+    """
+
+    view: View
+    focal: float
+    T_body_cam0: F64
+    up: F64
+
+    @property
+    def y(self) -> F64:
+        """Keypoints (N, 3): u, v and inverse depth [1/m], NaN where depth is unknown."""
+        return np.column_stack([self.view.uv, 1 / self.view.points[:, 2]]).astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Verified:
+    """T_c_q (4, 4): body of the query in the body frame of the candidate; cov (6, 6) of it.
+
+    matches: descriptor pairs; inliers: those that agree with the pose.
+    """
+
+    T_c_q: F64
+    cov: F64
+    matches: int
+    inliers: int
+
+    @property
+    def reason(self) -> str:
+        return f"{self.inliers} inliers of {self.matches} matches"
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why not, for a person: "17 inliers of 25 needed"."""
+
+    reason: str
+
+
+class _Failed(Exception):
+    """A check that did not pass; its text is the reason."""
+
+
+def verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int = 0) -> Verified | Refusal:
+    """The pose of the query's body in the candidate's body frame, or why there is none.
+
+    Deterministic for a given seed. Does not raise on any two valid views.
+    """
+    try:
+        return _verify(query, candidate, config, seed)
+    except _Failed as failed:
+        return Refusal(str(failed))
+
+
+def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> Verified:
+    pairs = match(
+        query.view.descriptors, candidate.view.descriptors, config.max_distance_bits, config.ratio
+    )
+    _need(len(pairs), config.min_matches, "matches")
+    y_q, y_c = query.y[pairs[:, 0]], candidate.y[pairs[:, 1]]
+    rough = _both_ways(y_q, y_c, query.focal, candidate.focal, config, seed)
+    with_depth = np.isfinite(y_q[:, 2]) | np.isfinite(y_c[:, 2])
+    y_q, y_c = y_q[with_depth], y_c[with_depth]
+    noise_q, noise_c = (Noise(config.sigma_px / s.focal, config.sigma_inverse_depth) for s in (query, candidate))
+    fine = refine(rough, y_q, y_c, noise_q, noise_c, config.inlier_chi2)
+    inlier = fine.d2 < config.inlier_chi2
+    _need(int(inlier.sum()), config.min_inliers, "inliers")
+    _check_spread(y_q[inlier], "query", config)
+    _check_spread(y_c[inlier], "candidate", config)
+    _check_uncertainty(fine.cov, config)
+    _check_gravity(fine.T, query, candidate, config)
+    T, cov = _between_bodies(fine.T, fine.cov, query.T_body_cam0, candidate.T_body_cam0)
+    return Verified(T, cov + _floor(config), len(pairs), int(inlier.sum()))
+
+
+def _need(have: int, want: int, what: str) -> None:
+    if have < want:
+        raise _Failed(f"{have} {what} of {want} needed")
+
+
+def _both_ways(y_q: F64, y_c: F64, focal_q: float, focal_c: float, config: PlaceConfig, seed: int) -> F64:
+    """T_c_q by the query's points in the candidate's image and by the reverse, which must agree."""
+    forward = _absolute_pose(y_q, y_c, focal_c, "query's", config, seed)
+    backward = _absolute_pose(y_c, y_q, focal_q, "candidate's", config, seed)
+    apart = forward @ backward
+    metres, degrees = float(np.linalg.norm(apart[:3, 3])), float(np.degrees(se3.angle(apart)))
+    depth = float(np.nanmedian(1 / np.concatenate([y_q[:, 2], y_c[:, 2]])))
+    allowed = config.agree_depth_ratio * depth
+    if metres > allowed or degrees > config.agree_deg:
+        raise _Failed(
+            f"the two directions differ by {metres:.2f} m and {degrees:.1f}°, "
+            f"{allowed:.2f} m and {config.agree_deg:.1f}° allowed"
+        )
+    return forward
+
+
+def _absolute_pose(
+    source: F64, target: F64, focal: float, whose: str, config: PlaceConfig, seed: int
+) -> F64:
+    """T_target_source from 3D points of the source seen by the target (LO-RANSAC + P3P, poselib)."""
+    import poselib
+
+    known = np.isfinite(source[:, 2])
+    _need(int(known.sum()), config.min_direction_inliers, f"matches with the {whose} depth")
+    y = source[known]
+    points = np.column_stack([y[:, :2], np.ones(len(y))]) / y[:, 2:]
+    camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
+    ransac = {
+        "max_reproj_error": config.ransac_px,
+        "max_iterations": config.ransac_iterations,
+        "min_iterations": 50,
+        "seed": seed,
+    }
+    pose, info = poselib.estimate_absolute_pose(target[known, :2] * focal, points, camera, ransac, {})
+    _need(int(info["num_inliers"]), config.min_direction_inliers, f"inliers of the {whose} points")
+    return se3.compose(np.asarray(pose.R), np.asarray(pose.t))
+
+
+def _check_spread(y: F64, whose: str, config: PlaceConfig) -> None:
+    """The narrow side of the cloud of inliers: a pose from one corner or one line is not to be trusted."""
+    narrow = float(np.sqrt(np.linalg.eigvalsh(np.cov(y[:, :2].T))[0]))
+    if narrow < config.min_spread:
+        raise _Failed(f"inliers crowd in the {whose} image: spread {narrow:.3f} of {config.min_spread} needed")
+
+
+def _check_uncertainty(cov: F64, config: PlaceConfig) -> None:
+    """Inliers can be many and yet leave the pose loose; most wrong poses that pass the rest show here."""
+    degrees = float(np.degrees(np.sqrt(np.trace(cov[:3, :3]))))
+    if degrees > config.max_sigma_deg:
+        raise _Failed(f"pose uncertain by {degrees:.2f}°, {config.max_sigma_deg:.2f}° allowed")
+
+
+def _check_gravity(T_c_q: F64, query: Sight, candidate: Sight, config: PlaceConfig) -> None:
+    if not (query.up.any() and candidate.up.any()):
+        return
+    up_q, up_c = (s.T_body_cam0[:3, :3].T @ s.up for s in (query, candidate))
+    cosine = float((T_c_q[:3, :3] @ up_q) @ up_c)
+    degrees = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    if degrees > config.gravity_deg:
+        raise _Failed(f"gravity differs by {degrees:.1f}°, {config.gravity_deg:.1f}° allowed")
+
+
+def _between_bodies(T_c_q: F64, cov: F64, T_body_cam_q: F64, T_body_cam_c: F64) -> tuple[F64, F64]:
+    """From cameras to bodies: X_c T Exp(xi) X_q^-1 = (X_c T X_q^-1) Exp(Ad(X_q) xi)."""
+    Ad = se3.adjoint(T_body_cam_q)
+    return T_body_cam_c @ T_c_q @ se3.inverse(T_body_cam_q), Ad @ cov @ Ad.T
+
+
+def _floor(config: PlaceConfig) -> Any:
+    """What many inliers do not average away: calibration, depth bias, rolling shutter."""
+    return np.diag([np.radians(config.floor_deg) ** 2] * 3 + [config.floor_m**2] * 3)
