@@ -59,7 +59,7 @@ class PlaceConfig:
     """When two views are taken for the same place."""
 
     candidates: int = 8  # verified per query, best first
-    tables: int = 16  # hash tables of the index
+    tables: int = 8  # hash tables of the index
     hash_bits: int = 16  # descriptor bits that make a word in each of them
     index_seed: int = 1  # which bits
     max_distance_bits: int = 64  # of 256: a match of two descriptors

@@ -34,7 +34,7 @@ class Candidate(NamedTuple):
 class PlaceIndex:
     """Keyframes by their descriptors. Ids are any distinct integers."""
 
-    def __init__(self, seed: int, tables: int = 16, bits: int = 16) -> None:
+    def __init__(self, seed: int, tables: int = 8, bits: int = 16) -> None:
         if not (1 <= bits <= _MAX_BITS and tables >= 1):
             raise ValueError(f"{tables} tables of {bits} bits: bits must lie in 1 .. {_MAX_BITS}")
         rng = np.random.default_rng(seed)
@@ -64,10 +64,10 @@ class PlaceIndex:
             return []
         votes = self._votes(np.sort(self._words(descriptors)))
         votes /= np.sqrt(np.maximum(1, self._sizes))
-        order = np.argsort(-votes, kind="stable")
         left_out = set(exclude)
-        ranked = (Candidate(self._ids[i], float(votes[i])) for i in order[: limit + len(left_out)] if votes[i] > 0)
-        return [c for c in ranked if c.id not in left_out][:limit]
+        ranked = np.argsort(-votes, kind="stable")[: limit + len(left_out)]
+        found = [Candidate(self._ids[i], float(votes[i])) for i in ranked if votes[i] > 0]
+        return [c for c in found if c.id not in left_out][:limit]
 
     def _votes(self, words: I64) -> F64:
         """Sum over the words of idf for every stored keyframe, (n,)."""
@@ -87,4 +87,5 @@ class PlaceIndex:
         tables, bits = self._samples.shape
         sampled = np.unpackbits(descriptors, axis=1)[:, self._samples]
         values = sampled.astype(np.int64) @ (1 << np.arange(bits))
-        return (values + (np.arange(tables) << bits)).ravel()
+        words: I64 = (values + (np.arange(tables) << bits)).ravel()
+        return words

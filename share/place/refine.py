@@ -140,4 +140,5 @@ def _add(
 
 def _solve(linear: _Linear, weight: NDArray[Any]) -> F64:
     H = np.tensordot(weight.astype(np.float64), linear.H, 1)
-    return np.linalg.solve(H + _RIDGE, weight @ linear.g)
+    step: F64 = np.linalg.solve(H + _RIDGE, weight @ linear.g)
+    return step

@@ -15,7 +15,7 @@ import numpy as np
 from share.config import PlaceConfig
 from share.geometry import se3
 from share.place.matching import match
-from share.place.refine import Mask, Noise, refine
+from share.place.refine import Noise, refine
 from share.types import F64, View
 
 
@@ -62,7 +62,7 @@ class Refusal:
     reason: str
 
 
-class _Failed(Exception):
+class _RefusedError(Exception):
     """A check that did not pass; its text is the reason."""
 
 
@@ -73,20 +73,20 @@ def verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int = 0) -
     """
     try:
         return _verify(query, candidate, config, seed)
-    except _Failed as failed:
+    except _RefusedError as failed:
         return Refusal(str(failed))
 
 
 def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> Verified:
-    pairs = match(
-        query.view.descriptors, candidate.view.descriptors, config.max_distance_bits, config.ratio
-    )
+    pairs = match(query.view.descriptors, candidate.view.descriptors, config.max_distance_bits, config.ratio)
     _need(len(pairs), config.min_matches, "matches")
     y_q, y_c = query.y[pairs[:, 0]], candidate.y[pairs[:, 1]]
     rough = _both_ways(y_q, y_c, query.focal, candidate.focal, config, seed)
     with_depth = np.isfinite(y_q[:, 2]) | np.isfinite(y_c[:, 2])
     y_q, y_c = y_q[with_depth], y_c[with_depth]
-    noise_q, noise_c = (Noise(config.sigma_px / s.focal, config.sigma_inverse_depth) for s in (query, candidate))
+    noise_q, noise_c = (
+        Noise(config.sigma_px / s.focal, config.sigma_inverse_depth) for s in (query, candidate)
+    )
     fine = refine(rough, y_q, y_c, noise_q, noise_c, config.inlier_chi2)
     inlier = fine.d2 < config.inlier_chi2
     _need(int(inlier.sum()), config.min_inliers, "inliers")
@@ -98,9 +98,13 @@ def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> V
     return Verified(T, cov + _floor(config), len(pairs), int(inlier.sum()))
 
 
+def _noise(sight: Sight, config: PlaceConfig) -> Noise:
+    return Noise(config.sigma_px / sight.focal, config.sigma_inverse_depth)
+
+
 def _need(have: int, want: int, what: str) -> None:
     if have < want:
-        raise _Failed(f"{have} {what} of {want} needed")
+        raise _RefusedError(f"{have} {what} of {want} needed")
 
 
 def _both_ways(y_q: F64, y_c: F64, focal_q: float, focal_c: float, config: PlaceConfig, seed: int) -> F64:
@@ -112,16 +116,14 @@ def _both_ways(y_q: F64, y_c: F64, focal_q: float, focal_c: float, config: Place
     depth = float(np.nanmedian(1 / np.concatenate([y_q[:, 2], y_c[:, 2]])))
     allowed = config.agree_depth_ratio * depth
     if metres > allowed or degrees > config.agree_deg:
-        raise _Failed(
+        raise _RefusedError(
             f"the two directions differ by {metres:.2f} m and {degrees:.1f}°, "
             f"{allowed:.2f} m and {config.agree_deg:.1f}° allowed"
         )
     return forward
 
 
-def _absolute_pose(
-    source: F64, target: F64, focal: float, whose: str, config: PlaceConfig, seed: int
-) -> F64:
+def _absolute_pose(source: F64, target: F64, focal: float, whose: str, config: PlaceConfig, seed: int) -> F64:
     """T_target_source from 3D points of the source seen by the target (LO-RANSAC + P3P, poselib)."""
     import poselib
 
@@ -145,14 +147,16 @@ def _check_spread(y: F64, whose: str, config: PlaceConfig) -> None:
     """The narrow side of the cloud of inliers: a pose from one corner or one line is not to be trusted."""
     narrow = float(np.sqrt(np.linalg.eigvalsh(np.cov(y[:, :2].T))[0]))
     if narrow < config.min_spread:
-        raise _Failed(f"inliers crowd in the {whose} image: spread {narrow:.3f} of {config.min_spread} needed")
+        raise _RefusedError(
+            f"inliers crowd in the {whose} image: spread {narrow:.3f} of {config.min_spread} needed"
+        )
 
 
 def _check_uncertainty(cov: F64, config: PlaceConfig) -> None:
     """Inliers can be many and yet leave the pose loose; most wrong poses that pass the rest show here."""
     degrees = float(np.degrees(np.sqrt(np.trace(cov[:3, :3]))))
     if degrees > config.max_sigma_deg:
-        raise _Failed(f"pose uncertain by {degrees:.2f}°, {config.max_sigma_deg:.2f}° allowed")
+        raise _RefusedError(f"pose uncertain by {degrees:.2f}°, {config.max_sigma_deg:.2f}° allowed")
 
 
 def _check_gravity(T_c_q: F64, query: Sight, candidate: Sight, config: PlaceConfig) -> None:
@@ -162,7 +166,7 @@ def _check_gravity(T_c_q: F64, query: Sight, candidate: Sight, config: PlaceConf
     cosine = float((T_c_q[:3, :3] @ up_q) @ up_c)
     degrees = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
     if degrees > config.gravity_deg:
-        raise _Failed(f"gravity differs by {degrees:.1f}°, {config.gravity_deg:.1f}° allowed")
+        raise _RefusedError(f"gravity differs by {degrees:.1f}°, {config.gravity_deg:.1f}° allowed")
 
 
 def _between_bodies(T_c_q: F64, cov: F64, T_body_cam_q: F64, T_body_cam_c: F64) -> tuple[F64, F64]:
