@@ -169,7 +169,9 @@ _LAYOUTS: dict[type, _Layout] = {
     ),
     m.Rate: _Layout(20, m.Rate, _Scalars.of(hz=float)),
     m.Pong: _Layout(
-        21, m.Pong, _Scalars.of(sequence=Int64, sent_ns=Int64, received_ns=Int64, replied_ns=Int64)
+        21,
+        m.Pong,
+        _Scalars.of(sequence=Int64, sent_ns=Int64, received_ns=Int64, replied_ns=Int64, session=Int64),
     ),
 }
 _BY_CODE = {layout.code: (cls, layout) for cls, layout in _LAYOUTS.items()}

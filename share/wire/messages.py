@@ -141,12 +141,16 @@ class Rate:
 
 @dataclass(frozen=True)
 class Pong:
-    """The four-stamp exchange of RFC 5905, section 8: sent by the agent, received and replied here."""
+    """The four-stamp exchange of RFC 5905, section 8: sent by the agent, received and replied here.
+
+    Every ping is answered, a stranger's too: `session` tells it that it must say hello again.
+    """
 
     sequence: int
     sent_ns: int
     received_ns: int
     replied_ns: int
+    session: int
 
 
 Up = Hello | PoseUpdate | Keyframe | Evaluation | Ping | Bye

@@ -42,7 +42,7 @@ EXAMPLES: list[m.Message] = [
     m.Ack(4, (6, 7)),
     Correction(POSE, np.eye(6), "map-1", 5, 3),
     m.Rate(4.5),
-    m.Pong(1, 1, 2, 3),
+    m.Pong(1, 1, 2, 3, 2**62),
 ]
 
 

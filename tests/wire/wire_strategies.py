@@ -57,5 +57,5 @@ messages = st.one_of(
     st.builds(m.Ack, ids, st.lists(ids, max_size=m.MAX_HELD).map(tuple)),
     st.builds(Correction, poses(), covs, names, int64, int64),
     st.builds(m.Rate, st.floats(0, m.MAX_RATE_HZ)),
-    st.builds(m.Pong, int64, int64, int64, int64),
+    st.builds(m.Pong, int64, int64, int64, int64, int64),
 )

@@ -1,0 +1,317 @@
+"""The agent's side of the protocol, without sockets, threads or a clock of its own.
+
+`handle` takes one event and the time, and returns what is to be done. The same events at the same times
+give the same effects. Odometry passes through untouched: the edge only moves the map under it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from typing import Any
+
+from share.config import Config
+from share.core import events as ev
+from share.core.chain import Chain
+from share.core.clock import ClockFilter
+from share.core.ledger import Entry, Ledger
+from share.core.map_frame import MapFrame
+from share.core.rate import Every, TokenBucket, seconds
+from share.errors import UsageError, WireError
+from share.geometry.se3 import inverse
+from share.types import F64, Correction
+from share.wire import messages as m
+from share.wire.codec import decode, encode, size
+
+_COUNTED = (
+    *("bytes_up", "bytes_down", "bad_messages", "poses", "candidates", "drop_rate"),
+    *("corrections", "corrections_stale"),
+)
+_BOOKED = ("sent", "resent", "acknowledged", "drop_oldest_acknowledged", "drop_oldest", "bad_acks")
+_REMEMBERED = 16  # pings under way, earlier lives of the edge, complaints
+
+
+class Agent:
+    """One run of one agent. `hello` is repeated until an edge welcomes it."""
+
+    def __init__(self, hello: m.Hello, config: Config) -> None:
+        link = config.link
+        self._config = config
+        self._name = hello.name
+        self._hello = encode(hello)
+        self._chain = Chain()
+        self._ledger = Ledger(config.agent, link)
+        self._bucket = TokenBucket(config.agent.rate_burst)
+        self._map = MapFrame(config.agent)
+        self._clock = ClockFilter(config.clock)
+        self._hello_timer, self._ping_timer = Every(link.hello_s), Every(link.ping_s)
+        self._waiting: ev.FrameTracked | None = None  # its candidate waits for a token
+        self._T_odom_body: F64 | None = None
+        self._connected = False
+        self._session: int | None = None
+        self._sessions: deque[int] = deque(maxlen=_REMEMBERED)
+        self._heard_ns: int | None = None  # or when waiting for the edge began
+        self._silence_said = False
+        self._revision = -1
+        self._pings: deque[m.Ping] = deque(maxlen=_REMEMBERED)
+        self._complaints: deque[str] = deque(maxlen=_REMEMBERED)
+        self._finish_by_ns: int | None = None
+        self._ended = False
+        self._counts: Counter[str] = Counter()
+        self._effects: list[ev.AgentEffect] = []
+
+    def handle(self, event: ev.AgentEvent, now_ns: int) -> list[ev.AgentEffect]:
+        """What to do about `event` at `now_ns` (host monotonic clock, never falling)."""
+        if self._ended:
+            return []
+        self._effects = []
+        if self._heard_ns is None:
+            self._heard_ns = now_ns
+        match event:
+            case ev.FrameTracked():
+                self._frame_tracked(event, now_ns)
+            case ev.Received():
+                self._received(event, now_ns)
+            case ev.Finished():
+                self._finished(now_ns)
+            case ev.Tick():
+                pass
+        if not self._ended:
+            self._keep_up(now_ns)
+        return self._effects
+
+    def report(self) -> dict[str, Any]:
+        """Counters and the present state, as plain data."""
+        return {
+            **{name: self._counts[name] for name in _COUNTED},
+            **{name: self._ledger.counts[name] for name in _BOOKED},
+            "keyframes": self._chain.next_id,
+            "open": self._ledger.open,
+            "rate_hz": self._bucket.hz,
+            "connected": self._connected,
+            "edge_sessions": len(self._sessions),
+            "map_id": self._map.map_id,
+            "revision": self._revision,
+            **self._clock.report(),
+        }
+
+    # ------------------------------------------------------------ frames
+
+    def _frame_tracked(self, frame: ev.FrameTracked, now_ns: int) -> None:
+        if frame.candidate is not None and frame.candidate.new_stretch:
+            self._map.forget()
+        if frame.candidate is not None:
+            self._offer(frame)
+        if frame.T_odom_body is not None and frame.state.has_pose:
+            self._localised(frame, frame.T_odom_body, now_ns)
+        if frame.candidate is None:
+            self._frame_done(frame, sent=False)
+
+    def _offer(self, frame: ev.FrameTracked) -> None:
+        """Queues a candidate for a token; the one that has waited so far is dropped (drop_rate)."""
+        assert frame.candidate is not None
+        self._counts["candidates"] += 1
+        self._drop_waiting()
+        self._chain.extend(frame.candidate)
+        self._waiting = frame
+
+    def _localised(self, frame: ev.FrameTracked, T_odom_body: F64, now_ns: int) -> None:
+        self._T_odom_body = T_odom_body
+        T_map_odom = self._map.at(now_ns)
+        self._effects.append(
+            ev.Localised(frame.index, frame.stamp_ns, T_odom_body, T_map_odom, self._map.map_id, frame.state)
+        )
+        if self._connected:
+            self._counts["poses"] += 1
+            self._send(self._pose_update(frame, T_odom_body))
+
+    def _pose_update(self, frame: ev.FrameTracked, T_odom_body: F64) -> m.PoseUpdate:
+        """Relative to the last keyframe that the edge has, if it is of the present stretch."""
+        last = self._ledger.last_acknowledged
+        if last is None or last.keyframe.id < self._chain.first_of_stretch:
+            return m.PoseUpdate(frame.stamp_ns, frame.state, -1, T_odom_body)
+        T_keyframe_body = inverse(last.T_odom_body) @ T_odom_body
+        return m.PoseUpdate(frame.stamp_ns, frame.state, last.keyframe.id, T_keyframe_body)
+
+    def _spend(self, now_ns: int) -> None:
+        """Makes a keyframe of the waiting candidate if the rate allows."""
+        frame = self._waiting
+        if frame is None or frame.candidate is None or not self._bucket.take(now_ns):
+            return
+        self._waiting = None
+        keyframe = self._chain.keyframe(frame.candidate, frame.stamp_ns)
+        self._ledger.add(Entry(keyframe, frame.candidate.T_odom_body, frame.index, frame.arrived_ns))
+        self._frame_done(frame, sent=True)
+        if self._connected and self._clock.rtt_ms is not None:
+            delay_ms = self._clock.rtt_ms + max(0.0, frame.track_ms)
+            self._send(m.Evaluation(keyframe.id, delay_ms, frame.error_cm))
+
+    def _drop_waiting(self) -> None:
+        if self._waiting is not None:
+            self._counts["drop_rate"] += 1
+            self._frame_done(self._waiting, sent=False)
+            self._waiting = None
+
+    def _frame_done(self, frame: ev.FrameTracked, sent: bool) -> None:
+        self._effects.append(
+            ev.FrameDone(frame.stamp_ns, frame.track_ms, frame.state, frame.candidate is not None, sent)
+        )
+
+    # ------------------------------------------------------------ what the edge says
+
+    def _received(self, event: ev.Received, now_ns: int) -> None:
+        self._counts["bytes_down"] += size(event.frames)
+        try:
+            message = decode(event.frames)
+        except WireError as error:
+            self._complain(f"a message from the edge is not understood: {error}")
+            return
+        self._heard_ns = now_ns
+        match message:
+            case m.Welcome():
+                self._welcomed(message, now_ns)
+            case m.Refused():
+                self._refused(message, now_ns)
+            case m.Ack():
+                self._ledger.acknowledge(message)
+            case Correction():
+                self._corrected(message, now_ns)
+            case m.Rate():
+                self._bucket.limit(message.hz, now_ns)
+            case m.Pong():
+                self._ponged(message, now_ns)
+            case _:
+                self._complain(f"the edge sent a {type(message).__name__}, which only agents send")
+
+    def _complain(self, text: str) -> None:
+        """Counts a bad message; says each kind once."""
+        self._counts["bad_messages"] += 1
+        if text not in self._complaints:
+            self._complaints.append(text)
+            self._say(text)
+
+    def _welcomed(self, welcome: m.Welcome, now_ns: int) -> None:
+        if welcome.session != self._session and welcome.session in self._sessions:
+            return  # overtaken on its way by that of a later life of the edge
+        returned, self._connected, self._silence_said = not self._connected, True, False
+        if welcome.session != self._session:
+            self._new_session(welcome, now_ns)
+        elif returned:
+            self._ledger.resume(welcome)
+            self._say("the edge is back")
+
+    def _new_session(self, welcome: m.Welcome, now_ns: int) -> None:
+        again = self._session is not None
+        self._session, self._revision = welcome.session, -1
+        self._sessions.append(welcome.session)
+        self._bucket.limit(None, now_ns)
+        self._clock.reset()
+        self._pings.clear()
+        held = self._ledger.begin(welcome)
+        self._say(
+            f"the edge has restarted; it is sent {held} keyframes again" if again else "connected to the edge"
+        )
+
+    def _refused(self, refused: m.Refused, now_ns: int) -> None:
+        text = f"the edge refuses '{self._name}': {refused.reason}"
+        if self._session is None:
+            self._ended = True
+            self._effects.append(ev.Fail(UsageError(text)))
+            return
+        self._connected = False
+        self._hello_timer.postpone(now_ns + seconds(self._config.link.refused_s))
+        self._say(f"{text}; tracking goes on alone")
+
+    def _corrected(self, correction: Correction, now_ns: int) -> None:
+        if not self._connected or correction.revision <= self._revision or not self._of_stretch(correction):
+            self._counts["corrections_stale"] += 1
+            return
+        self._revision = correction.revision
+        self._counts["corrections"] += 1
+        T_odom_body = correction.T_map_odom if self._T_odom_body is None else self._T_odom_body
+        new_map = self._map.correct(correction.T_map_odom, correction.map_id, T_odom_body, now_ns)
+        entry = self._ledger.find(correction.answers)
+        corrected_ms = None
+        if entry is not None and not (entry.answered or entry.replayed):
+            entry.answered = True
+            corrected_ms = (now_ns - entry.arrived_ns) / 1e6
+        self._effects.append(
+            ev.CorrectionApplied(
+                entry.keyframe.id if entry else None,
+                entry.frame if entry else None,
+                entry.keyframe.stamp_ns if entry else None,
+                corrected_ms,
+                correction.map_id,
+                correction.revision,
+                new_map,
+            )
+        )
+
+    def _of_stretch(self, correction: Correction) -> bool:
+        """Whether it is about the present stretch of odometry: the edge had a keyframe of it."""
+        last = self._ledger.last_acknowledged
+        known = max(correction.answers, last.keyframe.id if last and correction.answers < 0 else -1)
+        return known >= self._chain.first_of_stretch
+
+    def _ponged(self, pong: m.Pong, now_ns: int) -> None:
+        ping = m.Ping(pong.sequence, pong.sent_ns)
+        if ping not in self._pings:
+            return
+        self._pings.remove(ping)
+        if pong.session != self._session:
+            self._connected = False  # the edge has restarted and does not know us: hello
+            return
+        self._clock.update(pong.sent_ns, pong.received_ns, pong.replied_ns, now_ns)
+
+    # ------------------------------------------------------------ what is due
+
+    def _keep_up(self, now_ns: int) -> None:
+        self._spend(now_ns)
+        self._watch_silence(now_ns)
+        if self._connected:
+            self._ping(now_ns)
+            self._send_keyframes(now_ns)
+        elif self._hello_timer.due(now_ns):
+            self._send_frames(self._hello)
+        if self._finish_by_ns is not None and (not self._ledger.open or now_ns >= self._finish_by_ns):
+            self._end()
+
+    def _watch_silence(self, now_ns: int) -> None:
+        assert self._heard_ns is not None
+        if now_ns - self._heard_ns <= seconds(self._config.link.silent_s):
+            return
+        self._connected = False
+        if not self._silence_said:
+            self._silence_said = True
+            gone = "the edge is silent" if self._session is not None else "no edge answers yet"
+            self._say(f"{gone}; tracking goes on alone")
+
+    def _ping(self, now_ns: int) -> None:
+        if self._ping_timer.due(now_ns):
+            self._counts["pings"] += 1
+            ping = m.Ping(self._counts["pings"], now_ns)
+            self._pings.append(ping)
+            self._send(ping)
+
+    def _send_keyframes(self, now_ns: int) -> None:
+        for entry in self._ledger.due(now_ns):
+            self._send(entry.keyframe)
+
+    def _finished(self, now_ns: int) -> None:
+        self._drop_waiting()
+        self._finish_by_ns = now_ns + seconds(self._config.agent.finish_s)
+
+    def _end(self) -> None:
+        if self._connected:
+            self._send(m.Bye())
+        self._ended = True
+        self._effects.append(ev.Stop())
+
+    def _send(self, message: m.Up) -> None:
+        self._send_frames(encode(message))
+
+    def _send_frames(self, frames: Any) -> None:
+        self._counts["bytes_up"] += size(frames)
+        self._effects.append(ev.Send(frames))
+
+    def _say(self, text: str) -> None:
+        self._effects.append(ev.Say(text))

@@ -1,0 +1,130 @@
+"""What the agent is told (events) and what it wants done (effects). All times are host monotonic ns
+unless they are called `stamp_ns`: those are the frame's, in the sensor's clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from share.errors import ShareError
+from share.types import F64, Candidate, TrackState
+from share.wire.codec import Bytes
+
+# ---------------------------------------------------------------- events
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTracked:
+    """The tracker is done with a frame. T_odom_body (4, 4) where the state has a pose.
+
+    arrived_ns, done_ns: when the frame came in and its pose was known. error_cm: expected position
+    error, where somebody estimates it.
+    """
+
+    index: int
+    stamp_ns: int
+    arrived_ns: int
+    done_ns: int
+    state: TrackState
+    T_odom_body: F64 | None = None
+    candidate: Candidate | None = None
+    error_cm: float | None = None
+
+    @property
+    def track_ms(self) -> float:
+        return (self.done_ns - self.arrived_ns) / 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Received:
+    """A message from the edge, undecoded."""
+
+    frames: Sequence[Bytes]
+
+
+@dataclass(frozen=True)
+class Tick:
+    """Time has passed; every 50 ms is often enough."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """No frame will follow."""
+
+
+AgentEvent = FrameTracked | Received | Tick | Finished
+
+# ---------------------------------------------------------------- effects
+
+
+@dataclass(frozen=True, eq=False)
+class Send:
+    """Hand these frames to the link; whether they left is not reported back."""
+
+    frames: Sequence[Bytes]
+
+
+@dataclass(frozen=True, eq=False)
+class Localised:
+    """Where the agent is. T_map_odom: in force at this moment (blended), None before a correction."""
+
+    index: int
+    stamp_ns: int
+    T_odom_body: F64
+    T_map_odom: F64 | None
+    map_id: str | None
+    state: TrackState
+
+
+@dataclass(frozen=True)
+class CorrectionApplied:
+    """A correction is in force, or being blended in, from now on.
+
+    keyframe, frame, stamp_ns: the keyframe that it answers and its frame, None where it answers none that is
+    remembered. corrected_ms: from that frame's arrival to now, for the first correction only, and
+    not for keyframes that a restarted edge was given again.
+    """
+
+    keyframe: int | None
+    frame: int | None
+    stamp_ns: int | None
+    corrected_ms: float | None
+    map_id: str
+    revision: int
+    new_map: bool
+
+
+@dataclass(frozen=True)
+class FrameDone:
+    """One per frame, once it is known whether it is sent; so a candidate's comes after it has waited.
+
+    keyframe: the tracker offered it as one. sent: it was given a keyframe id.
+    """
+
+    stamp_ns: int
+    track_ms: float
+    state: TrackState
+    keyframe: bool
+    sent: bool
+
+
+@dataclass(frozen=True)
+class Say:
+    """One line for a person."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Fail:
+    """The run cannot go on; `error` says why."""
+
+    error: ShareError
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Everything is done: close the link."""
+
+
+AgentEffect = Send | Localised | CorrectionApplied | FrameDone | Say | Fail | Stop

@@ -1,0 +1,56 @@
+"""Keyframes of one agent, from any order of arrival into the order in which they were made."""
+
+from __future__ import annotations
+
+from share.types import Keyframe
+from share.wire.messages import MAX_HELD, Ack
+
+
+class InOrder:
+    """Yields each keyframe once, after the one that it follows; holds a bounded number back.
+
+    Ids that the agent dropped are skipped: the first keyframe after them says so by what it follows.
+    Of two versions of a waiting keyframe the one that follows the lower id is the later.
+    """
+
+    def __init__(self, next_keyframe: int = 0, hold: int = 64) -> None:
+        """next_keyframe: one more than the last id already applied. hold: at most MAX_HELD."""
+        if not 1 <= hold <= MAX_HELD:
+            raise ValueError(f"hold: {hold} is outside 1 .. {MAX_HELD}")
+        self.next_keyframe = next_keyframe
+        self.duplicates = 0
+        self.evicted = 0
+        self._hold = hold
+        self._waiting: dict[int, Keyframe] = {}
+
+    def push(self, keyframe: Keyframe) -> list[Keyframe]:
+        """The keyframes, rising by id, that can be applied now that this one is here."""
+        if keyframe.id < self.next_keyframe:
+            self.duplicates += 1
+            return []
+        self._keep(keyframe)
+        ready = []
+        while (found := self._applicable()) is not None:
+            ready.append(found)
+            self.next_keyframe = found.id + 1
+            self._waiting = {k: v for k, v in self._waiting.items() if k > found.id}
+        return ready
+
+    def ack(self) -> Ack:
+        """What to answer to every keyframe, duplicates too: their acknowledgement may have been lost."""
+        return Ack(self.next_keyframe, tuple(sorted(self._waiting)))
+
+    def _keep(self, keyframe: Keyframe) -> None:
+        known = self._waiting.get(keyframe.id)
+        if known is not None:
+            self.duplicates += 1
+        if known is None or keyframe.follows < known.follows:
+            self._waiting[keyframe.id] = keyframe
+        if len(self._waiting) > self._hold:
+            del self._waiting[max(self._waiting)]  # drop_newest: the agent sends it again
+            self.evicted += 1
+
+    def _applicable(self) -> Keyframe | None:
+        ready = (k for k in sorted(self._waiting) if self._waiting[k].follows < self.next_keyframe)
+        first = next(ready, None)
+        return None if first is None else self._waiting[first]

@@ -1,0 +1,154 @@
+"""The agent's book of keyframes: what was sent, what has been acknowledged, what is due again."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+
+from share.config import AgentConfig, LinkConfig
+from share.core.rate import seconds
+from share.geometry.se3 import compose_cov
+from share.types import F64, Keyframe
+from share.wire.messages import Ack, Welcome
+
+
+@dataclass(eq=False, slots=True)
+class Entry:
+    """A keyframe, its frame, and how far it has come."""
+
+    keyframe: Keyframe
+    T_odom_body: F64
+    frame: int
+    arrived_ns: int
+    attempts: int = 0  # in this life of the edge
+    due_ns: int | None = None  # None: now
+    sent_ns: int = 0
+    replayed: bool = False  # an earlier life of the edge had acknowledged it
+    answered: bool = False  # a correction based on it came back
+
+
+class Ledger:
+    """Keyframes in order of their ids: first those acknowledged, then those open.
+
+    Only the first `window` open ones are in flight. A full ledger drops the oldest acknowledged one
+    (policy drop_oldest_acknowledged); where none is, the oldest open one (drop_oldest), and the next
+    keyframe is then made relative to what that one was relative to. `counts` has both, by name.
+    """
+
+    def __init__(self, agent: AgentConfig, link: LinkConfig) -> None:
+        self.counts: Counter[str] = Counter()
+        self._keep = agent.keep_keyframes
+        self._link = link
+        self._acknowledged: dict[int, Entry] = {}
+        self._open: dict[int, Entry] = {}
+        self._held: frozenset[int] = frozenset()  # arrived, but waiting at the edge for a gap to close
+        self._sent_to = -1  # highest id put on the wire in this life of the edge
+
+    def __len__(self) -> int:
+        return len(self._acknowledged) + len(self._open)
+
+    @property
+    def open(self) -> int:
+        """How many keyframes are not acknowledged."""
+        return len(self._open)
+
+    @property
+    def last_acknowledged(self) -> Entry | None:
+        return next(reversed(self._acknowledged.values()), None)
+
+    def find(self, keyframe: int) -> Entry | None:
+        return self._acknowledged.get(keyframe) or self._open.get(keyframe)
+
+    def add(self, entry: Entry) -> None:
+        """Appends the newest keyframe; drops one where that is one too many."""
+        self._open[entry.keyframe.id] = entry
+        if len(self) > self._keep:
+            self._drop()
+
+    def due(self, now_ns: int) -> list[Entry]:
+        """What to send now, in order; taken as sent."""
+        window = list(self._open.values())[: self._link.window]
+        chosen = [entry for entry in window if self._is_due(entry, now_ns)]
+        for entry in chosen:
+            self.counts["sent" if entry.attempts == 0 else "resent"] += 1
+            backoff = self._link.resend_s * 2.0 ** min(entry.attempts, 30)
+            entry.due_ns = now_ns + seconds(min(backoff, self._link.resend_max_s))
+            entry.attempts += 1
+            entry.sent_ns = now_ns
+            self._sent_to = max(self._sent_to, entry.keyframe.id)
+        return chosen
+
+    def acknowledge(self, ack: Ack) -> None:
+        """Takes note of what has arrived; gaps below what is held are due again after `gap_s`."""
+        if ack.next_keyframe > self._sent_to + 1:  # says more than was ever sent
+            self.counts["bad_acks"] += 1
+            return
+        while self._open and (first := next(iter(self._open))) < ack.next_keyframe:
+            self._acknowledged[first] = self._open.pop(first)
+            self.counts["acknowledged"] += 1
+        self._held = frozenset(ack.held)
+        top = max(self._held, default=-1)
+        for entry in list(self._open.values())[: self._link.window]:
+            if entry.attempts and entry.keyframe.id < top:
+                entry.due_ns = min(entry.due_ns or 0, entry.sent_ns + seconds(self._link.gap_s))
+
+    def resume(self, welcome: Welcome) -> None:
+        """The edge was silent and is back: what was on its way is taken as lost, and due."""
+        self.acknowledge(Ack(welcome.next_keyframe))
+        self._retry()
+
+    def begin(self, welcome: Welcome) -> int:
+        """A new life of the edge: everything held from `next_keyframe` on is due. Returns how many.
+
+        The first one stands on its own if this life of the edge does not have what it refers to.
+        """
+        everything = self._acknowledged | self._open
+        for entry in self._acknowledged.values():
+            entry.replayed = True
+        self._acknowledged = {k: v for k, v in everything.items() if k < welcome.next_keyframe}
+        self._open = {k: v for k, v in everything.items() if k >= welcome.next_keyframe}
+        self._sent_to = welcome.next_keyframe - 1
+        first = next(iter(self._open.values()), None)
+        if first and first.keyframe.follows >= welcome.next_keyframe:
+            first.keyframe = _cut_loose(first)
+        for entry in self._open.values():
+            entry.attempts = 0
+        self._retry()
+        return self.open
+
+    def _is_due(self, entry: Entry, now_ns: int) -> bool:
+        return entry.keyframe.id not in self._held and (entry.due_ns is None or entry.due_ns <= now_ns)
+
+    def _retry(self) -> None:
+        self._held = frozenset()
+        for entry in self._open.values():
+            entry.due_ns = None
+
+    def _drop(self) -> None:
+        if self._acknowledged:
+            del self._acknowledged[next(iter(self._acknowledged))]
+            self.counts["drop_oldest_acknowledged"] += 1
+            return
+        dropped = self._open.pop(next(iter(self._open))).keyframe
+        self.counts["drop_oldest"] += 1
+        heir = next(iter(self._open.values()), None)
+        if heir:
+            heir.keyframe = _inherit(heir.keyframe, dropped)
+
+
+def _inherit(keyframe: Keyframe, dropped: Keyframe) -> Keyframe:
+    """`keyframe` relative to what the dropped one, its predecessor, was relative to."""
+    if keyframe.reference != dropped.id:  # a stretch of its own
+        return replace(keyframe, follows=dropped.follows)
+    return replace(
+        keyframe,
+        reference=dropped.reference,
+        follows=dropped.follows,
+        T_ref_body=dropped.T_ref_body @ keyframe.T_ref_body,
+        cov=compose_cov(keyframe.T_ref_body, dropped.cov, keyframe.cov),
+    )
+
+
+def _cut_loose(entry: Entry) -> Keyframe:
+    """The keyframe at the beginning of a stretch, for an edge that has nothing before it."""
+    return replace(entry.keyframe, reference=-1, follows=-1, T_ref_body=entry.T_odom_body)

@@ -1,0 +1,51 @@
+"""Where odometry lies in the map, as an application may use it: without jumps."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from share.config import AgentConfig
+from share.core.rate import SECOND_NS
+from share.geometry import se3
+from share.types import F64
+
+
+class MapFrame:
+    """T_map_odom (4, 4) in force. Large changes are blended in along the geodesic of SE(3).
+
+    How large a change is, is judged where the body is: a small turn moves what is far from the
+    origin of odometry a long way.
+    """
+
+    def __init__(self, config: AgentConfig) -> None:
+        self.map_id: str | None = None
+        self._config = config
+        self._target: F64 | None = None
+        self._xi: F64 = np.zeros(6)  # from the target back to what was in force when the blend began
+        self._began_ns = 0
+
+    def at(self, now_ns: int) -> F64 | None:
+        """T_map_odom at this time, None before the first correction."""
+        if self._target is None:
+            return None
+        left = 1 - (now_ns - self._began_ns) / (self._config.blend_s * SECOND_NS)
+        if left <= 0 or not self._xi.any():
+            return self._target
+        return self._target @ se3.exp(min(left, 1.0) * self._xi)
+
+    def correct(self, T_map_odom: F64, map_id: str, T_odom_body: F64, now_ns: int) -> bool:
+        """A new target from now on. Returns whether it lies in another map."""
+        now, same_map = self.at(now_ns), map_id == self.map_id
+        blend = now is not None and same_map and self._is_large(now, T_map_odom, T_odom_body)
+        self._xi = se3.log(se3.inverse(T_map_odom) @ now) if blend and now is not None else np.zeros(6)
+        self._target, self._began_ns, self.map_id = T_map_odom, now_ns, map_id
+        return not same_map
+
+    def forget(self) -> None:
+        """Odometry broke: nothing is known until the next correction."""
+        self._target = None
+
+    def _is_large(self, T_old: F64, T_new: F64, T_odom_body: F64) -> bool:
+        jump = se3.log(se3.inverse(T_old @ T_odom_body) @ T_new @ T_odom_body)
+        turn, shift = np.linalg.norm(jump[:3]), np.linalg.norm(jump[3:])
+        return bool(shift > self._config.blend_jump_m or turn > self._config.blend_jump_rad)

@@ -1,0 +1,59 @@
+"""Timers and the token bucket, on a clock that is passed in."""
+
+from __future__ import annotations
+
+SECOND_NS = 1_000_000_000
+
+
+def seconds(value: float) -> int:
+    """Seconds as ns."""
+    return round(value * SECOND_NS)
+
+
+class Every:
+    """Due at once, and then again after each period."""
+
+    def __init__(self, period_s: float) -> None:
+        self._period_ns = seconds(period_s)
+        self._next_ns: int | None = None
+
+    def due(self, now_ns: int) -> bool:
+        if self._next_ns is not None and now_ns < self._next_ns:
+            return False
+        self._next_ns = now_ns + self._period_ns
+        return True
+
+    def postpone(self, until_ns: int) -> None:
+        """Not due before `until_ns`."""
+        self._next_ns = until_ns
+
+
+class TokenBucket:
+    """Lets `hz` a second through on average, at most `burst` at once; everything while hz is None."""
+
+    def __init__(self, burst: float) -> None:
+        self.hz: float | None = None
+        self._burst = burst
+        self._tokens = burst
+        self._seen_ns: int | None = None
+
+    def limit(self, hz: float | None, now_ns: int) -> None:
+        """A new rate from now on; what has been saved up stays."""
+        self._refill(now_ns)
+        self.hz = hz
+
+    def take(self, now_ns: int) -> bool:
+        """Whether one may pass now."""
+        self._refill(now_ns)
+        if self.hz is None:
+            return True
+        if self._tokens < 1 - 1e-9:
+            return False
+        self._tokens -= 1
+        return True
+
+    def _refill(self, now_ns: int) -> None:
+        passed_ns = 0 if self._seen_ns is None else max(0, now_ns - self._seen_ns)
+        self._seen_ns = now_ns
+        if self.hz is not None:
+            self._tokens = min(self._burst, self._tokens + self.hz * passed_ns / SECOND_NS)
