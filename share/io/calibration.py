@@ -47,25 +47,29 @@ def read_calibration(path: Path) -> Calibration:
 
 def read_kalibr(path: Path, imu_path: Path | None = None) -> Calibration:
     """Kalibr's camchain and, if given, IMU chain. Without the latter the rig has no IMU, body = cam0."""
-    top = read_yaml(path)
-    cam0, topics = top.section("cam0"), {}
-    imu = None
-    if imu_path:
-        section = read_yaml(imu_path).section("imu0")
-        imu, topics["imu"] = _imu_noise(section, "update_rate"), section.text("rostopic", "")
-    rig = Rig(cam0=_camera(cam0), T_body_cam0=_kalibr_T_imu_cam(cam0) if imu else np.eye(4), imu=imu)
-    for name in ("cam0", "cam1", "depth"):
-        if name in top:
-            topics[name] = top.section(name).text("rostopic", "")
-    if "cam1" in top:
-        cam1 = top.section("cam1")
-        rig = replace(rig, cam1=_camera(cam1), T_cam1_cam0=_kalibr_T_cam1_cam0(cam0, cam1))
+    return kalibr(read_yaml(path), read_yaml(imu_path).section("imu0") if imu_path else None)
+
+
+def kalibr(chain: Section, imu: Section | None) -> Calibration:
+    """The rig of a camchain (cam0, cam1 and, ours alone, depth) and an IMU chain's imu0."""
+    cams = {name: chain.section(name) for name in ("cam0", "cam1", "depth") if name in chain}
+    cam0 = chain.section("cam0")
+    rig = Rig(
+        cam0=_camera(cam0),
+        T_body_cam0=_kalibr_T_imu_cam(cam0) if imu else np.eye(4),
+        imu=_imu_noise(imu, "update_rate") if imu else None,
+    )
+    if "cam1" in cams:
+        T_cam1_cam0 = _kalibr_T_cam1_cam0(cam0, cams["cam1"])
+        rig = replace(rig, cam1=_camera(cams["cam1"]), T_cam1_cam0=T_cam1_cam0)
     scale = _DEPTH_SCALE
-    if "depth" in top:  # not Kalibr's: an RGB-D sensor's depth camera in the same file
-        depth = top.section("depth")
+    if "depth" in cams:
+        depth = cams["depth"]
         rig = replace(rig, depth=_camera(depth), T_depth_cam0=depth.pose("T_depth_cam0"))
         scale = depth.number("depth_scale", _DEPTH_SCALE, positive=True)
-    return Calibration(rig, str(path), scale, {k: v for k, v in topics.items() if v})
+    named = cams | ({"imu": imu} if imu else {})
+    topics = {name: section.text("rostopic", "") for name, section in named.items()}
+    return Calibration(rig, chain.where, scale, {k: v for k, v in topics.items() if v})
 
 
 def read_camera_yaml(path: Path) -> Calibration:

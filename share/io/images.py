@@ -113,6 +113,16 @@ def encode_jpeg(image: U8, quality: int) -> bytes:
     return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
 
 
+def image_format(data: bytes) -> str:
+    """`png` or `jpg`."""
+    return "png" if data[:8] == _PNG else "jpg"
+
+
+def encode_png(image: U8) -> bytes:
+    """(H, W) uint8 -> PNG, lossless."""
+    return bytes(cv2.imencode(".png", image)[1])
+
+
 def check_size(image: NDArray[Any], width: int, height: int, where: str) -> NDArray[Any]:
     """`image` if it is as large as the calibration says, else DataError."""
     if image.shape != (height, width):

@@ -102,10 +102,8 @@ class McapFile:
         with open(self.path, "rb") as file:
             try:
                 return self._reader(file).get_summary()
-            except damage() as error:
-                raise self._broken(str(error) or type(error).__name__) from None
-            except OSError:  # shorter than a footer
-                raise self._broken("it ends too soon") from None
+            except (*damage(), OSError):  # OSError: shorter than a footer
+                raise self._broken("it has no end") from None
 
     def _check_index(self) -> None:
         summary = self._summary

@@ -7,9 +7,9 @@ start, record by record, as far as it goes.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from share.errors import DataError, UsageError
 from share.io.files import check_writable, sync_folder
@@ -17,7 +17,7 @@ from share.io.mcap_file import MAGIC, damage
 
 
 class Recovered(NamedTuple):
-    """messages by topic, bytes that could not be read, and why reading stopped (empty: at a good end)."""
+    """messages by topic; bytes that could not be read; why (empty: nothing was lost)."""
 
     messages: dict[str, int]
     lost_bytes: int
@@ -25,7 +25,7 @@ class Recovered(NamedTuple):
 
 
 def recover(path: Path, out: Path, progress: Callable[[int], None] = lambda _: None) -> Recovered:
-    """Copy what is whole from `path` to `out`; `progress` is told the bytes read so far.
+    """Copy what is whole from `path` to `out`; `progress` is told how many more bytes are read.
 
     Raises UsageError for paths that cannot be used, DataError if nothing can be saved.
     """
@@ -49,30 +49,44 @@ def _copy(path: Path, part: Path, progress: Callable[[int], None]) -> Recovered:
     from mcap.writer import Writer
 
     with open(path, "rb") as file, open(part, "wb") as target:
-        size = os.fstat(file.fileno()).st_size
         if file.read(len(MAGIC)) != MAGIC:
             raise DataError(f"{path}: is not an MCAP file, or is empty")
         file.seek(0)
         writer = Writer(target, chunk_size=256 * 1024)
         writer.start(profile="ros2", library="share")
-        copier, reason, good = _Copier(writer), "", 0
-        try:
-            for record in _records(file):
-                copier.copy(record)
-                good = file.tell()
-                progress(good)
-        except damage() as error:
-            reason = str(error) or type(error).__name__
+        copier = _Copier(writer)
+        lost, reason = _copy_records(file, copier, progress)
         writer.finish()
         target.flush()
         os.fsync(target.fileno())
-    return Recovered(copier.counts, size - good if reason else 0, reason)
+    return Recovered(copier.counts, lost, reason)
 
 
-def _records(file: Any) -> Iterator[Any]:
-    from mcap.stream_reader import StreamReader
+def _copy_records(file: BinaryIO, copier: _Copier, progress: Callable[[int], None]) -> tuple[int, str]:
+    """Up to the first record that is broken; a chunk that is broken inside is left out alone."""
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader, breakup_chunk
 
-    yield from StreamReader(file, validate_crcs=True, record_size_limit=2**30).records
+    records = StreamReader(file, emit_chunks=True, record_size_limit=2**30).records
+    lost, reason, good = 0, "", 0
+    while True:
+        try:
+            record = next(records, None)
+        except damage() as error:
+            return lost + os.fstat(file.fileno()).st_size - good, reason or _why(error)
+        if record is None:
+            return lost, reason
+        try:
+            for part in breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]:
+                copier.copy(part)
+        except damage() as error:
+            lost, reason = lost + file.tell() - good, reason or _why(error)
+        progress(file.tell() - good)
+        good = file.tell()
+
+
+def _why(error: Exception) -> str:
+    return "the file ends too soon" if type(error).__name__ == "EndOfFile" else f"damaged: {error}"
 
 
 class _Copier:

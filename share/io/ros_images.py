@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from share.errors import DataError
 from share.geometry.camera import Camera
 from share.io import ros_types as ros
-from share.io.images import EncodedImage, check_size, depth_metres
+from share.io.images import EncodedImage, check_size, depth_metres, image_format
 from share.types import F32
 
 MILLIMETRES = 1000.0  # 16UC1 depth is in mm, 32FC1 in m: ROS REP 118
@@ -90,7 +90,7 @@ def from_compressed(message: Any, where: str, camera: Camera, is_depth: bool) ->
 
 def to_compressed(header: Any, data: bytes, is_depth: bool) -> Any:
     """JPEG or PNG bytes as they are. A 16-bit PNG of depth in mm gets image_transport's header."""
-    kind = "png" if data[:4] == b"\x89PNG" else "jpeg"
+    kind = "png" if image_format(data) == "png" else "jpeg"
     if is_depth:
         data, kind = bytes(_CONFIG_HEADER) + data, "16UC1; compressedDepth png"
     return ros.make(ros.COMPRESSED, header=header, format=kind, data=np.frombuffer(data, np.uint8))

@@ -7,89 +7,90 @@ truth/NAME.tum   pose of the body in the world, if known
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from share.errors import ConfigError, UsageError
-from share.io.files import atomic_write
+from share.io.calibration import Calibration, kalibr, read_calibration
 from share.io.section import Section, read_yaml
 from share.types import AgentKind
 
 SESSION = "session.yaml"
-VERSION = 1
+SCHEMA = 1
+_KEYS = ("kind", "sensors", "rate_hz", "clock_offset_ns", "calibration")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SessionAgent:
-    """sensors: the rig's kind, e.g. `stereo+imu`. calibration: file or folder below the session's folder,
-    or "" for what the recording carries. clock_offset_ms: what to add to its stamps for session time."""
+    """sensors: the rig's kind, e.g. `stereo+imu`. A stamp in its files is session time + clock_offset_ns.
+    calibration: None where the recording's own is to be used."""
 
     kind: AgentKind
     sensors: str
-    calibration: str = ""
-    clock_offset_ms: float = 0.0
+    rate_hz: float
+    clock_offset_ns: int
+    calibration: Calibration | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Session:
     """agents by name; provenance: where it comes from, plain values for a person and a paper."""
 
+    folder: Path
     agents: dict[str, SessionAgent]
-    provenance: dict[str, Any] = field(default_factory=dict)
+    provenance: dict[str, Any]
+
+    def recording(self, name: str) -> Path:
+        """The recording of agent `name`. Raises UsageError if there is none."""
+        if name not in self.agents:
+            raise UsageError(f"{self.folder}: has no agent '{name}'; it has {', '.join(self.agents)}")
+        recording = self.folder / f"{name}.mcap"
+        if not recording.is_file():
+            raise UsageError(f"{recording}: no such file, although {self.folder / SESSION} names it")
+        return recording
 
 
 def is_session(folder: Path) -> bool:
     return (folder / SESSION).is_file()
 
 
-def write_session(folder: Path, session: Session) -> None:
-    """Write session.yaml into `folder`. Raises UsageError if that cannot be done."""
-    import yaml
-
-    agents = {name: {**asdict(agent), "kind": str(agent.kind)} for name, agent in session.agents.items()}
-    data = {"version": VERSION, "agents": agents, "provenance": session.provenance}
-    atomic_write(folder / SESSION, yaml.safe_dump(data, sort_keys=False, allow_unicode=True))
-
-
 def read_session(folder: Path) -> Session:
     """Raises ConfigError naming the key that is wrong."""
     top = read_yaml(folder / SESSION)
-    version = top.number("version")
-    if version != VERSION:
-        raise ConfigError(
-            f"{top.where}: version {version:g} is not known; this SHARE reads version {VERSION}"
-        )
+    schema = top.number("schema")
+    if schema != SCHEMA:
+        raise ConfigError(f"{top.where}: schema {schema:g} is not known; this SHARE reads schema {SCHEMA}")
     agents = top.section("agents")
     if not agents.data:
         raise ConfigError(f"{agents.where}: names nobody")
     provenance = top.section("provenance").data if "provenance" in top else {}
-    return Session({str(name): _agent(agents.section(name)) for name in agents.data}, provenance)
+    found = {str(name): _agent(agents.section(name), folder) for name in agents.data}
+    return Session(folder, found, provenance)
 
 
-def recording_of(folder: Path, name: str) -> tuple[Path, Path | None]:
-    """(recording, calibration or None) of agent `name`. Raises UsageError if there is no such agent."""
-    agents = read_session(folder).agents
-    if name not in agents:
-        raise UsageError(f"{folder}: has no agent '{name}'; it has {', '.join(agents)}")
-    recording = folder / f"{name}.mcap"
-    if not recording.is_file():
-        raise UsageError(f"{recording}: no such file, although {folder / SESSION} names it")
-    calibration = agents[name].calibration
-    return recording, folder / calibration if calibration else None
-
-
-def _agent(section: Section) -> SessionAgent:
-    known = SessionAgent.__dataclass_fields__
-    unknown = [key for key in section.data if key not in known]
+def _agent(section: Section, folder: Path) -> SessionAgent:
+    unknown = [key for key in section.data if key not in _KEYS]
     if unknown:
-        raise ConfigError(f"{section.where}: unknown key '{unknown[0]}'; known: {', '.join(known)}")
+        raise ConfigError(f"{section.where}: unknown key '{unknown[0]}'; known: {', '.join(_KEYS)}")
     kind = section.text("kind")
     if kind not in list(AgentKind):
         raise ConfigError(f"{section.where}: kind '{kind}' is not known; known: {', '.join(AgentKind)}")
+    offset = section.data.get("clock_offset_ns", 0)
+    if type(offset) is not int:
+        raise ConfigError(f"{section.where}: clock_offset_ns: expected whole nanoseconds, found {offset!r}")
     return SessionAgent(
         AgentKind(kind),
         section.text("sensors", ""),
-        section.text("calibration", ""),
-        section.number("clock_offset_ms", 0.0),
+        section.number("rate_hz", 0.0),
+        offset,
+        _calibration(section, folder) if "calibration" in section else None,
     )
+
+
+def _calibration(section: Section, folder: Path) -> Calibration:
+    """A file or folder below the session's, or Kalibr's chains written out: cam0, cam1, depth, imu0."""
+    if isinstance(section.get("calibration"), str):
+        return read_calibration(folder / section.text("calibration"))
+    chain = section.section("calibration")
+    return kalibr(chain, chain.section("imu0") if "imu0" in chain else None)

@@ -10,7 +10,7 @@ from share.errors import UsageError
 from share.io.calibration import Calibration, read_calibration
 from share.io.euroc import is_euroc, open_euroc
 from share.io.recording import Source
-from share.io.session import is_session, recording_of
+from share.io.session import is_session, read_session
 from share.io.tum import is_tum, open_tum
 
 __all__ = ["READERS", "Source", "open_source"]
@@ -39,8 +39,9 @@ def _is_agent(path: Path) -> bool:
 
 
 def _open_agent(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
-    recording, own = recording_of(path.parent, path.name)
-    return _open_mcap(recording, calibration or (read_calibration(own) if own else None), frames)
+    session = read_session(path.parent)
+    recording = session.recording(path.name)
+    return _open_mcap(recording, calibration or session.agents[path.name].calibration, frames)
 
 
 READERS = (

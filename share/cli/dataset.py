@@ -1,0 +1,146 @@
+"""`share dataset`: look into, convert and recover recordings."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from share.cli import options
+from share.cli.progress import progress
+from share.errors import UsageError
+
+
+@click.group()
+def dataset() -> None:
+    """Look into, convert and recover recordings.
+
+    \b
+    Example:  share dataset info rec/kitchen
+    """
+
+
+@dataset.command()
+@click.argument("source")
+@options.calib
+@options.frames
+@options.as_json
+def info(source: str, calib: str | None, frames: slice | None, as_json: bool) -> None:
+    """Say what is in a recording: streams, rates, gaps, calibration, truth.
+
+    \b
+    Example:  share dataset info rec/kitchen
+              share dataset info session/ann --json
+    """
+    from share.io.source import open_source
+
+    description = open_source(source, calib, frames).describe()
+    click.echo(json.dumps(description) if as_json else _text(description))
+
+
+@dataset.command()
+@click.argument("source")
+@click.option("--out", required=True, metavar="PATH", help="X.mcap, or a new folder with --format euroc.")
+@options.calib
+@options.frames
+@click.option(
+    "--jpeg",
+    type=click.IntRange(1, 100),
+    metavar="QUALITY",
+    help="Compress gray images to JPEG (1-100). Without it images stay as they are, byte for byte.",
+)
+@click.option("--format", "kind", type=click.Choice(["mcap", "euroc"]), default="mcap", show_default=True)
+def convert(
+    source: str, out: str, calib: str | None, frames: slice | None, jpeg: int | None, kind: str
+) -> None:
+    """Write a recording as MCAP (ROS 2 messages) or as an EuRoC/ASL folder.
+
+    The calibration goes with it. A true trajectory is written beside X.mcap as X.truth.tum, where
+    every command finds it again. If anything fails, nothing is left behind.
+
+    \b
+    Example:  share dataset convert rec/kitchen --out kitchen.mcap --frames 0:250
+    """
+    from share.io.convert import to_euroc, to_mcap
+    from share.io.files import check_writable
+    from share.io.source import open_source
+
+    target = Path(out)
+    if kind == "euroc" and jpeg is not None:
+        raise UsageError("--jpeg: goes with --format mcap only")
+    if kind == "mcap":
+        _check_mcap(check_writable(target), source)
+    opened = open_source(source, calib, frames)
+    with progress(opened.images_count, "converting") as bar:
+        if kind == "mcap":
+            to_mcap(opened, target, jpeg, bar)
+        else:
+            to_euroc(opened, target, bar)
+    click.echo(f"{target}: {opened.images_count} frames")
+
+
+@dataset.command()
+@click.argument("broken")
+@click.option("--out", required=True, metavar="GOOD.mcap", help="Where the recovered recording goes.")
+@options.as_json
+def recover(broken: str, out: str, as_json: bool) -> None:
+    """Save what is whole of an MCAP recording that was cut off (a crash, a power cut, a full disk).
+
+    A recording in progress is called X.mcap.part; after a crash that is the file to recover.
+
+    \b
+    Example:  share dataset recover walk.mcap.part --out walk.mcap
+    """
+    from share.io.recover import recover as run
+
+    path, target = Path(broken), Path(out)
+    if not path.is_file():
+        raise UsageError(f"{broken}: no such file")
+    _check_mcap(target, broken)
+    with progress(path.stat().st_size, "recovering") as bar:
+        result = run(path, target, bar)
+    click.echo(json.dumps(result._asdict()) if as_json else _recovered(target, result))
+
+
+def _check_mcap(out: Path, source: str) -> None:
+    if out.suffix != ".mcap":
+        raise UsageError(f"--out {out}: the name of a recording ends in .mcap")
+    if out.exists() and Path(source).exists() and out.samefile(source):
+        raise UsageError(f"--out {out}: is the source itself; give another name")
+
+
+def _recovered(out: Path, result: Any) -> str:
+    lines = [f"{out}: {sum(result.messages.values())} messages saved"]
+    lines += [f"  {topic:<34} {count:>8}" for topic, count in sorted(result.messages.items())]
+    if result.reason:
+        lines.append(f"lost: {result.lost_bytes} bytes ({result.reason})")
+    return "\n".join(lines)
+
+
+def _text(d: dict[str, Any]) -> str:
+    lines = [f"{d['name']}: {d['kind']}, {d['duration_s']:.1f} s"]
+    for name, s in d["streams"].items():
+        line = f"  {name:<6} {s['count']:>7} at {s['rate_hz']:.5g} Hz"
+        if s["gaps"]:
+            line += f", {s['gaps']} gaps (longest {s['longest_gap_s']:.3g} s)"
+        lines.append(line + "".join(f", {s[k]} {k}" for k in ("duplicates", "backward") if s[k]))
+    for name in ("cam0", "cam1", "depth"):
+        if name in d["calibration"]:
+            lines.append(f"  {name:<6} {_camera(d['calibration'][name])}")
+    if "baseline_m" in d["calibration"]:
+        lines.append(f"  baseline {100 * d['calibration']['baseline_m']:.2f} cm")
+    truth = d["truth"]
+    lines.append(
+        f"  truth  {truth['poses']} poses, {truth['length_m']:.2f} m in {truth['duration_s']:.1f} s"
+        if truth
+        else "  truth  none"
+    )
+    return "\n".join(lines + [f"  note: {note}" for note in d["notes"]])
+
+
+def _camera(camera: dict[str, Any]) -> str:
+    (width, height), (fx, fy, *_) = camera["resolution"], camera["intrinsics"]
+    distortion = "radial-tangential" if camera["distortion"] else "no distortion"
+    return f"{width}x{height}, f {fx:.1f} {fy:.1f} px, {camera['fov_deg']:.0f} deg wide, {distortion}"
