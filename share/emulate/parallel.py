@@ -1,12 +1,12 @@
-"""Agents recorded side by side, one task each, in fresh processes (spawned, so that threads and
-locks of the parent are not inherited)."""
+"""Agents recorded side by side, a spawned process each: threads and locks are not inherited."""
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable
-from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
-from multiprocessing import get_context
+from multiprocessing import connection, get_context, parent_process
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import cv2
 
 from share.emulate.agents import AGENTS
 from share.emulate.record import record
+from share.errors import ShareError
 
 _POLL_S = 0.1
 
@@ -21,63 +22,53 @@ _POLL_S = 0.1
 def record_all(
     folder: Path, frames: int, seed: int, workers: int, progress: Callable[[int, int], None]
 ) -> None:
-    """`record` every agent. Raises what a worker raised; stops the others at their next frame."""
-    total = frames * len(AGENTS)
-    if workers <= 1:
-        _here(folder, frames, seed, lambda done: progress(done, total))
-        return
+    """`record` every agent into `folder`, at most `workers` at a time. Raises what one of them raised;
+    none runs on when this returns or raises."""
     context = get_context("spawn")
-    counter, stop = context.Value("q", 0), context.Event()
-    with ProcessPoolExecutor(min(workers, len(AGENTS)), context, _begin, (counter, stop)) as pool:
-        try:
-            tasks = [pool.submit(_task, i, folder, frames, seed) for i in range(len(AGENTS))]
-            _follow(tasks, lambda: progress(counter.value, total))
-        except BaseException:
-            stop.set()
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    counter, failures = context.Value("q", 0), context.SimpleQueue()
+    waiting: list[BaseProcess] = [
+        context.Process(target=_work, args=(i, folder, frames, seed, counter, failures), daemon=True)
+        for i in range(len(AGENTS))
+    ]
+    running: list[BaseProcess] = []
+    try:
+        while waiting or running:
+            while waiting and len(running) < max(workers, 1):
+                running.append(waiting.pop(0))
+                running[-1].start()
+            connection.wait([process.sentinel for process in running], _POLL_S)
+            progress(counter.value, frames * len(AGENTS))
+            running = [process for process in running if not _ended(process, failures)]
+    finally:
+        for process in running:
+            process.kill()
+            process.join()
 
 
-def _here(folder: Path, frames: int, seed: int, progress: Callable[[int], None]) -> None:
-    done = 0
-
-    def count() -> None:
-        nonlocal done
-        done += 1
-        progress(done)
-
-    for i in range(len(AGENTS)):
-        record(i, folder, frames, seed, count)
+def _ended(process: BaseProcess, failures: Any) -> bool:
+    if process.exitcode and not failures.empty():
+        raise failures.get()
+    if process.exitcode:
+        raise ShareError(
+            f"a process that renders images ended with code {process.exitcode}; is memory short?"
+        )
+    return process.exitcode == 0
 
 
-def _follow(tasks: list[Future[None]], report: Callable[[], None]) -> None:
-    pending: set[Future[None]] = set(tasks)
-    while pending:
-        finished, pending = wait(pending, _POLL_S, FIRST_EXCEPTION)
-        for task in finished:
-            task.result()
-        report()
-
-
-# ---------------------------------------------------------------- in the worker
-
-_shared: tuple[Any, Any]  # frames done by all, and whether to stop; set once, when the process begins
-
-
-def _begin(counter: Any, stop: Any) -> None:
-    global _shared
-    _shared = counter, stop
+def _work(index: int, folder: Path, frames: int, seed: int, counter: Any, failures: Any) -> None:
+    """The life of one process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     cv2.setNumThreads(1)
+    parent = parent_process()
 
+    def count() -> None:
+        if parent is None or not parent.is_alive():  # nobody will finish the session
+            os._exit(1)
+        with counter.get_lock():
+            counter.value += 1
 
-def _task(index: int, folder: Path, frames: int, seed: int) -> None:
-    record(index, folder, frames, seed, _count)
-
-
-def _count() -> None:
-    counter, stop = _shared
-    if stop.is_set():
-        raise InterruptedError("stopped")
-    with counter.get_lock():
-        counter.value += 1
+    try:
+        record(index, folder, frames, seed, count)
+    except Exception as error:
+        failures.put(error)
+        raise SystemExit(1) from None

@@ -1,7 +1,7 @@
 """The session folder that `share demo` plays: session.yaml, NAME.mcap and truth/NAME.tum per agent.
 
-A folder under its own name is whole: it is written as `.NAME.partial` and renamed at the end. A lock
-keeps two processes from making the same one, and lets the next remove what a killed one left.
+A folder under its own name is whole: it is written as `.NAME.partial-PID` and renamed at the end. A
+lock keeps two processes from making the same one, and lets the next remove what a killed one left.
 """
 
 from __future__ import annotations
@@ -10,15 +10,16 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from glob import escape
 from pathlib import Path
 
 from share import __version__
 from share.emulate.agents import AGENTS, RATE_HZ, calibration
 from share.errors import ShareError, UsageError
-from share.io.files import writable_dir
+from share.io.files import atomic_write, writable_dir
+from share.io.session import SCHEMA, SESSION
 
 GENERATOR_VERSION = 1  # raise it when any picture, motion or file changes: cached sessions are then made anew
-SCHEMA_VERSION = 1
 
 Progress = Callable[[int, int], None]  # frames done, frames in all
 
@@ -35,11 +36,12 @@ def cached_session(
     Raises as `make_session`.
     """
     folder = default_cache() if cache is None else cache
-    out = folder / f"room-v{GENERATOR_VERSION}-seed{seed}-{_frames(seconds)}frames"
+    frames = _frames(seconds, seed)
+    out = folder / f"room-v{GENERATOR_VERSION}-seed{seed}-{frames}frames"
     if not out.exists():
         with _lock(out):
             if not out.exists():  # nobody else made it while we waited
-                _make(out, seconds, seed, workers, progress)
+                _make(out, frames, seed, workers, progress)
     return out
 
 
@@ -50,14 +52,15 @@ def make_session(
     workers: int = 2,
     progress: Progress = lambda done, total: None,
 ) -> Path:
-    """Make a session in the new folder `out` with `workers` processes (1: in this one).
+    """Make a session in the new folder `out` with `workers` processes at a time.
 
     Raises UsageError where `out` exists or cannot be written, ShareError where the disk fills up.
     """
+    frames = _frames(seconds, seed)
     with _lock(out):
         if out.exists():
             raise UsageError(f"{out}: exists already; give the name of a new folder")
-        _make(out, seconds, seed, workers, progress)
+        _make(out, frames, seed, workers, progress)
     return out
 
 
@@ -67,16 +70,16 @@ def default_cache() -> Path:
     return (Path(home) if Path(home).is_absolute() else Path.home() / ".cache") / "share"
 
 
-def _make(out: Path, seconds: float, seed: int, workers: int, progress: Progress) -> None:
+def _make(out: Path, frames: int, seed: int, workers: int, progress: Progress) -> None:
     from share.emulate.parallel import record_all
 
-    frames = _frames(seconds)
-    partial = out.with_name(f".{out.name}.partial")
+    for left in out.parent.glob(f".{escape(out.name)}.partial-*"):
+        shutil.rmtree(left, ignore_errors=True)
+    partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
     try:
-        shutil.rmtree(partial, ignore_errors=True)
         (partial / "truth").mkdir(parents=True)
         record_all(partial, frames, seed, workers, progress)
-        (partial / "session.yaml").write_text(_description(frames, seed))
+        atomic_write(partial / SESSION, _description(frames, seed))
         partial.rename(out)
     except OSError as error:
         raise ShareError(f"{out}: the session cannot be written: {error.strerror or error}") from None
@@ -84,9 +87,12 @@ def _make(out: Path, seconds: float, seed: int, workers: int, progress: Progress
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def _frames(seconds: float) -> int:
+def _frames(seconds: float, seed: int) -> int:
+    """How many frames each agent gets. Raises UsageError for what cannot be made."""
     if not 1 <= seconds <= 3600:
-        raise UsageError(f"--seconds {seconds:g}: a session lasts 1 to 3600 seconds")
+        raise UsageError(f"{seconds:g} seconds: a session lasts 1 to 3600 seconds")
+    if seed < 0:
+        raise UsageError(f"seed {seed}: must not be negative")
     return round(seconds * RATE_HZ)
 
 
@@ -111,7 +117,7 @@ def _description(frames: int, seed: int) -> str:
         "seed": seed,
         "frames": frames,
     }
-    data = {"schema": SCHEMA_VERSION, "provenance": provenance, "agents": agents}
+    data = {"schema": SCHEMA, "provenance": provenance, "agents": agents}
     return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
 
 

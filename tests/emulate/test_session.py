@@ -6,15 +6,14 @@ import time
 
 import numpy as np
 import pytest
-import yaml
 
 from share.core.measurement import CAM0, CAM1, DEPTH
 from share.emulate import session as session_module
 from share.emulate.agents import AGENTS, RATE_HZ
 from share.emulate.session import cached_session, default_cache, make_session
 from share.errors import ShareError, UsageError
+from share.io.session import read_session
 from share.io.source import open_source
-from share.io.trajectory import read_tum
 
 SECONDS = 1.0
 
@@ -38,25 +37,28 @@ def test_it_is_whole(session):
     wanted = [f"{a.name}.mcap" for a in AGENTS] + [f"truth/{a.name}.tum" for a in AGENTS] + ["session.yaml"]
     assert names == sorted(wanted)
     assert os.listdir(session.parent) == [session.name]  # nothing half-made beside it
-    described = yaml.safe_load((session / "session.yaml").read_text())
-    assert described["schema"] == 1 and described["provenance"]["seed"] == 5
-    assert {n: a["kind"] for n, a in described["agents"].items()} == {
+    described = read_session(session)
+    assert {n: str(a.kind) for n, a in described.agents.items()} == {
         "ar1": "ar",
         "ar2": "ar",
         "robot": "robot",
     }
+    assert described.provenance["seed"] == 5
+    for agent in AGENTS:
+        assert described.agents[agent.name].calibration.rig.kind == agent.rig.kind
 
 
 @pytest.mark.parametrize("agent", AGENTS, ids=lambda a: a.name)
 def test_recordings_read_back(session, agent):
-    source = open_source(str(session / f"{agent.name}.mcap"))
+    source = open_source(str(session / agent.name))  # SESSION/NAME
     assert source.rig.kind == agent.rig.kind
     assert source.rig.cam0 == agent.rig.cam0
     assert source.rig.baseline == agent.rig.baseline
     found = images(session / f"{agent.name}.mcap")
     second = CAM1 if agent.rig.cam1 else DEPTH
     assert set(found) == {CAM0, second}
-    truth = read_tum(session / "truth" / f"{agent.name}.tum")
+    truth = source.truth()
+    assert truth is not None
     for stamps, pictures in found.values():
         assert np.array_equal(stamps, truth.stamps_ns)
         assert len(pictures) == SECONDS * RATE_HZ
@@ -65,20 +67,6 @@ def test_recordings_read_back(session, agent):
     if second == DEPTH:
         depth = found[DEPTH][1][0]
         assert depth.dtype == np.float32 and 0.5 < np.median(depth[depth > 0]) < 9
-
-
-def test_calibration_in_session_yaml_is_the_rigs(session, tmp_path):
-    from share.io.calibration import read_kalibr
-
-    described = yaml.safe_load((session / "session.yaml").read_text())
-    for agent in AGENTS:
-        path = tmp_path / f"{agent.name}.yaml"
-        path.write_text(yaml.safe_dump(described["agents"][agent.name]["calibration"]))
-        rig = read_kalibr(path).rig
-        assert rig.kind == agent.rig.kind and rig.cam0 == agent.rig.cam0
-        for name in ("T_cam1_cam0", "T_depth_cam0"):
-            have, want = getattr(rig, name), getattr(agent.rig, name)
-            assert (have is None and want is None) or np.array_equal(have, want)
 
 
 def test_same_seed_same_pictures_however_many_workers(session, tmp_path):
@@ -128,11 +116,11 @@ def test_what_a_killed_process_left_is_replaced(tmp_path):
     )
     process.start()
     deadline = time.monotonic() + 30
-    while not list(tmp_path.glob(".room.partial/*.mcap.part")) and time.monotonic() < deadline:
+    while not list(tmp_path.glob(".room.partial-*/*.mcap.part")) and time.monotonic() < deadline:
         time.sleep(0.05)
     process.kill()
     process.join()
-    assert os.listdir(tmp_path) == [".room.partial"]
+    assert [n.startswith(".room.partial-") for n in os.listdir(tmp_path)] == [True]
     make_session(tmp_path / "room", SECONDS, 0, 1)
     assert os.listdir(tmp_path) == ["room"]
 
@@ -147,3 +135,5 @@ def test_wrong_use_is_said(tmp_path):
     for seconds in (0.0, -1.0, float("nan"), 1e9):
         with pytest.raises(UsageError, match="1 to 3600"):
             make_session(tmp_path / "room", seconds)
+    with pytest.raises(UsageError, match="negative"):
+        make_session(tmp_path / "room", SECONDS, seed=-1)
