@@ -102,7 +102,9 @@ class McapFile:
         with open(self.path, "rb") as file:
             try:
                 return self._reader(file).get_summary()
-            except (*damage(), OSError):  # OSError: shorter than a footer
+            except damage():
+                raise self._broken("it has no end") from None
+            except OSError:  # shorter than a footer
                 raise self._broken("it has no end") from None
 
     def _check_index(self) -> None:

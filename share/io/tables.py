@@ -53,11 +53,11 @@ def read_table(path: Path, columns: int) -> tuple[I64, F64]:
     number, or stamps that go back.
     """
     dtype = [("stamp", np.int64), *((f"c{i}", np.float64) for i in range(1, columns))]
-    text = read_text(path)
+    lines = read_text(path).splitlines()
     try:
-        if not text.strip():
+        if all(not line.strip() or line.startswith("#") for line in lines):
             raise ValueError("empty")
-        table = np.loadtxt(text.splitlines(), dtype, delimiter=",", usecols=range(columns), ndmin=1)
+        table = np.loadtxt(lines, dtype, delimiter=",", usecols=range(columns), ndmin=1)
         values = np.stack([table[name] for name, _ in dtype[1:]], axis=1)
     except (ValueError, IndexError, OverflowError):
         return _read_slowly(path, columns)

@@ -1,7 +1,7 @@
 """Trajectories as TUM files: `t[s] x y z qx qy qz qw`, one pose a line.
 
-Stamps go from integer nanoseconds to nine decimals and back without a float between, so a file that
-is read and written again is the same file.
+Stamps go from integer nanoseconds to nine decimals and back without a float between: they are exact.
+Poses are rounded to nine decimals; the same trajectory always gives the same bytes.
 """
 
 from __future__ import annotations
