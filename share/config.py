@@ -119,9 +119,9 @@ class LinkConfig:
 class ClockConfig:
     """The filter of the edge's clock against the agent's."""
 
-    noise_us: float = 30.0  # of an exchange that met no queue
+    noise_us: float = 20.0  # of an exchange that met no queue
     asymmetry: float = 0.5  # one-way error of an exchange per delay beyond the least; 0.5 is all of it
-    offset_walk_us: float = 2.0  # per sqrt(s)
+    offset_walk_us: float = 4.0  # per sqrt(s)
     drift_walk_ppm: float = 0.05  # per sqrt(s)
     drift_ppm: float = 100.0  # before anything is known (1 sigma)
     least_of: int = 64  # exchanges among which the least delay is sought
@@ -133,12 +133,39 @@ class ClockConfig:
 
 
 @dataclass(frozen=True)
+class GraphConfig:
+    """How the pose graph is solved."""
+
+    cauchy: float = 1.0  # whitened residual at which a loop begins to lose weight
+    max_iterations: int = 100
+    relative_tolerance: float = 1e-6  # of the cost, between two iterations
+    anchor_sigma: float = 1e-4  # rad and m; holds the gauge, removed again after solving
+
+
+@dataclass(frozen=True)
+class MergeConfig:
+    """What is believed before a loop may move a map."""
+
+    min_loop_gap: int = 10  # keyframes of one stretch nearer than this are odometry's business
+    agree_chi2: float = 22.5  # two loops agree, or a loop fits the map (99.9 %, 6 dof)
+    surprise_chi2: float = 200.0  # beyond this a loop contradicts the map whatever witnesses say
+    odometry_scale: float = 2.0  # agents' sigmas are this much too small
+    odometry_floor_deg: float = 0.02  # per edge, added in quadrature
+    odometry_floor_m: float = 0.002
+    sole_witness_inliers: int = 0  # a loop with so many inliers joins two maps alone; 0 = never
+    max_pending: int = 200  # loops that wait for a witness; the oldest is dropped
+    drop_chi2: float = 1000.0  # a solved graph at odds with a loop by more than this drops it
+
+
+@dataclass(frozen=True)
 class Config:
     """The whole; one section per part."""
 
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     sequencer: SequencerConfig = field(default_factory=SequencerConfig)
     place: PlaceConfig = field(default_factory=PlaceConfig)
+    graph: GraphConfig = field(default_factory=GraphConfig)
+    merge: MergeConfig = field(default_factory=MergeConfig)
     agent: AgentConfig = field(default_factory=AgentConfig)
     link: LinkConfig = field(default_factory=LinkConfig)
     clock: ClockConfig = field(default_factory=ClockConfig)

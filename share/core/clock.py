@@ -12,6 +12,7 @@ from share.core.rate import SECOND_NS
 from share.types import F64
 
 _SMOOTHING = 1 / 8  # of the round trip time: RFC 6298, section 2
+_SETTLED = 8  # exchanges before the quickest of them counts as one that met no queue
 
 
 class ClockFilter:
@@ -94,8 +95,9 @@ class ClockFilter:
         self.rtt_ms = rtt_ms if self.rtt_ms is None else self.rtt_ms + _SMOOTHING * (rtt_ms - self.rtt_ms)
 
     def _variance(self, rtt_ns: int) -> float:
-        """us^2."""
-        excess_us = (rtt_ns - min(self._recent_ns)) / 1e3
+        """us^2. Half the round trip is the most that an exchange can be wrong by (RFC 5905, section 8)."""
+        settled = len(self._recent_ns) >= _SETTLED
+        excess_us = (rtt_ns - (min(self._recent_ns) if settled else 0)) / 1e3
         return self._config.noise_us**2 + (self._config.asymmetry * excess_us) ** 2
 
     def _start(self, offset_ns: int, at_ns: int, variance: float) -> None:

@@ -1,0 +1,148 @@
+"""The clock filter against simulated clocks whose truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from share.config import ClockConfig
+from share.core.clock import ClockFilter
+
+S = 1_000_000_000
+US = 1_000
+
+
+@dataclass
+class World:
+    """An edge clock that is off and drifts, and a path with a delay each way (us, per exchange)."""
+
+    seed: int
+    offset_ns: int = 7 * S
+    drift_ppm: float = 50.0
+    least_us: float = 200.0
+    jitter_us: float = 20.0
+    tail: float = 0.0  # how much of Pareto-distributed queueing, on the way up mostly
+
+    def edge(self, agent_ns: float) -> int:
+        return round(agent_ns + self.offset_ns + self.drift_ppm * 1e-6 * agent_ns)
+
+    def exchanges(self, n: int, every_s: float = 0.5, start: int = 0) -> Iterator[tuple[int, int, int, int]]:
+        rng = np.random.default_rng(self.seed)
+        for k in range(start, start + n):
+            up, down = self.least_us + np.abs(rng.normal(0, self.jitter_us, 2))
+            up += self.tail * rng.pareto(1.5) * 300
+            down += self.tail * 0.2 * rng.pareto(1.5) * 300
+            sent = int(k * every_s * S)
+            arrived, replied = sent + up * US, sent + (up + 15) * US
+            yield sent, self.edge(arrived), self.edge(replied), round(replied + down * US)
+
+
+def error_us(clock: ClockFilter, world: World, now_ns: int) -> float:
+    estimate = clock.offset_ns(now_ns)
+    assert estimate is not None
+    return (estimate - (world.edge(now_ns) - now_ns)) / US
+
+
+def run(world: World, n: int = 240) -> tuple[ClockFilter, list[tuple[float, float]]]:
+    """The filter after n exchanges, and (error us, sigma us) after each of the second half."""
+    clock, track = ClockFilter(ClockConfig()), []
+    for k, stamps in enumerate(world.exchanges(n)):
+        clock.update(*stamps)
+        sigma = clock.sigma_ns(stamps[3])
+        assert sigma is not None
+        if k >= n // 2:
+            track.append((error_us(clock, world, stamps[3]), sigma / US))
+    return clock, track
+
+
+def test_nothing_is_known_before_the_first_exchange() -> None:
+    clock = ClockFilter(ClockConfig())
+    assert clock.offset_ns(0) is clock.sigma_ns(0) is clock.rtt_ms is clock.drift_ppm is None
+    assert clock.report()["clock_steps"] == 0
+
+
+def test_four_stamps_as_in_rfc_5905() -> None:
+    clock = ClockFilter(ClockConfig())
+    assert clock.update(1000 * US, 5400 * US, 5500 * US, 1900 * US)
+    assert clock.offset_ns(1450 * US) == 4000 * US
+    assert clock.rtt_ms == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("drift_ppm", [-50.0, 0.0, 50.0])
+def test_a_quiet_path_gives_microseconds_and_the_drift(seed: int, drift_ppm: float) -> None:
+    clock, track = run(World(seed, drift_ppm=drift_ppm))
+    assert np.sqrt(np.mean([e**2 for e, _ in track])) < 15
+    assert clock.drift_ppm == pytest.approx(drift_ppm, abs=1.0)
+    assert clock.rtt_ms == pytest.approx(0.43, abs=0.05)
+    assert clock.steps == 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_heavy_tailed_one_sided_delays_are_mostly_ignored(seed: int) -> None:
+    world = World(seed, tail=1.0)
+    clock, track = run(world, 400)
+    raw = [((b - a) + (c - d)) / 2 - world.offset_ns - 50e-6 * a for a, b, c, d in world.exchanges(400)]
+    rms = np.sqrt(np.mean([e**2 for e, _ in track]))
+    assert rms < 60
+    assert rms < 0.1 * np.std(raw) / US
+    assert clock.drift_ppm == pytest.approx(50, abs=3)
+    assert clock.steps == 0
+
+
+@pytest.mark.parametrize("tail", [0.0, 1.0])
+def test_sigma_is_honest_and_useful(tail: float) -> None:
+    """Normalised squared error of 40 runs at their end (1 dof, mean 1 if exact; 95 % band 0.6 .. 1.5).
+
+    Smaller than 1 is caution: the variance of an exchange takes the worst sharing of its excess.
+    """
+    ends = [run(World(seed, jitter_us=80.0, tail=tail))[1][-1] for seed in range(40)]
+    nees = np.mean([(e / sigma) ** 2 for e, sigma in ends])
+    assert 0.05 < nees < 1.5
+    assert max(sigma for _, sigma in ends) < 40
+
+
+def test_sigma_grows_while_nothing_is_heard() -> None:
+    clock, _ = run(World(1))
+    sigmas = [clock.sigma_ns(120 * S + k * 60 * S) for k in range(5)]
+    assert sigmas == sorted(sigmas)  # type: ignore[type-var]
+    assert abs(error_us(clock, World(1), 180 * S)) < 4 * (clock.sigma_ns(180 * S) or 0) / US
+
+
+def test_one_absurd_exchange_is_not_believed() -> None:
+    world = World(1)
+    clock, _ = run(world)
+    before = error_us(clock, world, 121 * S)
+    assert not clock.update(121 * S, 121 * S, 121 * S, 121 * S + 400 * US)  # the edge's clock back at zero
+    assert not clock.update(121 * S, 0, 10**9, 121 * S + 5)  # a negative round trip
+    assert abs(error_us(clock, world, 121 * S) - before) < 1
+    assert (clock.rejected, clock.steps) == (2, 0)
+
+
+def test_a_clock_that_was_set_is_followed() -> None:
+    clock, _ = run(World(1))
+    stepped = World(2, offset_ns=9 * S)
+    for stamps in stepped.exchanges(60, start=240):
+        clock.update(*stamps)
+    assert clock.steps == 1
+    assert abs(error_us(clock, stepped, 150 * S)) < 50
+
+
+def test_reset_forgets() -> None:
+    clock, _ = run(World(1))
+    clock.reset()
+    assert clock.offset_ns(0) is None
+    assert (clock.accepted, clock.rejected) == (0, 0)
+
+
+def test_exchanges_out_of_order_do_no_harm() -> None:
+    world = World(3)
+    stamps = list(world.exchanges(240))
+    rng = np.random.default_rng(0)
+    clock = ClockFilter(ClockConfig())
+    for k in np.argsort(np.arange(240) + rng.uniform(0, 3, 240)):
+        clock.update(*stamps[k])
+    assert abs(error_us(clock, world, 120 * S)) < 150
