@@ -34,6 +34,9 @@ class InOrder:
             ready.append(found)
             self.next_keyframe = found.id + 1
             self._waiting = {k: v for k, v in self._waiting.items() if k > found.id}
+        if len(self._waiting) > self._hold:
+            del self._waiting[max(self._waiting)]  # drop_newest: the agent sends it again
+            self.evicted += 1
         return ready
 
     def ack(self) -> Ack:
@@ -46,9 +49,6 @@ class InOrder:
             self.duplicates += 1
         if known is None or keyframe.follows < known.follows:
             self._waiting[keyframe.id] = keyframe
-        if len(self._waiting) > self._hold:
-            del self._waiting[max(self._waiting)]  # drop_newest: the agent sends it again
-            self.evicted += 1
 
     def _applicable(self) -> Keyframe | None:
         ready = (k for k in sorted(self._waiting) if self._waiting[k].follows < self.next_keyframe)

@@ -1,0 +1,104 @@
+"""In-order application at the edge."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from share.core.inorder import InOrder
+from share.types import Keyframe, View
+from share.wire.messages import MAX_HELD, Ack
+
+EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32)))
+
+
+def keyframe(id_: int, follows: int | None = None, reference: int | None = None) -> Keyframe:
+    """By default relative to its predecessor, as an agent's keyframes are."""
+    follows = id_ - 1 if follows is None else follows
+    reference = follows if reference is None else reference
+    return Keyframe(id_, reference, id_, np.eye(4), np.eye(6), np.zeros(3), EMPTY, follows)
+
+
+def ids(keyframes: list[Keyframe]) -> list[int]:
+    return [k.id for k in keyframes]
+
+
+def test_in_order_passes_through() -> None:
+    book = InOrder()
+    assert [ids(book.push(keyframe(k))) for k in range(3)] == [[0], [1], [2]]
+    assert book.ack() == Ack(3)
+
+
+def test_a_gap_holds_what_comes_after_it() -> None:
+    book = InOrder()
+    book.push(keyframe(0))
+    assert book.push(keyframe(3)) == book.push(keyframe(2)) == []
+    assert book.ack() == Ack(1, (2, 3))
+    assert ids(book.push(keyframe(1))) == [1, 2, 3]
+    assert book.ack() == Ack(4)
+
+
+def test_duplicates_are_ignored_and_acknowledged_again() -> None:
+    book = InOrder()
+    book.push(keyframe(0))
+    assert book.push(keyframe(0)) == []
+    book.push(keyframe(2))
+    assert book.push(keyframe(2)) == []
+    assert book.duplicates == 2
+    assert book.ack() == Ack(1, (2,))
+
+
+def test_a_new_stretch_does_not_overtake() -> None:
+    book = InOrder()
+    book.push(keyframe(0))
+    assert book.push(keyframe(2, follows=1, reference=-1)) == []
+    assert ids(book.push(keyframe(1))) == [1, 2]
+
+
+def test_dropped_ids_are_skipped() -> None:
+    book = InOrder()
+    book.push(keyframe(0))
+    assert ids(book.push(keyframe(5, follows=0))) == [5]
+    assert book.push(keyframe(3)) == []  # dropped by the agent, but late on its way
+    assert book.ack() == Ack(6)
+
+
+def test_the_later_version_of_a_waiting_keyframe_counts() -> None:
+    book = InOrder()
+    book.push(keyframe(0))
+    book.push(keyframe(2))
+    assert ids(book.push(keyframe(2, follows=0))) == [2]
+    book.push(keyframe(5))
+    assert book.push(keyframe(5)) == []
+
+
+def test_an_old_version_does_not_replace_a_later_one() -> None:
+    book = InOrder()
+    book.push(keyframe(9, follows=3))
+    book.push(keyframe(9, follows=8))
+    assert ids(book.push(keyframe(3, follows=-1))) == [3, 9]
+
+
+def test_an_edge_without_memory_begins_where_the_agent_does() -> None:
+    assert ids(InOrder().push(keyframe(40, follows=-1))) == [40]
+
+
+def test_an_edge_with_memory_goes_on() -> None:
+    book = InOrder(next_keyframe=40)
+    assert book.push(keyframe(39)) == []
+    assert ids(book.push(keyframe(40))) == [40]
+
+
+def test_the_holding_area_is_bounded() -> None:
+    book = InOrder(hold=4)
+    for k in (9, 8, 7, 6, 5, 4, 3, 2, 1):
+        assert book.push(keyframe(k)) == []
+    assert book.ack() == Ack(0, (1, 2, 3, 4))
+    assert book.evicted == 5
+    assert ids(book.push(keyframe(0))) == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("hold", [0, MAX_HELD + 1])
+def test_hold_must_fit_an_ack(hold: int) -> None:
+    with pytest.raises(ValueError, match="hold"):
+        InOrder(hold=hold)
