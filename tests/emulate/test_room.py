@@ -12,7 +12,7 @@ def test_a_seed_is_a_room():
 
 
 def test_furniture_stands_in_the_room_and_leaves_a_way_round():
-    for seed in range(4):
+    for seed in range(3):
         boxes = make_room(seed, (8.0, 6.0, 3.0)).boxes
         assert len(boxes) >= 6
         lower, upper = boxes[1:, 0], boxes[1:, 1]

@@ -81,10 +81,10 @@ def test_same_seed_same_pictures_however_many_workers(session, tmp_path):
 
 def test_the_cache_makes_once_and_tells_progress(tmp_path, monkeypatch):
     seen = []
-    first = cached_session(tmp_path, SECONDS, 1, 1, lambda done, total: seen.append((done, total)))
+    first = cached_session(tmp_path, SECONDS, 1, 2, lambda done, total: seen.append((done, total)))
     assert seen[-1] == (60, 60)
     stamp = (first / "session.yaml").stat().st_mtime_ns
-    assert cached_session(tmp_path, SECONDS, 1, 1, lambda *_: pytest.fail("made again")) == first
+    assert cached_session(tmp_path, SECONDS, 1, 2, lambda *_: pytest.fail("made again")) == first
     assert (first / "session.yaml").stat().st_mtime_ns == stamp
     monkeypatch.setattr(session_module, "GENERATOR_VERSION", 10**6)
     monkeypatch.setattr(session_module, "_make", lambda out, *_: out.mkdir())
@@ -98,15 +98,23 @@ def test_default_cache_follows_xdg(monkeypatch, tmp_path):
     assert default_cache().parts[-2:] == (".cache", "share")
 
 
+def test_a_worker_that_fails_is_heard(tmp_path):
+    """A file where the recording's folder should be: the worker's own error, in one line."""
+    from share.emulate.parallel import record_all
+
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match="not a folder"):
+        record_all(tmp_path / "file", 20, 0, 1, lambda *_: None)
+
+
 def test_a_failure_leaves_nothing_that_looks_whole(tmp_path):
     def fail(done, total):
         if done > 3:
             raise OSError(28, "No space left on device")
 
-    for workers in (1, 2):
-        with pytest.raises(ShareError, match="No space left"):
-            make_session(tmp_path / "room", SECONDS, 0, workers, fail)
-        assert os.listdir(tmp_path) == []
+    with pytest.raises(ShareError, match="No space left"):
+        make_session(tmp_path / "room", SECONDS, 0, 2, fail)
+    assert os.listdir(tmp_path) == []
 
 
 def test_what_a_killed_process_left_is_replaced(tmp_path):
@@ -121,7 +129,7 @@ def test_what_a_killed_process_left_is_replaced(tmp_path):
     process.kill()
     process.join()
     assert [n.startswith(".room.partial-") for n in os.listdir(tmp_path)] == [True]
-    make_session(tmp_path / "room", SECONDS, 0, 1)
+    make_session(tmp_path / "room", SECONDS, 0, 2)
     assert os.listdir(tmp_path) == ["room"]
 
 
