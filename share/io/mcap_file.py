@@ -92,7 +92,8 @@ class McapFile:
         names = list(topics)
         with open(self.path, "rb") as file:
             try:
-                for _, channel, message in self._reader(file).iter_messages(names, start_ns, end_ns):
+                found = self._reader(file).iter_messages(names, starting_at=start_ns, ending_before=end_ns)
+                for _, channel, message in found:
                     yield channel.topic, message.log_time, message.data
             except damage() as error:
                 raise self._broken(str(error) or type(error).__name__) from None

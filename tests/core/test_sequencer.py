@@ -1,0 +1,249 @@
+"""Streams to frames: whole and in order whatever the order of arrival, repaired, counted, bounded."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from share.config import SequencerConfig
+from share.core.measurement import Measurement
+from share.core.sequencer import SequencerCounters, _Merger, sequence
+from share.core.stamps import WRAP_NS
+
+MS = 1_000_000
+RATE = 20.0
+STEP = 50 * MS
+CONFIG = SequencerConfig()
+STEREO_IMU = ("cam0", "cam1", "imu")
+
+
+def images(stream: str, stamps) -> list[Measurement]:
+    return [Measurement(stream, int(s), f"{stream}@{s}") for s in stamps]
+
+
+def imu(stamps) -> list[Measurement]:
+    return [Measurement("imu", int(s), (float(s % 1000), 0.0, 0.0, 0.0, 0.0, 9.81)) for s in stamps]
+
+
+def recording(frames: int, start: int = 0, skew: int = 0) -> list[Measurement]:
+    """Stereo at 20 Hz, cam1 later by `skew`, IMU at 200 Hz; in order of time."""
+    times = start + STEP * np.arange(frames)
+    samples = start + 5 * MS * np.arange(-10, 10 * frames - 9)
+    return in_order(imu(samples) + images("cam0", times) + images("cam1", times + skew))
+
+
+def in_order(measurements: list[Measurement]) -> list[Measurement]:
+    return sorted(measurements, key=lambda m: m.stamp_ns)
+
+
+def run(measurements, streams=STEREO_IMU, config=CONFIG, rate=RATE):
+    counters = SequencerCounters()
+    return list(sequence(measurements, streams, rate, config, counters)), counters
+
+
+def plain(bundles) -> list[tuple]:
+    return [
+        (b.stamp_ns, b.index, b.image0, b.image1, b.depth, b.gap_ns, b.imu.stamps_ns.tolist())
+        for b in bundles
+    ]
+
+
+def test_frames_are_whole_and_imu_lies_between_them():
+    bundles, counters = run(recording(10, skew=2 * MS))
+    assert [b.stamp_ns for b in bundles] == [STEP * i for i in range(10)]
+    assert [b.index for b in bundles] == list(range(10))
+    for before, b in itertools.pairwise(bundles):
+        assert b.image0 == f"cam0@{b.stamp_ns}"
+        assert b.image1 == f"cam1@{b.stamp_ns + 2 * MS}"
+        assert b.imu.stamps_ns.tolist() == list(range(before.stamp_ns + 5 * MS, b.stamp_ns + 1, 5 * MS))
+        assert b.imu.gyro[:, 0].tolist() == (b.imu.stamps_ns % 1000).tolist()
+    assert counters == SequencerCounters(frames=10, imu_samples=10 + 1 + 9 * 10)
+
+
+delays = st.lists(st.integers(0, 95 * MS), min_size=400, max_size=400)
+
+
+@settings(max_examples=60, deadline=None)
+@given(delays, st.integers(2, 12), st.integers(-4 * MS, 4 * MS))
+def test_any_bounded_shuffle_gives_the_same_frames(delay, frames, skew):
+    """Within a stream and between streams: no sample is lost, doubled, or in another frame."""
+    config = replace(CONFIG, reorder_ms=100.0)
+    ordered = recording(frames, 10**12, skew)
+    shuffled = [m for _, m in sorted(zip(delay, ordered, strict=False), key=lambda p: p[1].stamp_ns + p[0])]
+    assert len(shuffled) == len(ordered)
+    expected, counted = run(ordered)
+    bundles, counters = run(shuffled, config=config)
+    assert plain(bundles) == plain(expected)
+    assert counters == counted
+    assert counters.frames == frames
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.fixed_dictionaries({s: st.integers(0, 95 * MS) for s in STEREO_IMU}), st.integers(2, 12))
+def test_streams_out_of_step_give_the_same_frames_without_reordering(lag, frames):
+    """The default serves a live camera: each stream in order, but not in step with the others."""
+    ordered = recording(frames, 10**12)
+    lagged = sorted(ordered, key=lambda m: m.stamp_ns + lag[m.stream])
+    assert plain(run(lagged)[0]) == plain(run(ordered)[0])
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.data())
+def test_every_measurement_is_used_or_counted(data):
+    """Holes, repeats and steps back anywhere: what comes out plus what is counted is what went in."""
+    ordered = recording(8, 10**12)
+    picks = data.draw(st.lists(st.sampled_from(ordered), max_size=150))
+    bundles, c = run(picks)
+    used = 2 * len(bundles) + c.imu_samples
+    assert used + c.duplicates + c.backward + c.unpaired + c.imu_dropped == len(picks)
+    assert [b.stamp_ns for b in bundles] == sorted({b.stamp_ns for b in bundles})
+    stamps = [s for b in bundles for s in b.imu.stamps_ns.tolist()]
+    assert stamps == sorted(set(stamps))
+    for before, b in itertools.pairwise(bundles):
+        assert ((b.imu.stamps_ns > before.stamp_ns) & (b.imu.stamps_ns <= b.stamp_ns)).all()
+
+
+def test_a_frame_goes_out_as_soon_as_it_is_whole():
+    """No frame waits for the next one: after its last measurement has come, it is out."""
+    counters, fed, out = SequencerCounters(), [], []
+
+    def feed():
+        for m in recording(5):
+            fed.append(m.stamp_ns)
+            yield m
+
+    out = [(b.stamp_ns, fed[-1]) for b in sequence(feed(), STEREO_IMU, RATE, CONFIG, counters)]
+    assert all(now == stamp for stamp, now in out[:-1])
+
+
+def test_duplicates_and_steps_back_are_dropped_and_counted():
+    ordered = recording(6)
+    again = [m for m in ordered for _ in range(2)]
+    bundles, counters = run(again)
+    assert plain(bundles) == plain(run(ordered)[0])
+    assert counters.duplicates == len(ordered)
+    late = [*ordered[:60], *ordered[5:8], *ordered[60:]]
+    bundles, counters = run(late)
+    assert plain(bundles) == plain(run(ordered)[0])
+    assert counters.backward == 3
+
+
+def test_a_missing_partner_drops_the_frame():
+    ordered = [m for m in recording(6) if not (m.stream == "cam1" and m.stamp_ns == 2 * STEP)]
+    bundles, counters = run(ordered)
+    assert [b.stamp_ns // STEP for b in bundles] == [0, 1, 3, 4, 5]
+    assert counters.unpaired == 1
+    assert len(bundles[2].imu) == 20  # nothing of the IMU is lost with the frame
+    bundles, counters = run(recording(6, skew=6 * MS))
+    assert bundles == []
+    assert counters.unpaired == 12
+
+
+def test_a_dead_cam1_or_cam0_holds_nothing_up():
+    only = [m for m in recording(200) if m.stream != "cam1"]
+    assert run(only)[1].unpaired == 200
+    assert run([m for m in recording(200) if m.stream != "cam0"])[1].unpaired == 200
+
+
+def test_a_silent_imu_does_not_end_the_run():
+    """Silent from 1 s to 3 s: frames go on, first 100 ms late, then at once; then it is back."""
+    ordered = [m for m in recording(80) if m.stream != "imu" or not 10**9 < m.stamp_ns <= 3 * 10**9]
+    newest, lateness = 0, {}
+
+    def feed():
+        nonlocal newest
+        for m in ordered:
+            newest = m.stamp_ns
+            yield m
+
+    counters = SequencerCounters()
+    for b in sequence(feed(), STEREO_IMU, RATE, CONFIG, counters):
+        lateness[b.stamp_ns // STEP] = newest - b.stamp_ns
+    assert sorted(lateness) == list(range(80))
+    assert counters.imu_silent == 40
+    assert 100 * MS <= lateness[25] <= 160 * MS
+    assert lateness[50] == 0
+    assert lateness[70] == 0
+
+
+def test_an_imu_that_never_comes():
+    bundles, counters = run([m for m in recording(30) if m.stream != "imu"])
+    assert len(bundles) == counters.imu_silent == 30
+
+
+def test_gaps_are_marked():
+    ordered = [m for m in recording(20) if m.stream == "imu" or not 5 * STEP < m.stamp_ns < 9 * STEP]
+    bundles, counters = run(ordered)
+    assert [(b.stamp_ns // STEP, b.gap_ns // STEP) for b in bundles if b.gap_ns] == [(9, 4)]
+    assert counters.gaps == 1
+    assert run(ordered, rate=0.0)[1].gaps == 0  # without a rate there is no gap
+
+
+@pytest.mark.parametrize("lag", [0, 40 * MS])
+def test_the_wrap_of_the_d4xx_clock_is_unwrapped(lag):
+    """As if the counter had more bits, also with the IMU ahead of the cameras by `lag`."""
+    ordered = recording(40, WRAP_NS - 10 * STEP)
+    ordered.sort(key=lambda m: m.stamp_ns + (lag if m.stream != "imu" else 0))
+    bundles, counters = run([replace(m, stamp_ns=m.stamp_ns % WRAP_NS) for m in ordered])
+    assert plain(bundles) == plain(run(ordered)[0])
+    assert len(bundles) == 40
+    assert (counters.wraps, counters.backward, counters.gaps, counters.jumps) == (1, 0, 0, 0)
+
+
+def test_the_clock_wraps_more_than_once():
+    stamps = np.arange(0, 3 * WRAP_NS, 10**9)
+    bundles, counters = run(images("cam0", stamps % WRAP_NS), ("cam0",), rate=1.0)
+    assert [b.stamp_ns for b in bundles] == stamps.tolist()
+    assert (counters.wraps, counters.gaps) == (2, 0)
+
+
+def test_a_jump_is_believed_with_witnesses_and_begins_a_gap():
+    ordered = recording(10) + recording(10, 3600 * 10**9)
+    bundles, counters = run(ordered)
+    assert len(bundles) == 20
+    assert (counters.jumps, counters.gaps, counters.strays) == (1, 1, 0)
+    assert bundles[10].gap_ns == 3600 * 10**9 - 9 * STEP
+    assert len(bundles[10].imu) == 11  # only those near it
+
+
+def test_a_stray_stamp_is_dropped():
+    ordered = recording(20)
+    stray = replace(ordered[50], stamp_ns=10**18)
+    bundles, counters = run([*ordered[:60], stray, *ordered[60:]])
+    assert plain(bundles) == plain(run(ordered)[0])
+    assert (counters.strays, counters.jumps) == (1, 0)
+
+
+def test_the_distant_past_is_dropped_and_counted():
+    ordered = recording(10, 10**15)
+    bundles, counters = run(ordered + recording(10))
+    assert len(bundles) == 10
+    assert counters.backward == len(recording(10))
+
+
+def test_rgbd_and_streams_that_are_not_wanted():
+    times = STEP * np.arange(5)
+    ordered = in_order(images("cam0", times) + images("depth", times) + images("cam1", times) + imu(times))
+    bundles, counters = run(ordered, ("cam0", "depth"))
+    assert [b.depth for b in bundles] == [f"depth@{t}" for t in times]
+    assert all(b.image1 is None and len(b.imu) == 0 for b in bundles)
+    assert counters == SequencerCounters(frames=5)
+
+
+@pytest.mark.parametrize("without", ["cam0", "cam1", "imu"])
+def test_memory_is_bounded_whichever_stream_dies(without):
+    """Ten minutes of two streams without the third: what waits stays small."""
+    counters = SequencerCounters()
+    merger = _Merger(STEREO_IMU, RATE, CONFIG, counters)
+    most = 0
+    for second in range(0, 600, 40):
+        for m in recording(20 * 40, second * 10**9 + 10**12):
+            if m.stream != without:
+                merger.add(m.stream, m.stamp_ns, m.payload)
+                for _ in merger.ready():
+                    pass
+                most = max(most, sum(len(b.items) for b in merger.buffers.values()))
+    assert most < 200 * CONFIG.max_jump_s + 200
