@@ -68,8 +68,8 @@ class PlaceConfig:
     ransac_px: float = 6.0  # reprojection error of a consensus
     ransac_iterations: int = 1000
     min_direction_inliers: int = 12  # 3D points of either view in the other's image
-    agree_depth_ratio: float = 0.1  # the two directions' positions differ less than this times the depth
-    agree_deg: float = 3.0  # … and their rotations less than this
+    agree_depth_ratio: float = 0.05  # the two directions' positions differ less than this times the depth
+    agree_deg: float = 2.5  # … and their rotations less than this
     sigma_px: float = 1.5  # of a keypoint
     sigma_inverse_depth: float = 0.01  # 1/m, of a keypoint's depth: disparity noise / (focal * baseline)
     inlier_chi2: float = 11.3  # squared Mahalanobis distance of an inlier (99 %, 3 dof)
@@ -158,6 +158,15 @@ class MergeConfig:
 
 
 @dataclass(frozen=True)
+class EdgeConfig:
+    """How the edge serves its agents."""
+
+    policy: str = "covins-g"  # every keyframe is sent, every verified loop is merged
+    silent_s: float = 3.0  # nothing heard of an agent for this long: it is taken as gone
+    name_hold_s: float = 3.0  # a name stays taken so long after its agent was last heard
+
+
+@dataclass(frozen=True)
 class Config:
     """The whole; one section per part."""
 
@@ -166,6 +175,7 @@ class Config:
     place: PlaceConfig = field(default_factory=PlaceConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
     merge: MergeConfig = field(default_factory=MergeConfig)
+    edge: EdgeConfig = field(default_factory=EdgeConfig)
     agent: AgentConfig = field(default_factory=AgentConfig)
     link: LinkConfig = field(default_factory=LinkConfig)
     clock: ClockConfig = field(default_factory=ClockConfig)

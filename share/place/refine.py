@@ -140,5 +140,4 @@ def _add(
 
 def _solve(linear: _Linear, weight: NDArray[Any]) -> F64:
     H = np.tensordot(weight.astype(np.float64), linear.H, 1)
-    step: F64 = np.linalg.solve(H + _RIDGE, weight @ linear.g)
-    return step
+    return np.asarray(np.linalg.solve(H + _RIDGE, weight @ linear.g), np.float64)

@@ -84,9 +84,7 @@ def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> V
     rough = _both_ways(y_q, y_c, query.focal, candidate.focal, config, seed)
     with_depth = np.isfinite(y_q[:, 2]) | np.isfinite(y_c[:, 2])
     y_q, y_c = y_q[with_depth], y_c[with_depth]
-    noise_q, noise_c = (
-        Noise(config.sigma_px / s.focal, config.sigma_inverse_depth) for s in (query, candidate)
-    )
+    noise_q, noise_c = _noise(query, config), _noise(candidate, config)
     fine = refine(rough, y_q, y_c, noise_q, noise_c, config.inlier_chi2)
     inlier = fine.d2 < config.inlier_chi2
     _need(int(inlier.sum()), config.min_inliers, "inliers")

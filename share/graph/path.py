@@ -1,0 +1,72 @@
+"""How well is one pose known from another? By the surest way through the graph between them.
+
+The covariance along any one path is an upper bound of what the whole graph knows, and it costs no
+factorisation. It is what a new loop has to agree with.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Sequence
+
+import numpy as np
+
+from share.geometry import se3
+from share.graph.posegraph import Edge
+from share.types import F64
+
+
+class Roads:
+    """The edges of a growing pose graph, by the poses that they touch."""
+
+    def __init__(self) -> None:
+        self._touching: dict[int, list[Edge]] = {}
+
+    def add(self, edge: Edge) -> None:
+        for end in (edge.a, edge.b):
+            self._touching.setdefault(end, []).append(edge)
+
+    def remove(self, edge: Edge) -> None:
+        for end in (edge.a, edge.b):
+            self._touching[end].remove(edge)
+
+    def surest(self, start: int, goal: int) -> list[Edge] | None:
+        """The path of least summed trace(cov) as the edges to walk, None if there is none (Dijkstra 1959)."""
+        came: dict[int, tuple[int, Edge]] = {}
+        done: set[int] = set()
+        heap: list[tuple[float, int, int, Edge | None]] = [(0.0, start, start, None)]
+        while heap:
+            cost, here, previous, edge = heapq.heappop(heap)
+            if here in done:
+                continue
+            done.add(here)
+            if edge is not None:
+                came[here] = (previous, edge)
+            if here == goal:
+                return _walk_back(came, start, goal)
+            for road in self._touching.get(here, ()):
+                there = road.b if road.a == here else road.a
+                if there not in done:
+                    heapq.heappush(heap, (cost + road.spread, there, here, road))
+        return None
+
+
+def covariance_between(path: Sequence[Edge], start: int, poses: Sequence[F64]) -> F64:
+    """Covariance (6, 6) of T_start_goal along `path`, each step laid along the current `poses`."""
+    cov = np.zeros((6, 6))
+    here = start
+    for edge in path:
+        there, step = (
+            (edge.b, edge.cov) if edge.a == here else (edge.a, se3.inverse_cov(edge.T_a_b, edge.cov))
+        )
+        cov = se3.compose_cov(se3.inverse(poses[here]) @ poses[there], cov, step)
+        here = there
+    return cov
+
+
+def _walk_back(came: dict[int, tuple[int, Edge]], start: int, goal: int) -> list[Edge]:
+    path = []
+    while goal != start:
+        goal, edge = came[goal]
+        path.append(edge)
+    return path[::-1]

@@ -1,0 +1,85 @@
+"""When a loop may be believed: against the map that it closes, or against a second witness.
+
+Two loops between the same two maps must tell the same story: T_a1_b1 = T_a1_a2 T_a2_b2 T_b2_b1, to
+within their own covariances and that of the ways a1 - a2 and b2 - b1. Source: pairwise consistency,
+Mangelson et al., ICRA 2018.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from share.geometry import se3
+from share.types import F64, checked, checked_pose
+
+
+class Key(NamedTuple):
+    """A keyframe: whose, and its number. `agent` names one run of an agent: ids begin anew with each."""
+
+    agent: str
+    id: int
+
+    def __str__(self) -> str:
+        return f"{self.agent}:{self.id}"
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """Body of keyframe b as seen from that of a: T_a_b (4, 4), cov (6, 6), and the inliers behind it."""
+
+    a: Key
+    b: Key
+    T_a_b: F64
+    cov: F64
+    inliers: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "T_a_b", checked_pose("T_a_b", self.T_a_b))
+        object.__setattr__(self, "cov", checked("cov", self.cov, (6, 6), np.float64))
+
+    def reverse(self) -> Loop:
+        return Loop(
+            self.b, self.a, se3.inverse(self.T_a_b), se3.inverse_cov(self.T_a_b, self.cov), self.inliers
+        )
+
+    def __str__(self) -> str:
+        return f"{self.a} - {self.b}"
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A relative pose T (4, 4) and its covariance (6, 6)."""
+
+    T: F64
+    cov: F64
+
+    def then(self, other: Known) -> Known:
+        return Known(self.T @ other.T, se3.compose_cov(other.T, self.cov, other.cov))
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """How far two statements about one relative pose lie apart."""
+
+    chi2: float
+    metres: float
+    degrees: float
+
+    def __str__(self) -> str:
+        return f"{self.metres:.2f} m and {self.degrees:.1f}° apart, chi2 {self.chi2:.0f}"
+
+
+def disagreement(first: Known, second: Known) -> Disagreement:
+    """Of two independent estimates of the same pose."""
+    xi = se3.log(se3.inverse(first.T) @ second.T)
+    chi2 = float(xi @ np.linalg.solve(first.cov + second.cov, xi))
+    return Disagreement(chi2, float(np.linalg.norm(xi[3:])), float(np.degrees(np.linalg.norm(xi[:3]))))
+
+
+def witness_disagreement(first: Loop, a1_a2: Known, second: Loop, b2_b1: Known) -> Disagreement:
+    """Of two loops, given the ways between their ends on either side."""
+    told = a1_a2.then(Known(second.T_a_b, second.cov)).then(b2_b1)
+    return disagreement(Known(first.T_a_b, first.cov), told)

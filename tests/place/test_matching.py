@@ -1,0 +1,49 @@
+import cv2
+import numpy as np
+
+from share.place.matching import hamming, match
+
+
+def test_hamming_agrees_with_opencv() -> None:
+    rng = np.random.default_rng(0)
+    a, b = (rng.integers(0, 256, (n, 32), np.uint8) for n in (40, 60))
+    index = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(a, b, k=60)
+    expected = np.zeros((40, 60))
+    for row in index:
+        for m in row:
+            expected[m.queryIdx, m.trainIdx] = m.distance
+    assert np.array_equal(hamming(a, b), expected)
+
+
+def test_finds_the_permutation_of_noisy_descriptors() -> None:
+    rng = np.random.default_rng(1)
+    a = rng.integers(0, 256, (300, 32), np.uint8)
+    order = rng.permutation(300)
+    b = a[order] ^ np.packbits(rng.random((300, 256)) < 0.05, axis=1)
+    pairs = match(a, b, 64, 0.9)
+    assert len(pairs) == 300
+    assert np.array_equal(order[pairs[:, 1]], pairs[:, 0])
+
+
+def test_is_symmetric_and_refuses_the_unlike() -> None:
+    rng = np.random.default_rng(2)
+    a, b = (rng.integers(0, 256, (100, 32), np.uint8) for _ in range(2))
+    assert len(match(a, b, 64, 1.0)) == 0
+    loose = match(a, b, 256, 1.0)
+    assert {tuple(p) for p in loose} == {(j, i) for i, j in match(b, a, 256, 1.0)}
+
+
+def test_ratio_refuses_an_ambiguous_match() -> None:
+    rng = np.random.default_rng(3)
+    a = rng.integers(0, 256, (2, 32), np.uint8)
+    twins = np.stack([a[0], a[0] ^ np.eye(1, 32, 0, dtype=np.uint8)[0]])
+    noisy = a.copy()
+    noisy[0, 5] ^= 0xFF
+    assert 0 in match(noisy, twins, 64, 1.0)[:, 0]
+    assert 0 not in match(noisy, twins, 64, 0.8)[:, 0]
+
+
+def test_too_few_descriptors_match_nothing() -> None:
+    one = np.zeros((1, 32), np.uint8)
+    assert match(one, one, 64, 1.0).shape == (0, 2)
+    assert match(np.zeros((0, 32), np.uint8), one, 64, 1.0).shape == (0, 2)
