@@ -54,3 +54,10 @@ def load_config(path: str | None) -> Config:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise UsageError(f"{path}: cannot read the configuration: {reason}") from None
     return settings.load(text, path)
+
+
+def agent_name(value: str) -> str:
+    """A name that can be a file's. Raises UsageError."""
+    if not re.fullmatch(r"[\w.-]{1,64}", value) or value.startswith("."):
+        raise UsageError(f"--name '{value}': use 1 to 64 letters, digits, '_', '-' or '.'")
+    return value

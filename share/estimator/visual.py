@@ -32,13 +32,14 @@ class TrackResult:
     """What one frame came to. T_odom_body is None where there is no pose to be had.
 
     keyframe: this frame became one; `VisualTracker.keyframe` gives what it shows. points: how many
-    the pose rests on.
+    the pose rests on. new_stretch: odometry broke before this keyframe.
     """
 
     state: TrackState
     T_odom_body: F64 | None
     keyframe: bool = False
     points: int = 0
+    new_stretch: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +231,7 @@ class VisualTracker:
             self._T_odom_cam, self._tracks = None, _NO_TRACKS
             self._map = LocalMap(self._config.max_keyframes)
             return TrackResult(TrackState.INITIALISING, None)
-        return TrackResult(TrackState.OK, self._T_odom_body(), True, len(self._tracks.ids))
+        return TrackResult(TrackState.OK, self._T_odom_body(), True, len(self._tracks.ids), True)
 
     def _recover(self, frame: Frame) -> TrackResult:
         """Find ourselves in the local map; after a while, begin a new stretch where we were lost."""
@@ -249,7 +250,7 @@ class VisualTracker:
         if len(self._tracks.ids) < config.min_inliers:
             return TrackResult(TrackState.LOST, None)
         self._lost_since_ns = None
-        return TrackResult(TrackState.WEAK, self._T_odom_body(), True, len(self._tracks.ids))
+        return TrackResult(TrackState.WEAK, self._T_odom_body(), True, len(self._tracks.ids), found is None)
 
     def _T_odom_body(self) -> F64:
         assert self._T_odom_cam is not None

@@ -35,23 +35,30 @@ class FrameRow:
 
 @dataclass
 class RunLog:
-    """Rows in the order of frames; marks come later, by the frame's stamp."""
+    """Rows in order of their stamps once read; marks come later, by the frame's stamp."""
 
-    rows: list[FrameRow] = field(default_factory=list)
+    _rows: list[FrameRow] = field(default_factory=list)
     cpu_s: float = 0.0  # process CPU time of the tracking pipeline
     decode_s: float = 0.0  # CPU time of image decoding
     _by_stamp: dict[int, FrameRow] = field(default_factory=dict)
 
-    def add(self, stamp_ns: int, track_ms: float, state: TrackState, keyframe: bool) -> None:
-        row = FrameRow(stamp_ns, track_ms, state, keyframe)
-        self.rows.append(row)
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def rows(self) -> list[FrameRow]:
+        """In order of time, which is not the order in which their fate was known."""
+        return sorted(self._rows, key=lambda row: row.stamp_ns)
+
+    def add(
+        self, stamp_ns: int, track_ms: float, state: TrackState, keyframe: bool, sent: bool = False
+    ) -> None:
+        row = FrameRow(stamp_ns, track_ms, state, keyframe, sent)
+        self._rows.append(row)
         self._by_stamp[stamp_ns] = row
 
     def add_decode(self, cpu_s: float) -> None:
         self.decode_s += cpu_s
-
-    def mark_sent(self, stamp_ns: int) -> None:
-        self._by_stamp[stamp_ns].sent = True
 
     def mark_corrected(self, stamp_ns: int, corrected_ms: float) -> None:
         self._by_stamp[stamp_ns].corrected_ms = corrected_ms
@@ -62,7 +69,8 @@ class RunLog:
 
     def report(self) -> dict[str, Any]:
         """The fields of report.json that come from frames alone (docs/architecture.md)."""
-        frames, rows = len(self.rows), self.rows
+        rows = self.rows
+        frames = len(rows)
         parts = latency([r.track_ms for r in rows], [r.corrected_ms for r in rows])
         sent = sum(r.sent for r in rows)
         span_s = (rows[-1].stamp_ns - rows[0].stamp_ns) * 1e-9 if frames > 1 else 0.0
@@ -71,7 +79,7 @@ class RunLog:
             "tracked": sum(r.state.has_pose for r in rows),
             "keyframes": sum(r.keyframe for r in rows),
             "sent": sent,
-            "lost_s": self._lost_s(),
+            "lost_s": _lost_s(rows),
             "track_ms": parts.track_ms.report(),
             "corrected_ms": parts.corrected_ms.report(),
             "latency_ms": parts.latency_ms.report(),
@@ -79,16 +87,18 @@ class RunLog:
             "cpu_ms_per_frame": 1e3 * self.cpu_s / frames if frames else None,
             "decode_ms_per_frame": 1e3 * self.decode_s / frames if frames else None,
             "rate_hz": sent / span_s if span_s else None,
-            "init_s": self._init_s(),
+            "init_s": _init_s(rows),
         }
 
-    def _lost_s(self) -> float:
-        """Time from each LOST frame to the next frame."""
-        stamps = np.array([r.stamp_ns for r in self.rows], np.int64)
-        lost = np.array([r.state is TrackState.LOST for r in self.rows], bool)
-        return float((np.diff(stamps) * lost[:-1]).sum() * 1e-9) if len(stamps) > 1 else 0.0
 
-    def _init_s(self) -> float | None:
-        """From the first frame to the first with a pose; None if there was none."""
-        first = next((r.stamp_ns for r in self.rows if r.state.has_pose), None)
-        return None if first is None else (first - self.rows[0].stamp_ns) * 1e-9
+def _lost_s(rows: list[FrameRow]) -> float:
+    """Time from each LOST frame to the next frame."""
+    stamps = np.array([r.stamp_ns for r in rows], np.int64)
+    lost = np.array([r.state is TrackState.LOST for r in rows], bool)
+    return float((np.diff(stamps) * lost[:-1]).sum() * 1e-9) if len(rows) > 1 else 0.0
+
+
+def _init_s(rows: list[FrameRow]) -> float | None:
+    """From the first frame to the first with a pose; None if there was none."""
+    first = next((r.stamp_ns for r in rows if r.state.has_pose), None)
+    return None if first is None else (first - rows[0].stamp_ns) * 1e-9

@@ -1,0 +1,115 @@
+"""`share agent`: one agent at sensor rate."""
+
+from __future__ import annotations
+
+import secrets
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from share.cli import options
+from share.errors import ShareError
+
+if TYPE_CHECKING:
+    from share.run.agent import AgentRun, Status
+
+
+@click.command()
+@click.argument("source")
+@click.option("--name", required=True, help="What this agent is called; unique at its edge.")
+@click.option("--kind", type=click.Choice(["ar", "robot"]), required=True, help="Who is served.")
+@click.option("--edge", "address", metavar="tcp://H:P", required=True, help="Where the edge listens.")
+@options.calib
+@options.frames
+@click.option("--out", metavar="DIR", help="Write odom.tum, map.tum, latency.csv and report.json here.")
+@options.config
+@options.as_json
+def agent(
+    source: str,
+    name: str,
+    kind: str,
+    address: str,
+    calib: str | None,
+    frames: slice | None,
+    out: str | None,
+    config_file: str | None,
+    as_json: bool,
+) -> None:
+    """Track one agent at sensor rate, send keyframes to an edge, and take its corrections.
+
+    The agent never waits for the edge: without it, odometry goes on unchanged, and the edge is
+    joined whenever it answers. Exit code 1 if it never did.
+
+    \b
+    Example:  share agent rec/kitchen --name ann --kind ar --edge tcp://127.0.0.1:5555 --out out/ann
+    """
+    settings = options.load_config(config_file)
+    from share.io.source import open_source
+    from share.io.transport import connect, parse_address
+    from share.run.agent import AgentRun
+    from share.run.stop import on_stop
+    from share.types import AgentKind
+    from share.wire.messages import Hello
+
+    parse_address(address)
+    opened = open_source(source, calib, frames)
+    run_id = secrets.randbits(63)
+    rig = opened.rig
+    hello = Hello(options.agent_name(name), AgentKind(kind), run_id, rig.cam0.focal, rig.T_body_cam0)
+    live = _LiveLine(opened.images_count)
+    folder = None if out is None else Path(out)
+    run = AgentRun(opened, hello, settings, lambda: connect(address, run_id), folder, live.say, live.show)
+    with on_stop(run.stop):
+        run.go()
+    live.end()
+    if as_json:
+        import json
+
+        click.echo(json.dumps(run.report))
+    else:
+        click.echo(_summary(run))
+    if not run.report["protocol"]["edge_sessions"]:
+        raise ShareError(f"no edge ever answered at {address}; is `share edge` running there?")
+
+
+class _LiveLine:
+    """One line on a terminal that is written over; elsewhere only what is said."""
+
+    def __init__(self, total: int) -> None:
+        self._total, self._shown, self._tty = total, 0, sys.stderr.isatty()
+
+    def show(self, status: Status) -> None:
+        if not self._tty or (status.frames % 5 and status.frames != self._total):
+            return
+        r = status.report
+        rtt = "  –  " if r["rtt_ms"] is None else f"{r['rtt_ms']:.1f} ms"
+        text = (
+            f"{status.frames}/{self._total} {status.state:4} sent {r['sent']} acknowledged "
+            f"{r['acknowledged']} corrections {r['corrections']} rtt {rtt} map {r['map_id'] or '–'}"
+        )
+        click.echo("\r\x1b[K" + text, err=True, nl=False)
+        self._shown = len(text)
+
+    def say(self, text: str) -> None:
+        self.end()
+        click.echo(f"share agent: {text}", err=True)
+
+    def end(self) -> None:
+        if self._shown:
+            click.echo("", err=True)
+        self._shown = 0
+
+
+def _summary(run: AgentRun) -> str:
+    r = run.report
+    p95 = r["track_ms"]["p95"]
+    lines = [
+        f"{r['tracked']} of {r['frames']} frames tracked, lost for {r['lost_s']:.1f} s",
+        f"{r['sent']} of {r['keyframes']} keyframes sent, {r['corrections']} corrections, "
+        f"{r['bytes_up'] / 1e6:.2f} MB up, {r['bytes_down'] / 1e6:.3f} MB down",
+    ]
+    if p95 is not None:
+        lines.append(f"pose after {r['track_ms']['p50']:.1f} ms (95 %: {p95:.1f} ms)")
+    return "\n".join(lines)

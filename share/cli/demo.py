@@ -1,0 +1,136 @@
+"""`share demo`: the whole system on this machine."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from share.cli.progress import progress
+
+if TYPE_CHECKING:
+    from share.metrics.ate import Ate
+    from share.run.demo import Progress
+    from share.run.score import SessionScore
+
+
+@click.command()
+@click.option("--seconds", type=click.FloatRange(2, 600), default=20, show_default=True)
+@click.option("--policy", type=click.Choice(["covins-g"]), default="covins-g", show_default=True)
+@click.option("--out", metavar="DIR", default="share-demo", show_default=True, help="Everything it leaves.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Which room.")
+def demo(seconds: float, policy: str, out: str, seed: int) -> None:
+    """The whole system on this machine, nothing else needed.
+
+    Makes a room with two headset wearers and a robot (kept for the next time), plays it in real
+    time through an edge and three agents, each a process of its own, and shows how well the agents
+    knew where they were in the map that they came to share.
+
+    \b
+    Example:  share demo --seconds 30 --out /tmp/demo
+    """
+    folder = Path(out)
+    from share.emulate.session import cached_session
+    from share.io.files import writable_dir
+    from share.io.session import read_session
+    from share.run.demo import play
+    from share.run.score import score
+
+    writable_dir(folder)
+    with progress(100, "making the room") as bar:
+        share_done = _Percent(bar)
+        session = read_session(cached_session(seconds=seconds, seed=seed, progress=share_done))
+    live = _LiveLine(seconds)
+    folders = play(session, seconds, policy, folder, live.show)
+    live.end()
+    result = score(session, folders)
+    click.echo(_table(result))
+    if result.joint is not None:
+        from share.io.picture import draw_trajectories
+
+        picture = folder / "trajectories.png"
+        title = f"joint ATE {100 * result.joint.joint.rmse:.2f} cm, causal, one alignment for all"
+        paths = {name: (agent.map, agent.truth) for name, agent in result.agents.items()}
+        draw_trajectories(picture, paths, result.joint.joint.T_truth_est, title)
+        click.echo(f"\npicture: {picture}   decisions of the edge: {folder / 'edge' / 'events.jsonl'}")
+
+
+class _Percent:
+    """Frames done of all, as steps of a bar of 100."""
+
+    def __init__(self, bar: object) -> None:
+        self._bar, self._done = bar, 0
+
+    def __call__(self, done: int, total: int) -> None:
+        percent = 100 * done // max(total, 1)
+        self._bar(percent - self._done)  # type: ignore[operator]
+        self._done = percent
+
+
+class _LiveLine:
+    def __init__(self, seconds: float) -> None:
+        self._seconds, self._tty = seconds, sys.stderr.isatty()
+
+    def show(self, now: Progress) -> None:
+        if self._tty:
+            frames = "  ".join(f"{name} {count}" for name, count in now.frames.items())
+            text = f"frames: {frames}   in a shared map: {now.joined}   corrections: {now.corrections}"
+            click.echo("\r\x1b[K" + text, err=True, nl=False)
+
+    def end(self) -> None:
+        if self._tty:
+            click.echo("", err=True)
+
+
+def _table(result: SessionScore) -> str:
+    joint = {} if result.joint is None else result.joint.agents
+    head = (
+        "agent",
+        "odom ATE",
+        "map ATE",
+        "pose p50",
+        "p95",
+        "> 20 ms",
+        "corrected p50",
+        "p95",
+        "keyframes",
+        "sent",
+        "corrections",
+    )
+    rows = [head]
+    for name, agent in result.agents.items():
+        r = agent.report
+        rows.append(
+            (
+                name,
+                _cm(agent.odometry),
+                _cm(joint.get(name)),
+                _ms(r["track_ms"]["p50"]),
+                _ms(r["track_ms"]["p95"]),
+                f"{100 * r['over_20ms']:.1f} %",
+                _ms(r["corrected_ms"]["p50"]),
+                _ms(r["corrected_ms"]["p95"]),
+                str(r["keyframes"]),
+                str(r["sent"]),
+                str(r["corrections"]),
+            )
+        )
+    widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
+    lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    members = len(joint)
+    verdict = (
+        f"{members} of {len(result.agents)} agents in one map"
+        + (f", joint ATE {_cm(result.joint.joint)}" if result.joint else "")
+        + "  (causal poses, one SE3 alignment for all)"
+    )
+    return "\n".join([*lines, "", verdict])
+
+
+def _cm(ate: Ate | None) -> str:
+    return "–" if ate is None else f"{100 * ate.rmse:.2f} cm"
+
+
+def _ms(value: float | None) -> str:
+    return "–" if value is None else f"{value:.1f} ms"

@@ -1,0 +1,77 @@
+"""`share edge`: the server of a room."""
+
+from __future__ import annotations
+
+import json
+import secrets
+from pathlib import Path
+from typing import Any
+
+import click
+
+from share.cli import options
+
+
+@click.command()
+@click.option("--bind", default="tcp://127.0.0.1:5555", show_default=True, metavar="tcp://H:P")
+@click.option(
+    "--policy",
+    type=click.Choice(["covins-g"]),
+    default="covins-g",
+    show_default=True,
+    help="How agents are scheduled. covins-g: every keyframe is sent, every verified loop is merged.",
+)
+@click.option("--out", metavar="DIR", help="Write events.jsonl and edge.json here.")
+@options.config
+@options.verbose
+@options.as_json
+def edge(
+    bind: str, policy: str, out: str | None, config_file: str | None, verbose: bool, as_json: bool
+) -> None:
+    """Join the maps of all agents and send corrections back. Ctrl-C ends it.
+
+    Says when agents come and go and when maps are joined; with -v, every decision and its reason.
+
+    \b
+    Example:  share edge --bind tcp://127.0.0.1:5555 --out out/edge
+    """
+    settings = options.load_config(config_file)
+    from dataclasses import replace
+
+    from share.io.files import writable_dir
+    from share.io.transport import bind as bind_link
+    from share.io.transport import parse_address
+    from share.run.edge import EdgeRun
+    from share.run.stop import on_stop
+
+    parse_address(bind, bind=True)
+    settings = replace(settings, edge=replace(settings.edge, policy=policy))
+    folder = None if out is None else writable_dir(Path(out))
+    link = bind_link(bind)
+    run = EdgeRun(settings, secrets.randbits(63), link, folder, lambda e: _tell(e, verbose))
+    with on_stop(run.stop):
+        click.echo(f"listening on {link.endpoint}, policy {policy}", err=True)
+        report = run.go()
+    click.echo(json.dumps(report) if as_json else _summary(report))
+
+
+_NEWS = {"joined the edge", "left", "back", "silent", "refused", "maps joined", "merge taken out"}
+
+
+def _tell(event: dict[str, Any], verbose: bool) -> None:
+    if verbose or event["event"] in _NEWS:
+        agent = f" {event['agent']}:" if event["agent"] else ""
+        click.echo(f"{event['t_s']:9.3f} s {event['event']}:{agent} {event['reason']}", err=True)
+
+
+def _summary(report: dict[str, Any]) -> str:
+    lines = [
+        f"{name}: {a['keyframes']} keyframes, {a['corrections']} corrections, "
+        f"{a['bytes_up'] / 1e6:.2f} MB up, in map {a['map_id']}"
+        for name, a in report["agents"].items()
+    ]
+    loops = report["loops"]
+    lines.append(
+        f"loops: {loops['tried']} tried, {loops['accepted']} accepted; {report['merges']['done']} merges"
+    )
+    return "\n".join(lines)

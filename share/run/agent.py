@@ -1,0 +1,244 @@
+"""An agent as a process: three threads and two bounded queues round the state machine of `core.agent`.
+
+    reader: decode, wait until the sensor would have delivered -> tracker: pose, then keyframe
+        -> main: the machine, the link, the files
+
+A recording is played at its own pace and no frame of it is dropped: the reader waits when the tracker
+is behind (policy `block`), while a frame still counts as arrived when it was due. So the poses of a
+recording are the same to the last digit on any machine, with an edge or without, and lateness shows
+in the latency, where it belongs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from share import __version__, config
+from share.core import events as ev
+from share.core.agent import Agent
+from share.core.sequencer import SequencerCounters
+from share.errors import DataError, ShareError
+from share.io.source import Source
+from share.io.transport import AgentLink
+from share.metrics.runlog import RunLog
+from share.run.agent_files import AgentFiles
+from share.run.pipeline import frames_of, tracker_for
+from share.types import Frame
+from share.wire.messages import Hello
+
+READ_AHEAD = 30  # frames decoded before they are due
+TICK_MS = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Status:
+    """For the live line."""
+
+    frames: int
+    state: str
+    report: dict[str, Any]
+
+
+@dataclass
+class _Shared:
+    """What the threads tell each other."""
+
+    frames: queue.Queue[Frame | None] = field(default_factory=lambda: queue.Queue(READ_AHEAD))
+    inbox: queue.SimpleQueue[ev.AgentEvent] = field(default_factory=queue.SimpleQueue)
+    stop: threading.Event = field(default_factory=threading.Event)
+    error: BaseException | None = None  # what ended a thread
+
+
+class AgentRun:
+    """One run: `go` returns when the recording is over and everything is acknowledged and written.
+
+    A damaged image costs its frame; a recording that cannot be read on ends the run in good order,
+    and then raises.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        hello: Hello,
+        settings: config.Config,
+        connect: Callable[[], AgentLink],
+        out: Path | None,
+        say: Callable[[str], None],
+        show: Callable[[Status], None] = lambda status: None,
+    ) -> None:
+        self._source, self._settings = source, settings
+        self._say, self._show = say, show
+        self._machine = Agent(hello, settings)
+        self._tracker = tracker_for(source, settings)
+        self._files, self._log = AgentFiles(out), RunLog()
+        self._counters = SequencerCounters()
+        self._link = connect()  # last: whatever is wrong with the above has been said by now
+        self._shared = _Shared()
+        self._damaged = 0
+        self._ended = False
+        self.report: dict[str, Any] = {}
+
+    def stop(self) -> None:
+        """End early, in good order: no more frames, but what was sent is still waited for."""
+        self._shared.stop.set()
+
+    def go(self) -> None:
+        """Raises what ended the run before its time, after everything was closed."""
+        threads = [threading.Thread(target=f, name=n, daemon=True) for n, f in self._threads().items()]
+        for thread in threads:
+            thread.start()
+        try:
+            self._loop()
+            self.report = self._report()
+            self._files.finish(self._log, self.report)
+        except ShareError:
+            self._files.discard()
+            raise
+        finally:
+            self._shared.stop.set()
+            self._link.close()
+            for thread in threads:
+                thread.join(timeout=2)
+        if self._shared.error is not None:
+            raise self._shared.error
+
+    def _threads(self) -> dict[str, Callable[[], None]]:
+        return {"reader": self._read, "tracker": self._track}
+
+    # ------------------------------------------------------------------ reader
+
+    def _read(self) -> None:
+        shared = self._shared
+        try:
+            frames = frames_of(
+                self._source, self._settings, self._counters, self._skip_damaged, self._log.add_decode
+            )
+            for frame in frames:
+                if not self._put(frame):
+                    return
+        except BaseException as error:
+            shared.error = error
+        finally:
+            self._put(None)
+
+    def _put(self, frame: Frame | None) -> bool:
+        """Wait for room, unless the run is over."""
+        while not self._shared.stop.is_set():
+            try:
+                self._shared.frames.put(frame, timeout=0.1)
+                return True
+            except queue.Full:
+                continue
+        return False
+
+    def _skip_damaged(self, error: DataError) -> None:
+        self._damaged += 1
+        self._say(f"a frame is left out: {error}")
+
+    # ------------------------------------------------------------------ tracker
+
+    def _track(self) -> None:
+        try:
+            for frame, arrived_ns in self._due_frames():
+                self._track_one(frame, arrived_ns)
+        except BaseException as error:
+            self._shared.error = error
+        finally:
+            self._post(ev.Finished())
+
+    def _due_frames(self) -> Iterator[tuple[Frame, int]]:
+        """Frames when the sensor would have delivered them, and that moment."""
+        began: tuple[int, int] | None = None
+        while not self._shared.stop.is_set():
+            try:
+                frame = self._shared.frames.get(timeout=0.1)
+            except queue.Empty:
+                continue
+            if frame is None:
+                return
+            now = time.monotonic_ns()
+            began = (now, frame.stamp_ns) if began is None else began
+            due = began[0] + frame.stamp_ns - began[1]
+            if due > now and self._shared.stop.wait((due - now) * 1e-9):
+                return
+            yield frame, due
+
+    def _track_one(self, frame: Frame, arrived_ns: int) -> None:
+        cpu = time.thread_time()
+        result = self._tracker.track(frame)
+        tracked = ev.FrameTracked(
+            index=frame.index,
+            stamp_ns=frame.stamp_ns,
+            arrived_ns=arrived_ns,
+            done_ns=time.monotonic_ns(),
+            state=result.state,
+            T_odom_body=result.T_odom_body,
+            keyframe=result.keyframe,
+            new_stretch=result.new_stretch,
+        )
+        self._post(tracked)  # the pose goes out before others are served
+        if result.keyframe:
+            self._post(ev.KeyframeMade(tracked, self._tracker.keyframe(frame)))
+        self._log.cpu_s += time.thread_time() - cpu
+
+    def _post(self, event: ev.AgentEvent) -> None:
+        self._shared.inbox.put(event)
+        self._link.wake()
+
+    # ------------------------------------------------------------------ main
+
+    def _loop(self) -> None:
+        while not self._ended:
+            frames = self._link.receive(TICK_MS)
+            if frames is not None:
+                self._handle(ev.Received(frames))
+            while not self._shared.inbox.empty():
+                self._handle(self._shared.inbox.get())
+            self._handle(ev.Tick())
+
+    def _handle(self, event: ev.AgentEvent) -> None:
+        for effect in self._machine.handle(event, time.monotonic_ns()):
+            self._carry_out(effect)
+
+    def _carry_out(self, effect: ev.AgentEffect) -> None:
+        match effect:
+            case ev.Send():
+                self._link.send(effect.frames)
+            case ev.Localised():
+                self._files.odom(effect.stamp_ns, effect.T_odom_body)
+                if effect.T_map_odom is not None and effect.map_id is not None:
+                    self._files.map(effect.stamp_ns, effect.T_map_odom @ effect.T_odom_body, effect.map_id)
+            case ev.FrameDone():
+                self._log.add(effect.stamp_ns, effect.track_ms, effect.state, effect.keyframe, effect.sent)
+                self._show(Status(len(self._log), str(effect.state), self._machine.report()))
+            case ev.CorrectionApplied():
+                if effect.stamp_ns is not None and effect.corrected_ms is not None:
+                    self._log.mark_corrected(effect.stamp_ns, effect.corrected_ms)
+            case ev.Say():
+                self._say(effect.text)
+            case ev.Fail():
+                raise effect.error
+            case ev.Stop():
+                self._ended = True
+
+    def _report(self) -> dict[str, Any]:
+        protocol = self._machine.report()
+        frames = self._log.report()
+        return {
+            **frames,
+            "corrections": protocol["corrections"],
+            "bytes_up": protocol["bytes_up"],
+            "bytes_down": protocol["bytes_down"],
+            "damaged_images": self._damaged,
+            "sequencer": dataclasses.asdict(self._counters),
+            "protocol": protocol,
+            "version": __version__,
+            "config": config.to_mapping(self._settings),
+        }

@@ -1,0 +1,73 @@
+"""What `share agent --out DIR` leaves behind.
+
+Poses are written as they come, under a `.partial` name that a crash leaves behind readable; a run
+that ends gives them their real name. One TUM file holds poses of one map only: when the agent is
+taken into another map, what it wrote before is kept as `map.before-N.tum`.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import IO, Any
+
+from share.io.files import atomic_write, writable_dir
+from share.io.trajectory import format_pose
+from share.metrics.runlog import RunLog
+from share.types import F64
+
+
+class AgentFiles:
+    """odom.tum, map.tum, latency.csv and report.json of one run in `out`; nothing where that is None."""
+
+    def __init__(self, out: Path | None) -> None:
+        self._out = None if out is None else writable_dir(out)
+        self._open: dict[str, IO[str]] = {}
+        self._map_id: str | None = None
+        self._maps_before = 0
+
+    def odom(self, stamp_ns: int, T_odom_body: F64) -> None:
+        self._line("odom.tum", stamp_ns, T_odom_body)
+
+    def map(self, stamp_ns: int, T_map_body: F64, map_id: str) -> None:
+        if self._map_id not in (None, map_id) and "map.tum" in self._open and self._out is not None:
+            self._open.pop("map.tum").close()
+            self._maps_before += 1
+            (self._out / "map.tum.partial").rename(self._out / f"map.before-{self._maps_before}.tum.partial")
+        self._map_id = map_id
+        self._line("map.tum", stamp_ns, T_map_body)
+
+    def finish(self, log: RunLog, report: dict[str, Any]) -> None:
+        """Close what is open and give everything its name."""
+        self._close()
+        if self._out is None:
+            return
+        for old in self._out.glob("map.before-*.tum"):
+            old.unlink()  # of an earlier run in the same folder
+        for name in ("odom.tum", "map.tum"):
+            partial = self._out / f"{name}.partial"
+            partial.touch()  # no pose at all is an empty file, not an older run's
+            partial.replace(self._out / name)
+        for number in range(1, self._maps_before + 1):
+            name = f"map.before-{number}.tum"
+            (self._out / f"{name}.partial").replace(self._out / name)
+        atomic_write(self._out / "latency.csv", log.csv())
+        atomic_write(self._out / "report.json", json.dumps(report, indent=2) + "\n")
+
+    def discard(self) -> None:
+        """The run came to nothing: leave no trace of it."""
+        self._close()
+        for partial in self._out.glob("*.tum.partial") if self._out else ():
+            partial.unlink()
+
+    def _line(self, name: str, stamp_ns: int, T: F64) -> None:
+        if self._out is None:
+            return
+        if name not in self._open:
+            self._open[name] = (self._out / f"{name}.partial").open("w", buffering=1)
+        self._open[name].write(format_pose(stamp_ns, T) + "\n")
+
+    def _close(self) -> None:
+        for file in self._open.values():
+            file.close()
+        self._open.clear()

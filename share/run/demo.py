@@ -1,0 +1,111 @@
+"""The whole system on this machine: an edge and an agent per recording, as processes of their own."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from share.errors import ShareError
+from share.io.files import writable_dir
+from share.io.session import Session
+from share.run.processes import child, end
+
+START_S = 20.0  # how long the edge may take until it listens
+PATIENCE_S = 60.0  # how much longer than its recording an agent may take
+Processes = dict[str, subprocess.Popen[bytes]]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """For the live line: frames per agent, agents that share a map with another, corrections sent."""
+
+    frames: dict[str, int]
+    joined: int
+    corrections: int
+
+
+def play(
+    session: Session, seconds: float, policy: str, out: Path, show: Callable[[Progress], None]
+) -> dict[str, Path]:
+    """Runs `session` in real time. The folder of each agent's files, by name.
+
+    Raises ShareError naming the process that failed and what it said last.
+    """
+    folders = {name: out / name for name in session.agents}
+    logs = {name: out / f"{name}.log" for name in (*folders, "edge")}
+    writable_dir(out)
+    with ExitStack() as stack:
+        bind = ("--bind", "tcp://127.0.0.1:0", "--policy", policy, "--out", str(out / "edge"))
+        edge = stack.enter_context(child(logs["edge"], "edge", *bind))
+        address = _address(edge, logs["edge"])
+        agents: Processes = {}
+        for name, agent in session.agents.items():
+            who = (f"{session.folder}/{name}", "--name", name, "--kind", str(agent.kind))
+            where = ("--edge", address, "--out", str(folders[name]))
+            agents[name] = stack.enter_context(child(logs[name], "agent", *who, *where))
+        _watch(agents, folders, out / "edge" / "events.jsonl", seconds + PATIENCE_S, show)
+        for name, process in {**agents, "edge": edge}.items():
+            if end(process) != 0:
+                raise ShareError(f"{name} failed: {_last_line(logs[name])}")
+    return folders
+
+
+def _address(edge: subprocess.Popen[bytes], log: Path) -> str:
+    """Where the edge listens, as it says itself."""
+    deadline = time.monotonic() + START_S
+    while time.monotonic() < deadline:
+        found = re.search(r"listening on (tcp://\S+?),", log.read_text())
+        if found:
+            return found[1]
+        if edge.poll() is not None:
+            break
+        time.sleep(0.05)
+    raise ShareError(f"the edge did not start: {_last_line(log)}")
+
+
+def _watch(
+    agents: Processes,
+    folders: dict[str, Path],
+    events: Path,
+    limit_s: float,
+    show: Callable[[Progress], None],
+) -> None:
+    """Until every agent has ended, or one has failed."""
+    deadline = time.monotonic() + limit_s
+    while any(process.poll() is None for process in agents.values()):
+        if any(process.poll() for process in agents.values()):
+            return
+        if time.monotonic() > deadline:
+            raise ShareError(f"the agents have not ended {PATIENCE_S:g} s after their recordings")
+        show(_progress(folders, events))
+        time.sleep(0.2)
+    show(_progress(folders, events))
+
+
+def _progress(folders: dict[str, Path], events: Path) -> Progress:
+    lines = _lines(events)
+    decided = [json.loads(line) for line in lines if line.endswith("}")]
+    maps = {event["agent"]: event["map_id"] for event in decided if event["event"] == "correction"}
+    shared = [map_id for map_id, count in Counter(maps.values()).items() if count > 1]
+    frames = {
+        name: max(len(_lines(folder / "odom.tum.partial")), len(_lines(folder / "odom.tum")))
+        for name, folder in folders.items()
+    }
+    joined = sum(map_id in shared for map_id in maps.values())
+    return Progress(frames, joined, sum(event["event"] == "correction" for event in decided))
+
+
+def _lines(path: Path) -> list[str]:
+    return path.read_text().splitlines() if path.exists() else []
+
+
+def _last_line(log: Path) -> str:
+    lines = [line for line in log.read_text().splitlines() if line.strip()]
+    return lines[-1] if lines else "it said nothing"
