@@ -169,13 +169,13 @@ class Atlas:
         for number, T in zip(job.nodes, solved.poses, strict=True):
             self._poses[number] = T
         self._extend(job.stretches, after=job.nodes[-1])
-        dropped = self._drop_contradicted(job, solved.loop_chi2)
+        news = self._drop_contradicted(job, solved.loop_chi2) + self._settle_pending()
         corrections = self._corrections(result)
         moved = ", ".join(corrections) or "nobody"
         return Applied(
             corrections,
             f"map {job.map_id}: {len(job.nodes)} poses, {len(job.loops)} loops solved, "
-            f"corrects {moved}{dropped}",
+            f"corrects {moved}{news}",
         )
 
     # ------------------------------------------------------------ judging loops

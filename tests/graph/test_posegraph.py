@@ -48,8 +48,8 @@ def test_recovers_a_drifting_path() -> None:
     assert rms(guess, truth) > 0.3
     assert rms(solved.poses, truth) < 0.5 * rms(guess, truth)
     assert np.array_equal(solved.poses[0], guess[0])
-    assert 4 < solved.odometry_chi2.mean() < 7
-    assert 3 < solved.loop_chi2.mean() < 7
+    # of 6 * 359 equations 6 * 299 are used up by the poses: chi-square of 6 * 60 is left
+    assert 0.8 < (solved.odometry_chi2.sum() + solved.loop_chi2.sum()) / 360 < 1.25
     assert np.array_equal(solved.loop_chi2, chi2(solved.poses, loops))
 
 
@@ -152,4 +152,4 @@ def test_covariance_along_a_path_is_that_of_the_samples() -> None:
     for step in steps:
         T = T @ step @ se3.exp(rng.multivariate_normal(np.zeros(6), small, 4000))
     samples = se3.log(se3.inverse(poses[4]) @ T)
-    assert np.cov(samples.T) == pytest.approx(claimed, rel=0.15, abs=3e-6)
+    assert np.cov(samples.T) == pytest.approx(claimed, rel=0.15, abs=6e-6)

@@ -46,7 +46,9 @@ def sights(seed: int, T_c_q: F64, depth_share: float = 0.8, up: bool = True) -> 
     up_c = np.array([0.0, 0.0, 1.0])
     up_q = bodies(T_c_q)[:3, :3].T @ up_c
     none = np.zeros(3)
-    return Sight(query, FOCAL, X_CAM, up_q if up else none), Sight(candidate, FOCAL, X_CAM, up_c if up else none)
+    return Sight(query, FOCAL, X_CAM, up_q if up else none), Sight(
+        candidate, FOCAL, X_CAM, up_c if up else none
+    )
 
 
 def bodies(T_c_q: F64) -> F64:

@@ -57,7 +57,10 @@ def test_answer_does_not_depend_on_how_segments_were_merged() -> None:
     asked = enumerate_words(index, query)
     expected = np.zeros(37)
     for word in asked:
-        holders = [sum(w == word for w in enumerate_words(index, p)) if word in s else 0 for p, s in zip(places, words, strict=True)]
+        holders = [
+            sum(w == word for w in enumerate_words(index, p)) if word in s else 0
+            for p, s in zip(places, words, strict=True)
+        ]
         df = min(sum(holders), 37)
         expected += np.log(38 / (1 + df)) * np.array(holders)
     scores = {c.id - 1000: c.score for c in index.query(query, limit=37)}

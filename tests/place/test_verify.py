@@ -93,7 +93,9 @@ def test_inliers_in_one_corner_are_refused(half: float) -> None:
     near = np.abs(candidate.view.uv - candidate.view.uv.mean(0)).max(1) < half * 3
     # only what lies in the corner keeps its descriptor
     rng = np.random.default_rng(0)
-    others = np.where(near[:, None], candidate.view.descriptors, rng.integers(0, 256, (len(near), 32), np.uint8))
+    others = np.where(
+        near[:, None], candidate.view.descriptors, rng.integers(0, 256, (len(near), 32), np.uint8)
+    )
     corner = View(candidate.view.uv, candidate.view.points, others)
     loose = replace(CONFIG, min_matches=10, min_inliers=8, min_direction_inliers=6, min_spread=0.15)
     assert "inliers crowd in the" in reason(query, replace(candidate, view=corner), loose)

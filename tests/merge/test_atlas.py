@@ -1,0 +1,352 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from atlas_sim import Walker, error, loop, near_loops
+from share.config import GraphConfig, MergeConfig
+from share.geometry import se3
+from share.merge.atlas import Applied, Atlas
+from share.merge.join import Key, Loop
+from share.merge.solving import run_job
+from share.types import F64
+
+CONFIG = MergeConfig()
+GRAPH = GraphConfig()
+WRONG = se3.exp(np.array([0.0, 0.0, 0.5, 1.0, -0.7, 0.1]))
+
+
+def atlas_of(*walkers: Walker, config: MergeConfig = CONFIG) -> Atlas:
+    """All keyframes of all, taken in turn."""
+    atlas = Atlas(config)
+    for i in range(max(len(w.keyframes) for w in walkers)):
+        for w in walkers:
+            if i < len(w.keyframes):
+                atlas.add_keyframe(w.name, w.keyframes[i])
+    return atlas
+
+
+def settle(atlas: Atlas) -> list[Applied]:
+    done = []
+    while atlas.due():
+        done.append(atlas.apply(run_job(atlas.snapshot(atlas.due()[0]), GRAPH)))
+    return done
+
+
+def poses(atlas: Atlas, *walkers: Walker) -> F64:
+    return np.array([atlas.pose(Key(w.name, k.id)) for w in walkers for k in w.keyframes])
+
+
+def truth(*walkers: Walker) -> F64:
+    return np.concatenate([w.truth for w in walkers])
+
+
+@pytest.fixture
+def ann() -> Walker:
+    return Walker("ann", 1)
+
+
+@pytest.fixture
+def bob() -> Walker:
+    return Walker("bob", 2, phase=0.7)
+
+
+def test_every_stretch_is_a_map_until_joined(ann: Walker, bob: Walker) -> None:
+    atlas = atlas_of(ann, bob)
+    assert {name: len(keys) for name, keys in atlas.maps().items()} == {"ann/0": 60, "bob/0": 60}
+    assert len(atlas) == 120
+    assert atlas.due() == []
+    assert atlas.T_map_odom("bob") == pytest.approx(np.eye(4), abs=1e-9)
+    assert atlas.T_map_odom("nobody") is None
+
+
+def test_two_agents_are_joined_to_truth(ann: Walker, bob: Walker) -> None:
+    atlas = atlas_of(ann, bob)
+    rng = np.random.default_rng(0)
+    decisions = [atlas.propose(x) for x in near_loops(ann, bob, rng) + near_loops(bob, bob, rng)]
+    assert "first witness, waits for a second" in decisions[0].reason
+    assert not decisions[0].accepted
+    assert decisions[1].joined == ("ann/0", "bob/0")
+    assert all(d.accepted for d in decisions[1:])
+    before = error(np.array(ann.T_odom_body), ann.truth), error(np.array(bob.T_odom_body), bob.truth)
+    (applied,) = settle(atlas)
+    assert applied.corrections.keys() == {"ann", "bob"}
+    after = error(poses(atlas, ann, bob), truth(ann, bob))
+    assert after < 0.06
+    assert after < max(before)
+
+
+def test_the_founders_gauge_never_moves(ann: Walker, bob: Walker) -> None:
+    atlas = atlas_of(ann, bob)
+    rng = np.random.default_rng(0)
+    for x in near_loops(bob, ann, rng) + near_loops(ann, ann, rng):
+        atlas.propose(x)
+        settle(atlas)
+        assert np.array_equal(atlas.pose(Key("ann", 0)), ann.T_odom_body[0])
+        assert atlas.map_of(Key("ann", 5)) == "ann/0"
+
+
+def test_correction_brings_odometry_into_the_map(ann: Walker, bob: Walker) -> None:
+    atlas = atlas_of(ann, bob)
+    rng = np.random.default_rng(0)
+    for x in near_loops(ann, bob, rng):
+        atlas.propose(x)
+    (applied,) = settle(atlas)
+    correction = applied.corrections["bob"]
+    last = Key("bob", 59)
+    assert correction.T_map_odom @ bob.T_odom_body[-1] == pytest.approx(atlas.pose(last), abs=1e-9)
+    assert correction.T_map_odom == pytest.approx(atlas.T_map_odom("bob"))
+    assert (correction.map_id, correction.revision, correction.answers) == ("ann/0", 1, 56)
+    assert applied.corrections["ann"].answers == -1
+    # what is uncertain is where bob is, to a few centimetres, not the far-off origin of his odometry
+    cov = se3.inverse_cov(se3.inverse(bob.T_odom_body[-1]), correction.cov)
+    assert 0.001 < np.sqrt(np.trace(cov[3:, 3:])) < 0.2
+
+
+def test_correction_covariance_is_not_too_small() -> None:
+    """NEES of the joined agent's newest pose in the founder's frame. The atlas believes odometry twice
+    as uncertain as it is here, so that the mean lies below 6; it must not lie above."""
+    nees = []
+    for seed in range(25):
+        a, b = Walker("a", 2 * seed, 30), Walker("b", 2 * seed + 1, 30, phase=0.3)
+        atlas = atlas_of(a, b)
+        for x in near_loops(a, b, np.random.default_rng(seed)):
+            atlas.propose(x)
+        applied = settle(atlas)[-1]
+        c = applied.corrections["b"]
+        true_T = a.T_odom_body[0] @ se3.inverse(a.truth[0]) @ b.truth[-1]
+        cov = se3.inverse_cov(se3.inverse(b.T_odom_body[-1]), c.cov)
+        xi = se3.log(se3.inverse(c.T_map_odom @ b.T_odom_body[-1]) @ true_T)
+        nees.append(xi @ np.linalg.solve(cov, xi))
+    assert 0.8 < np.mean(nees) < 7.2
+
+
+def test_a_wrong_loop_never_joins(ann: Walker, bob: Walker) -> None:
+    atlas = atlas_of(ann, bob)
+    rng = np.random.default_rng(0)
+    for i in range(6):
+        turned = se3.exp(rng.normal(0, [0.4] * 3 + [1.0] * 3))
+        decision = atlas.propose(loop(ann, 5 * i, bob, 7 * i, rng, turned))
+        assert not decision.accepted
+    assert "none of 5 witnesses agrees" in decision.reason
+    good = near_loops(ann, bob, rng)
+    assert not atlas.propose(good[0]).accepted
+    assert atlas.propose(good[1]).accepted
+    settle(atlas)
+    assert len(atlas.loops) == 2
+    assert len(atlas.pending) == 6
+
+
+def test_one_keyframe_is_no_second_witness(ann: Walker, bob: Walker) -> None:
+    atlas = atlas_of(ann, bob)
+    rng = np.random.default_rng(0)
+    assert not atlas.propose(loop(ann, 10, bob, 5, rng)).accepted
+    assert not atlas.propose(loop(ann, 11, bob, 5, rng)).accepted
+    assert not atlas.propose(loop(ann, 12, bob, 5, rng)).accepted
+    assert atlas.propose(loop(ann, 12, bob, 7, rng)).accepted
+
+
+def test_very_many_inliers_join_alone_where_the_config_says_so(ann: Walker, bob: Walker) -> None:
+    x = loop(ann, 10, bob, 5, np.random.default_rng(0))
+    for least, joined in ((80, True), (81, False), (0, False)):
+        atlas = atlas_of(ann, bob, config=replace(CONFIG, sole_witness_inliers=least))
+        assert atlas.propose(x).accepted == joined
+
+
+def test_in_a_map_a_wrong_loop_contradicts_it(ann: Walker) -> None:
+    atlas = atlas_of(ann)
+    rng = np.random.default_rng(0)
+    right = near_loops(ann, ann, rng)[0]
+    wrong = Loop(right.a, right.b, right.T_a_b @ se3.exp(np.array([0, 0, 1.5, 3, 0, 0])), right.cov, 80)
+    decision = atlas.propose(wrong)
+    assert not decision.accepted
+    assert "contradicts the map" in decision.reason
+    assert atlas.propose(right).accepted
+    assert "joined already" in atlas.propose(right.reverse()).reason
+
+
+def test_neighbours_are_odometrys_business(ann: Walker) -> None:
+    atlas = atlas_of(ann)
+    rng = np.random.default_rng(0)
+    assert "neighbours by odometry" in atlas.propose(loop(ann, 20, ann, 29, rng)).reason
+    assert atlas.propose(loop(ann, 20, ann, 30, rng)).accepted
+
+
+def test_drift_beyond_what_odometry_admits_needs_two_witnesses() -> None:
+    ann = Walker("ann", 3, breaks=())
+    bent = [
+        replace(k, T_ref_body=k.T_ref_body @ se3.exp(np.array([0, 0, 0.08, 0, 0, 0]))) if k.id == 25 else k
+        for k in ann.keyframes
+    ]
+    ann.keyframes = bent
+    atlas = atlas_of(ann)
+    rng = np.random.default_rng(0)
+    across = [x for x in near_loops(ann, ann, rng, every=2) if x.a.id < 20 and x.b.id > 30]
+    first, *others = (atlas.propose(x) for x in across)
+    assert "fits the map badly" in first.reason
+    assert not first.accepted
+    assert any(d.accepted for d in others)
+    drifted = error(poses(atlas, ann), ann.truth)
+    settle(atlas)
+    assert error(poses(atlas, ann), ann.truth) < 0.5 * drifted
+
+
+def test_order_of_arrival_does_not_matter(ann: Walker, bob: Walker) -> None:
+    rng = np.random.default_rng(0)
+    loops = near_loops(ann, bob, rng) + near_loops(bob, bob, rng) + near_loops(ann, ann, rng)
+    results = []
+    for seed in range(4):
+        atlas = atlas_of(ann, bob)
+        for i in np.random.default_rng(seed).permutation(len(loops)):
+            atlas.propose(loops[i])
+        settle(atlas)
+        settle(atlas)
+        assert atlas.maps().keys() == {"ann/0"}
+        assert len(atlas.loops) == len(loops)
+        results.append(poses(atlas, ann, bob))
+    for other in results[1:]:
+        assert np.abs(other - results[0]).max() < 2e-3
+
+
+def test_three_agents_find_together(ann: Walker, bob: Walker) -> None:
+    cyd = Walker("cyd", 5, phase=1.4)
+    atlas = atlas_of(ann, bob, cyd)
+    rng = np.random.default_rng(0)
+    for x in near_loops(bob, cyd, rng):
+        atlas.propose(x)
+    settle(atlas)
+    assert atlas.maps().keys() == {"ann/0", "bob/0"}
+    for x in near_loops(ann, bob, rng):
+        atlas.propose(x)
+    applied = settle(atlas)[-1]
+    assert atlas.maps().keys() == {"ann/0"}
+    assert applied.corrections["cyd"].revision == 2
+    assert applied.corrections["cyd"].map_id == "ann/0"
+    assert error(poses(atlas, ann, bob, cyd), truth(ann, bob, cyd)) < 0.08
+
+
+def test_a_new_stretch_is_a_map_of_its_own_and_rejoins() -> None:
+    ann = Walker("ann", 1, breaks=(40,))
+    atlas = atlas_of(ann)
+    assert {name: len(keys) for name, keys in atlas.maps().items()} == {"ann/0": 40, "ann/1": 20}
+    rng = np.random.default_rng(0)
+    for x in (y for y in near_loops(ann, ann, rng) if y.b.id >= 40):
+        atlas.propose(x)
+    (applied,) = settle(atlas)
+    assert atlas.maps().keys() == {"ann/0"}
+    assert applied.corrections.keys() == {"ann"}
+    expected = atlas.pose(Key("ann", 59))
+    assert applied.corrections["ann"].T_map_odom @ ann.T_odom_body[-1] == pytest.approx(expected, abs=1e-9)
+    assert error(poses(atlas, ann), ann.truth) < 0.06
+
+
+def test_keyframes_that_came_while_solving_follow(ann: Walker, bob: Walker) -> None:
+    rng = np.random.default_rng(0)
+    late = 45
+    atlas = Atlas(CONFIG)
+    for w in (ann, bob):
+        for k in w.keyframes[:late]:
+            atlas.add_keyframe(w.name, k)
+    for x in near_loops(ann, bob, rng):
+        if x.a.id < late and x.b.id < late:
+            atlas.propose(x)
+    result = run_job(atlas.snapshot("ann/0"), GRAPH)
+    for k in bob.keyframes[late:]:
+        atlas.add_keyframe("bob", k)
+    applied = atlas.apply(result)
+    rigid = se3.inverse(bob.T_odom_body[late - 1]) @ bob.T_odom_body[-1]
+    assert se3.inverse(atlas.pose(Key("bob", late - 1))) @ atlas.pose(Key("bob", 59)) == pytest.approx(
+        rigid, abs=1e-9
+    )
+    assert applied.corrections["bob"].T_map_odom == pytest.approx(atlas.T_map_odom("bob"), abs=1e-9)
+
+
+def test_a_solution_of_a_map_that_was_joined_meanwhile_is_left_aside(ann: Walker, bob: Walker) -> None:
+    atlas = atlas_of(ann, bob)
+    rng = np.random.default_rng(0)
+    for x in near_loops(bob, bob, rng):
+        atlas.propose(x)
+    result = run_job(atlas.snapshot("bob/0"), GRAPH)
+    for x in near_loops(ann, bob, rng):
+        atlas.propose(x)
+    before = poses(atlas, ann, bob)
+    applied = atlas.apply(result)
+    assert applied.corrections == {}
+    assert "joined or split" in applied.reason
+    assert np.array_equal(poses(atlas, ann, bob), before)
+    assert atlas.due() == ["ann/0"]
+    assert settle(atlas)[0].corrections.keys() == {"ann", "bob"}
+
+
+def test_after_a_false_join_the_true_loops_say_so(ann: Walker, bob: Walker) -> None:
+    """Two false loops that tell one story do join the maps: no geometry can tell. What comes later
+    is refused by name, so that the log shows it."""
+    atlas = atlas_of(ann, bob)
+    rng = np.random.default_rng(0)
+    T_odd = se3.exp(np.array([0, 0, 1.0, 2.0, 1.0, 0.0]))
+    false = []
+    for i, j in ((10, 5), (14, 9)):
+        T = se3.inverse(ann.truth[i]) @ T_odd @ bob.truth[j]
+        false.append(Loop(Key("ann", i), Key("bob", j), T, loop(ann, i, bob, j, rng).cov, 80))
+    assert not atlas.propose(false[0]).accepted
+    assert atlas.propose(false[1]).accepted
+    settle(atlas)
+    decisions = [atlas.propose(x) for x in near_loops(ann, bob, rng)]
+    assert not any(d.accepted for d in decisions)
+    assert all("contradicts the map" in d.reason for d in decisions)
+
+
+def test_snapshot_is_untouched_by_what_comes_after(ann: Walker, bob: Walker) -> None:
+    atlas = atlas_of(ann, bob)
+    rng = np.random.default_rng(0)
+    loops = near_loops(ann, bob, rng)
+    for x in loops[:3]:
+        atlas.propose(x)
+    job = atlas.snapshot("ann/0")
+    first = run_job(job, GRAPH)
+    for x in loops[3:]:
+        atlas.propose(x)
+    settle(atlas)
+    assert run_job(job, GRAPH).solved.poses.tobytes() == first.solved.poses.tobytes()
+
+
+def test_what_cannot_be_is_refused_by_name(ann: Walker) -> None:
+    atlas = atlas_of(ann)
+    with pytest.raises(ValueError, match="ann:3 was added before"):
+        atlas.add_keyframe("ann", ann.keyframes[3])
+    with pytest.raises(ValueError, match="keyframe zoe:3 is not known"):
+        atlas.add_keyframe("zoe", ann.keyframes[4])
+    with pytest.raises(ValueError, match="keyframe ann:99 is not known"):
+        atlas.propose(Loop(Key("ann", 1), Key("ann", 99), np.eye(4), np.eye(6), 50))
+    with pytest.raises(ValueError, match="there is no map"):
+        atlas.snapshot("zoe/0")
+
+
+def test_a_loop_that_the_solved_map_speaks_against_is_dropped(ann: Walker, bob: Walker) -> None:
+    atlas = atlas_of(ann, bob, config=replace(CONFIG, agree_chi2=1e9, surprise_chi2=1e9))
+    rng = np.random.default_rng(0)
+    for x in near_loops(ann, bob, rng):
+        atlas.propose(x)
+    wrong = loop(ann, 30, bob, 8, rng, WRONG)
+    assert atlas.propose(wrong).accepted
+    reasons = [applied.reason for applied in settle(atlas)]
+    assert "dropped loops at odds with it: ann:30 - bob:8" in reasons[0]
+    assert wrong not in atlas.loops
+    assert error(poses(atlas, ann, bob), truth(ann, bob)) < 0.06
+
+
+def test_without_its_loops_a_join_is_undone(ann: Walker, bob: Walker) -> None:
+    """As if the solver had found every loop between the two at odds with the map."""
+    atlas = atlas_of(ann, bob)
+    rng = np.random.default_rng(0)
+    for x in near_loops(ann, bob, rng):
+        atlas.propose(x)
+    result = run_job(atlas.snapshot("ann/0"), GRAPH)
+    against = replace(result.solved, loop_chi2=np.full_like(result.solved.loop_chi2, 1e6))
+    applied = atlas.apply(replace(result, solved=against))
+    assert atlas.maps().keys() == {"ann/0", "bob/0"}
+    assert applied.corrections["bob"].map_id == "bob/0"
+    assert np.abs(atlas.pose(Key("bob", 0)) - bob.T_odom_body[0]).max() < 1e-9
+    assert atlas.due() == ["ann/0", "bob/0"]
+    settle(atlas)
+    assert not atlas.propose(near_loops(ann, bob, rng)[0]).accepted
