@@ -14,7 +14,7 @@ from share.errors import UsageError
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise
 from share.io import ros_rig
-from share.io.files import atomic_write, check_writable, writable_dir
+from share.io.files import atomic_write, check_writable, writable_dir, writing
 from share.io.images import EncodedImage, encode_png, image_format
 from share.io.recorder import Recorder
 from share.io.recording import Source
@@ -51,9 +51,10 @@ def to_euroc(source: Source, out: Path, progress: Progress) -> None:
     writable_dir(out.parent)
     work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
     try:
-        _write_asl(source, work / "mav0", progress)
-        work.chmod(0o755)
-        work.replace(out)
+        with writing(out):
+            _write_asl(source, work / "mav0", progress)
+            work.chmod(0o755)
+            work.replace(out)
     finally:
         shutil.rmtree(work, ignore_errors=True)
 

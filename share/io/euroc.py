@@ -45,8 +45,11 @@ def open_euroc(path: Path, calibration: Calibration | None, frames: slice | None
 
 def fit(rig: Rig, root: Path) -> Rig:
     """The rig, less the IMU where the folder has none. ConfigError if it wants a camera that is missing."""
-    if rig.cam1 and not (root / CAM1).is_dir():
-        raise ConfigError(f"{root}: the calibration has cam1, the recording has not; give another --calib")
+    missing = "cam1" if rig.cam1 and not (root / CAM1).is_dir() else "depth" if rig.depth else ""
+    if missing:
+        raise ConfigError(
+            f"{root}: the calibration has {missing}, the recording has not; give another --calib"
+        )
     if rig.imu and not (root / "imu0").is_dir():
         return replace(rig, imu=None, T_body_cam0=np.eye(4))
     return rig

@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
-from share.errors import UsageError
+from share.errors import ShareError, UsageError
 
 
 def atomic_write(path: Path, data: bytes | str) -> None:
@@ -33,6 +34,15 @@ def atomic_write(path: Path, data: bytes | str) -> None:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(name)
     sync_folder(path.parent)
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Says a full disk and its like in one line: OSError inside becomes a ShareError that names `path`."""
+    try:
+        yield
+    except OSError as error:
+        raise ShareError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
 def sync_folder(folder: Path) -> None:

@@ -7,6 +7,7 @@ crash leaves in the `.part`, `share.io.recover` brings back.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
 from types import TracebackType
@@ -19,7 +20,7 @@ from share.errors import DataError, UsageError
 from share.geometry.camera import Rig
 from share.io import ros_images, ros_rig
 from share.io import ros_types as ros
-from share.io.files import check_writable, sync_folder
+from share.io.files import check_writable, sync_folder, writing
 from share.io.images import EncodedImage, encode_jpeg
 from share.types import F64
 
@@ -59,32 +60,37 @@ class Recorder:
         self._flushed_ns: int | None = None
 
     def write(self, measurement: Measurement) -> None:
-        """Append one measurement. Raises DataError for a stamp before 1970 or after 2038."""
+        """Append one measurement. Raises DataError for a stamp before 1970 or after 2038, ShareError if
+        the disk is full."""
         stamp = measurement.stamp_ns
         if not 0 <= stamp < 2**31 * 10**9:
             raise DataError(f"{self.path}: stamp {stamp} ns does not fit a ROS 2 message")
-        if self._flushed_ns is None:
-            self._write_rig(stamp)
-        if measurement.stream == IMU:
-            self._put(ros.TOPICS[IMU], _imu(stamp, measurement.payload), stamp)
-        else:
-            self._image(measurement.stream, stamp, measurement.payload)
-        if self._flushed_ns is None or stamp - self._flushed_ns >= _FLUSH_NS:
-            self._flush(stamp)
+        with writing(self.path):
+            if self._flushed_ns is None:
+                self._write_rig(stamp)
+            if measurement.stream == IMU:
+                self._put(ros.TOPICS[IMU], _imu(stamp, measurement.payload), stamp)
+            else:
+                self._image(measurement.stream, stamp, measurement.payload)
+            if self._flushed_ns is None or stamp - self._flushed_ns >= _FLUSH_NS:
+                self._flush(stamp)
 
     def close(self) -> None:
         """Finish the file and give it its name."""
-        self._writer.finish()
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        self._file.close()
-        os.replace(self.part, self.path)
+        with writing(self.path):
+            self._writer.finish()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            os.replace(self.part, self.path)
         sync_folder(self.path.parent)
 
     def abort(self) -> None:
         """Stop here; the `.part` stays, with all that was written."""
-        self._writer.flush()
-        self._file.close()
+        with contextlib.suppress(OSError):  # a full disk has been told already
+            self._writer.flush()
+        with contextlib.suppress(OSError):
+            self._file.close()
 
     def __enter__(self) -> Recorder:
         return self

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 from share.errors import DataError, UsageError
-from share.io.files import check_writable, sync_folder
+from share.io.files import check_writable, sync_folder, writing
 from share.io.mcap_file import MAGIC, damage
 
 
@@ -35,7 +35,8 @@ def recover(path: Path, out: Path, progress: Callable[[int], None] = lambda _: N
     if part.exists() and part.samefile(path):
         part = out.with_name(out.name + ".recovering")
     try:
-        result = _copy(path, part, progress)
+        with writing(out):
+            result = _copy(path, part, progress)
         if not result.messages:
             raise DataError(f"{path}: holds no complete message ({result.reason or 'it is empty'})")
         os.replace(part, out)

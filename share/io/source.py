@@ -66,6 +66,8 @@ def open_source(spec: str, calib: str | None = None, frames: slice | None = None
         if reader.knows(path):
             return reader.open(path, calibration, frames)
     _existing(path, "SOURCE")
+    if path.name.endswith(".mcap.part"):
+        raise UsageError(f"{path}: was not closed; `share dataset recover {path} --out {path.stem}` saves it")
     known = "; ".join(reader.what for reader in READERS)
     raise UsageError(f"{spec}: is none of the recordings that SHARE reads: {known}")
 

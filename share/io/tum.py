@@ -41,6 +41,8 @@ def open_tum(path: Path, calibration: Calibration | None, frames: slice | None) 
     rig, scale = calibration.rig, calibration.depth_scale
     if rig.depth is None:
         raise ConfigError(f"{calibration.where}: has no depth camera, but {path} is an RGB-D recording")
+    if rig.cam1:
+        raise ConfigError(f"{path}: the calibration has cam1, the recording has not; give another --calib")
     depth = rig.depth
     rig = Rig(cam0=rig.cam0, T_body_cam0=np.eye(4), depth=depth, T_depth_cam0=rig.T_depth_cam0)
     pairs, note = _pairs(path)

@@ -93,6 +93,16 @@ def test_damage_leaves_nothing_half_written(tmp_path):
     assert os.listdir(out) == []
 
 
+def test_a_full_disk_is_one_line_and_leaves_nothing(walk, tmp_path):
+    out = tmp_path / "out"
+    program = "from share.cli.main import main; main()"
+    limited = 'ulimit -f 16; exec "$@"'  # blocks of 1 kB
+    command = ["bash", "-c", limited, "-", sys.executable, "-c", program, "dataset", "convert", str(walk)]
+    done = subprocess.run([*command, "--out", str(out / "x.mcap")], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (1, f"share: {out}/x.mcap: cannot be written: File too large\n")
+    assert os.listdir(out) == []
+
+
 @pytest.mark.parametrize("command", ["info", "convert", "recover"])
 def test_help_has_an_example(command):
     assert f"Example:  share dataset {command} " in good(command, "--help")

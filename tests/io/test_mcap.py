@@ -2,38 +2,25 @@
 killed recorder's file can be recovered."""
 
 import os
-import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from live import CAMERA, RIG, frames, live
 from recordings import HEIGHT, STEP_NS, WIDTH, depth_mm, make_euroc, make_tum, picture
 
-from share.config import SequencerConfig
 from share.core.measurement import Measurement
-from share.core.sequencer import SequencerCounters, sequence, streams_of
 from share.errors import ConfigError, DataError, UsageError
 from share.geometry import se3
-from share.geometry.camera import Camera, ImuNoise, Rig
+from share.geometry.camera import Camera, Rig
 from share.io import ros_rig
 from share.io import ros_types as ros
 from share.io.convert import to_euroc, to_mcap
-from share.io.images import ArrayImage, load
+from share.io.images import ArrayImage
 from share.io.recorder import Recorder
-from share.io.recover import recover
 from share.io.source import open_source
-
-
-def frames(source):
-    counters = SequencerCounters()
-    bundles = sequence(
-        source.measurements(), streams_of(source.rig), source.rate_hz, SequencerConfig(), counters
-    )
-    return [load(bundle) for bundle in bundles]
 
 
 def assert_same(a, b):
@@ -122,26 +109,6 @@ def test_rosbags_reads_it_as_ros_2(folder, tmp_path):
         assert depth.format == "16UC1; compressedDepth png"
         image = cv2.imdecode(depth.data[12:], cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(image, depth_mm(0))
-
-
-CAMERA = Camera(WIDTH, HEIGHT, 50.0, 51.0, 31.5, 23.5, (-0.1, 0.02, 0.001, -0.001))
-RIG = Rig(
-    cam0=CAMERA,
-    T_body_cam0=se3.exp(np.array([0.1, 0.2, -0.3, 0.01, 0.02, 0.03])),
-    depth=Camera(WIDTH, HEIGHT, 60.0, 60.0, 32.0, 24.0),
-    T_depth_cam0=se3.exp(np.array([0.0, 0.01, 0.0, 0.02, 0.0, 0.0])),
-    imu=ImuNoise(1e-4, 2e-3, 2e-5, 3e-3, 200.0),
-)
-
-
-def live(frames: int, depth_scale: float = 1000.0):
-    """What a camera gives: arrays, and IMU samples between them."""
-    for i in range(frames):
-        stamp = 10**9 + i * STEP_NS
-        for k in range(10):
-            yield Measurement("imu", stamp - STEP_NS + (k + 1) * STEP_NS // 10, (0.1, k, 0.0, 0.0, 0.0, 9.8))
-        yield Measurement("cam0", stamp, ArrayImage(picture(i)))
-        yield Measurement("depth", stamp, ArrayImage(depth_mm(i) / np.float32(depth_scale)))
 
 
 @pytest.mark.parametrize(("scale", "encoding"), [(1000.0, "16UC1"), (5000.0, "32FC1")])
@@ -306,100 +273,6 @@ def test_foreign_recordings_that_do_not_say_enough(tmp_path):
     }
     with pytest.raises(DataError, match="cut short: 9 of"):
         frames(open_source(str(write_foreign(tmp_path / "d.mcap", short, TF))))
-
-
-# ---------------------------------------------------------------- damage
-
-
-def test_no_mcap_and_empty(tmp_path):
-    for content in (b"", b"hello, this is no recording"):
-        (tmp_path / "x.mcap").write_bytes(content)
-        with pytest.raises(DataError, match="is not an MCAP file, or is empty"):
-            open_source(str(tmp_path / "x.mcap"))
-        with pytest.raises(DataError, match="is not an MCAP file, or is empty"):
-            recover(tmp_path / "x.mcap", tmp_path / "y.mcap")
-    assert not (tmp_path / "y.mcap").exists()
-
-
-def record(path: Path, count: int) -> Path:
-    with Recorder(path, RIG) as recorder:
-        for m in live(count):
-            recorder.write(m)
-    return path
-
-
-def test_any_cut_is_refused_and_recovered(tmp_path):
-    """Cut anywhere: open says `recover`; recover saves a beginning of what was there, unaltered."""
-    data = record(tmp_path / "whole.mcap", 200).read_bytes()
-    whole = [(m.stream, m.stamp_ns) for m in open_source(str(tmp_path / "whole.mcap")).measurements()]
-    saved_before = 0
-    for part in (0.2, 0.4, 0.6, 0.8):
-        cut, good = tmp_path / "cut.mcap", tmp_path / f"good{part}.mcap"
-        cut.write_bytes(data[: int(len(data) * part)])
-        with pytest.raises(DataError, match=r"share dataset recover"):
-            open_source(str(cut))
-        result = recover(cut, good)
-        back = [(m.stream, m.stamp_ns) for m in open_source(str(good)).measurements()]
-        assert back == whole[: len(back)]
-        assert len(back) > saved_before
-        assert len(back) == sum(n for t, n in result.messages.items() if "info" not in t and "tf" not in t)
-        saved_before = len(back)
-    assert result.lost_bytes < 400_000
-    (tmp_path / "nothing.mcap").write_bytes(data[:60])
-    with pytest.raises(DataError, match="holds no complete message"):
-        recover(tmp_path / "nothing.mcap", tmp_path / "no.mcap")
-    assert not list(tmp_path.glob("no.mcap*"))
-
-
-def test_a_flipped_bit_costs_one_chunk(tmp_path):
-    path = record(tmp_path / "whole.mcap", 100)
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0xFF
-    broken = tmp_path / "broken.mcap"
-    broken.write_bytes(data)
-    with pytest.raises(DataError, match="recover"):
-        list(open_source(str(broken)).measurements())
-    result = recover(broken, tmp_path / "good.mcap")
-    assert result.reason
-    left = open_source(str(tmp_path / "good.mcap")).images_count
-    assert 60 < left < 100
-
-
-def test_sigkill_leaves_a_file_that_can_be_recovered(tmp_path):
-    """A real recorder in a real process, killed in mid-run: at most the last second is missing."""
-    out = tmp_path / "walk.mcap"
-    code = (
-        "import sys, time; sys.path[:0] = sys.argv[2:]\n"
-        "from pathlib import Path; from test_mcap import RIG, live; from share.io.recorder import Recorder\n"
-        "with Recorder(Path(sys.argv[1]), RIG) as recorder:\n"
-        "    for m in live(10**6):\n"
-        "        recorder.write(m)\n"
-        "        if m.stream == 'depth': print(m.stamp_ns, flush=True); time.sleep(0.001)\n"
-    )
-    folders = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, str(out), *folders], stdout=subprocess.PIPE, text=True
-    )
-    for _ in range(150):
-        last = int(process.stdout.readline())
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    process.stdout.close()
-    assert os.listdir(tmp_path) == ["walk.mcap.part"]
-    recover(tmp_path / "walk.mcap.part", out)
-    stamps = open_source(str(out)).stamps()["cam0"]
-    assert last - stamps[-1] <= 10**9 + STEP_NS
-    assert len(frames(open_source(str(out)))) >= 125
-
-
-def test_an_error_while_converting_leaves_nothing(tmp_path):
-    folder = make_tum(tmp_path / "walk")
-    image = folder / "rgb" / "3.jpg"
-    image.write_bytes(image.read_bytes()[:-100])
-    out = tmp_path / "out"
-    with pytest.raises(DataError, match=r"3\.jpg: the image is cut short"):
-        to_mcap(open_source(str(folder)), out / "x.mcap", None, nothing)
-    assert os.listdir(out) == []
 
 
 def test_memory_does_not_grow_with_the_file(tmp_path):

@@ -5,22 +5,12 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from live import frames
 from recordings import HEIGHT, START_NS, STEP_NS, WIDTH, depth_mm, make_euroc, make_tum
 
-from share.config import SequencerConfig
-from share.core.sequencer import SequencerCounters, sequence, streams_of
 from share.errors import ConfigError, DataError, ShareError, UsageError
 from share.geometry import se3
-from share.io.images import load
 from share.io.source import open_source
-
-
-def frames(source):
-    counters = SequencerCounters()
-    bundles = sequence(
-        source.measurements(), streams_of(source.rig), source.rate_hz, SequencerConfig(), counters
-    )
-    return [load(bundle) for bundle in bundles]
 
 
 @pytest.fixture
