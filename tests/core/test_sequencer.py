@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from share.config import SequencerConfig
@@ -83,6 +83,8 @@ def test_any_bounded_shuffle_gives_the_same_frames(delay, frames, skew):
 
 @settings(max_examples=60, deadline=None)
 @given(st.fixed_dictionaries({s: st.integers(0, 95 * MS) for s in STEREO_IMU}), st.integers(2, 12))
+@example({"cam0": 0, "cam1": 0, "imu": 95 * MS}, 5)
+@example({"cam0": 95 * MS, "cam1": 0, "imu": 0}, 5)
 def test_streams_out_of_step_give_the_same_frames_without_reordering(lag, frames):
     """The default serves a live camera: each stream in order, but not in step with the others."""
     ordered = recording(frames, 10**12)
@@ -129,6 +131,12 @@ def test_duplicates_and_steps_back_are_dropped_and_counted():
     bundles, counters = run(late)
     assert plain(bundles) == plain(run(ordered)[0])
     assert counters.backward == 3
+    swapped = [*ordered[:60], ordered[61], ordered[60], *ordered[62:]]  # two IMU samples of one frame
+    assert [m.stream for m in swapped[60:62]] == ["imu", "imu"]
+    assert run(swapped)[1].backward == 1
+    bundles, counters = run(swapped, config=replace(CONFIG, reorder_ms=10.0))
+    assert plain(bundles) == plain(run(ordered)[0])
+    assert counters.backward == 0
 
 
 def test_a_missing_partner_drops_the_frame():
@@ -182,7 +190,7 @@ def test_gaps_are_marked():
     assert run(ordered, rate=0.0)[1].gaps == 0  # without a rate there is no gap
 
 
-@pytest.mark.parametrize("lag", [0, 40 * MS])
+@pytest.mark.parametrize("lag", [0, 40 * MS, 80 * MS])
 def test_the_wrap_of_the_d4xx_clock_is_unwrapped(lag):
     """As if the counter had more bits, also with the IMU ahead of the cameras by `lag`."""
     ordered = recording(40, WRAP_NS - 10 * STEP)

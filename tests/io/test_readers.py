@@ -51,6 +51,10 @@ def test_body_is_the_imu_and_the_truth_follows(euroc):
     np.testing.assert_allclose(after.rig.T_body_cam0, se3.inverse(T), atol=1e-12)
     for a, b in zip(truth.T, after.truth().T, strict=True):
         np.testing.assert_allclose(a @ before.rig.T_body_cam0, b @ after.rig.T_body_cam0, atol=1e-12)
+    (euroc / "mav0" / "state_groundtruth_estimate0" / "sensor.yaml").write_text(file.read_text())
+    same_mount = after.truth().T  # the truth's sensor sits where the IMU sits: the table tells of the IMU
+    np.testing.assert_allclose(same_mount[:, :3, 3], [[0.1 * i, 0, 1] for i in range(6)], atol=1e-12)
+    np.testing.assert_allclose(same_mount[:, :3, :3], [np.eye(3)] * 6, atol=1e-12)
 
 
 def test_without_imu_the_body_is_cam0(euroc):
