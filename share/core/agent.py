@@ -44,7 +44,7 @@ class Agent:
         self._map = MapFrame(config.agent)
         self._clock = ClockFilter(config.clock)
         self._hello_timer, self._ping_timer = Every(link.hello_s), Every(link.ping_s)
-        self._waiting: ev.FrameTracked | None = None  # its candidate waits for a token
+        self._waiting: ev.KeyframeMade | None = None  # waits for a token
         self._T_odom_body: F64 | None = None
         self._connected = False
         self._session: int | None = None
@@ -69,6 +69,8 @@ class Agent:
         match event:
             case ev.FrameTracked():
                 self._frame_tracked(event, now_ns)
+            case ev.KeyframeMade():
+                self._offer(event)
             case ev.Received():
                 self._received(event, now_ns)
             case ev.Finished():
@@ -97,22 +99,21 @@ class Agent:
     # ------------------------------------------------------------ frames
 
     def _frame_tracked(self, frame: ev.FrameTracked, now_ns: int) -> None:
-        if frame.candidate is not None and frame.candidate.new_stretch:
+        if frame.new_stretch:
+            self._drop_waiting()
+            self._chain.break_off()
             self._map.forget()
-        if frame.candidate is not None:
-            self._offer(frame)
         if frame.T_odom_body is not None and frame.state.has_pose:
             self._localised(frame, frame.T_odom_body, now_ns)
-        if frame.candidate is None:
+        if not frame.keyframe:
             self._frame_done(frame, sent=False)
 
-    def _offer(self, frame: ev.FrameTracked) -> None:
+    def _offer(self, made: ev.KeyframeMade) -> None:
         """Queues a candidate for a token; the one that has waited so far is dropped (drop_rate)."""
-        assert frame.candidate is not None
         self._counts["candidates"] += 1
         self._drop_waiting()
-        self._chain.extend(frame.candidate)
-        self._waiting = frame
+        self._chain.extend(made.candidate)
+        self._waiting = made
 
     def _localised(self, frame: ev.FrameTracked, T_odom_body: F64, now_ns: int) -> None:
         self._T_odom_body = T_odom_body
@@ -134,12 +135,12 @@ class Agent:
 
     def _spend(self, now_ns: int) -> None:
         """Makes a keyframe of the waiting candidate if the rate allows."""
-        frame = self._waiting
-        if frame is None or frame.candidate is None or not self._bucket.take(now_ns):
+        if self._waiting is None or not self._bucket.take(now_ns):
             return
+        frame, candidate = self._waiting.frame, self._waiting.candidate
         self._waiting = None
-        keyframe = self._chain.keyframe(frame.candidate, frame.stamp_ns)
-        self._ledger.add(Entry(keyframe, frame.candidate.T_odom_body, frame.index, frame.arrived_ns))
+        keyframe = self._chain.keyframe(candidate, frame.stamp_ns)
+        self._ledger.add(Entry(keyframe, candidate.T_odom_body, frame.index, frame.arrived_ns))
         self._frame_done(frame, sent=True)
         if self._connected and self._clock.rtt_ms is not None:
             delay_ms = self._clock.rtt_ms + max(0.0, frame.track_ms)
@@ -148,13 +149,11 @@ class Agent:
     def _drop_waiting(self) -> None:
         if self._waiting is not None:
             self._counts["drop_rate"] += 1
-            self._frame_done(self._waiting, sent=False)
+            self._frame_done(self._waiting.frame, sent=False)
             self._waiting = None
 
     def _frame_done(self, frame: ev.FrameTracked, sent: bool) -> None:
-        self._effects.append(
-            ev.FrameDone(frame.stamp_ns, frame.track_ms, frame.state, frame.candidate is not None, sent)
-        )
+        self._effects.append(ev.FrameDone(frame.stamp_ns, frame.track_ms, frame.state, frame.keyframe, sent))
 
     # ------------------------------------------------------------ what the edge says
 

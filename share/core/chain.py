@@ -18,12 +18,17 @@ class Chain:
         self._T_odom_candidate: F64 | None = None
         self._cov: F64 = np.zeros((6, 6))  # of the motion since the last keyframe
 
+    def break_off(self) -> None:
+        """Odometry broke: what comes now is of another stretch."""
+        self.first_of_stretch = self.next_id
+        self._T_odom_keyframe = self._T_odom_candidate = None
+
     def extend(self, candidate: Candidate) -> None:
         """Takes note of a candidate's motion, whether or not it will be sent."""
-        if candidate.new_stretch or self._T_odom_candidate is None:
-            self._T_odom_keyframe = None
+        if candidate.new_stretch:
+            self.break_off()
+        if self._T_odom_candidate is None:
             self._cov = candidate.cov
-            self.first_of_stretch = self.next_id
         else:
             T_step = inverse(self._T_odom_candidate) @ candidate.T_odom_body
             self._cov = compose_cov(T_step, self._cov, candidate.cov)

@@ -15,10 +15,11 @@ from share.wire.codec import Bytes
 
 @dataclass(frozen=True, eq=False)
 class FrameTracked:
-    """The tracker is done with a frame. T_odom_body (4, 4) where the state has a pose.
+    """The tracker has a frame's pose. T_odom_body (4, 4) where the state has one.
 
-    arrived_ns, done_ns: when the frame came in and its pose was known. error_cm: expected position
-    error, where somebody estimates it.
+    arrived_ns, done_ns: when the frame came in and its pose was known. keyframe: it became one, and
+    `KeyframeMade` follows; new_stretch: odometry broke before it. error_cm: expected position error,
+    where somebody estimates it.
     """
 
     index: int
@@ -27,12 +28,21 @@ class FrameTracked:
     done_ns: int
     state: TrackState
     T_odom_body: F64 | None = None
-    candidate: Candidate | None = None
+    keyframe: bool = False
+    new_stretch: bool = False
     error_cm: float | None = None
 
     @property
     def track_ms(self) -> float:
         return (self.done_ns - self.arrived_ns) / 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeMade:
+    """What a tracked frame shows to others: made after its pose was out."""
+
+    frame: FrameTracked
+    candidate: Candidate
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +62,7 @@ class Finished:
     """No frame will follow."""
 
 
-AgentEvent = FrameTracked | Received | Tick | Finished
+AgentEvent = FrameTracked | KeyframeMade | Received | Tick | Finished
 
 # ---------------------------------------------------------------- effects
 

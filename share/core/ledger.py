@@ -117,7 +117,9 @@ class Ledger:
         return self.open
 
     def _is_due(self, entry: Entry, now_ns: int) -> bool:
-        return entry.keyframe.id not in self._held and (entry.due_ns is None or entry.due_ns <= now_ns)
+        if entry.keyframe.id in self._held and entry.keyframe.id != next(iter(self._open)):
+            return False  # the oldest open one is never safe there: what it waits for may be dropped here
+        return entry.due_ns is None or entry.due_ns <= now_ns
 
     def _retry(self) -> None:
         self._held = frozenset()
@@ -134,6 +136,7 @@ class Ledger:
         heir = next(iter(self._open.values()), None)
         if heir:
             heir.keyframe = _inherit(heir.keyframe, dropped)
+            heir.due_ns = None
 
 
 def _inherit(keyframe: Keyframe, dropped: Keyframe) -> Keyframe:

@@ -31,6 +31,7 @@ class Worker:
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:
             began = time.perf_counter()
+            result: object
             try:
                 result = job.run()
             except Exception as error:  # a job that fails costs its keyframe, never the edge
