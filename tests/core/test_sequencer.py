@@ -131,8 +131,8 @@ def test_duplicates_and_steps_back_are_dropped_and_counted():
     bundles, counters = run(late)
     assert plain(bundles) == plain(run(ordered)[0])
     assert counters.backward == 3
-    swapped = [*ordered[:60], ordered[61], ordered[60], *ordered[62:]]  # two IMU samples of one frame
-    assert [m.stream for m in swapped[60:62]] == ["imu", "imu"]
+    swapped = [*ordered[:64], ordered[65], ordered[64], *ordered[66:]]  # two IMU samples of one frame
+    assert [m.stream for m in swapped[64:66]] == ["imu", "imu"]
     assert run(swapped)[1].backward == 1
     bundles, counters = run(swapped, config=replace(CONFIG, reorder_ms=10.0))
     assert plain(bundles) == plain(run(ordered)[0])
