@@ -136,7 +136,7 @@ class ClockConfig:
 class GraphConfig:
     """How the pose graph is solved."""
 
-    cauchy: float = 5.0  # whitened residual (6 dof: 2.4 is usual) at which a loop begins to lose weight
+    cauchy: float = 3.0  # whitened residual (6 dof: 2.4 is usual) at which a loop begins to lose weight
     max_iterations: int = 100
     relative_tolerance: float = 1e-6  # of the cost, between two iterations
     anchor_sigma: float = 1e-4  # rad and m; holds the gauge, removed again after solving

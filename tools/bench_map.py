@@ -9,6 +9,7 @@ descriptor bits flipped: every place is then stored many times over, which is th
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 import time
@@ -86,9 +87,7 @@ def bench_place(views: list[Sight], n: int) -> dict[str, float]:
 
 def bench_pair(views: list[Sight]) -> dict[str, float]:
     """Of neighbouring and of distant views: matching, and verification by its outcome."""
-    pairs = [(a, b) for a, b in zip(views, views[1:], strict=False)] + list(
-        zip(views, views[7:], strict=False)
-    )
+    pairs = [*itertools.pairwise(views), *zip(views, views[7:], strict=False)]
     accepts = [isinstance(verify(a, b, PLACE), Verified) for a, b in pairs]
     matching = [
         lambda a=a, b=b: match(a.view.descriptors, b.view.descriptors, PLACE.max_distance_bits, PLACE.ratio)

@@ -86,9 +86,9 @@ def refine(
         whole = _linearise(T, y_q, y_c, noise_q, noise_c)
         step = _solve(whole, 1 / (1 + whole.d2 / gate) ** 2)
         T = T @ se3.exp(step)
-        if np.abs(step).max() < 1e-5:
+        if np.abs(step).max() < 1e-4:  # rad and m; two plain steps follow
             break
-    for _ in range(3):
+    for _ in range(2):
         whole = _linearise(T, y_q, y_c, noise_q, noise_c)
         inside = whole.d2 < gate
         T = T @ se3.exp(_solve(whole, inside))

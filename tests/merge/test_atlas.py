@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from atlas_sim import Walker, error, loop, near_loops
+
 from share.config import GraphConfig, MergeConfig
 from share.geometry import se3
 from share.merge.atlas import Applied, Atlas

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from place_real import Seen, load
+
 from share.config import PlaceConfig
 from share.geometry import se3
 from share.place.index import PlaceIndex
@@ -64,8 +64,9 @@ def report(name: str, found: dict[tuple[int, int], tuple[float, float]], true: s
     recall = len(true & found.keys()) / len(true)
     median = np.median(errors, axis=0)
     print(
-        f"{name}: accepted {len(found)}, of {len(true)} true pairs {recall:.1%}, false {len(false_ones(found))}, "
-        f"pose error median {100 * median[0]:.1f} cm {median[1]:.2f} deg, worst {100 * errors[:, 0].max():.0f} cm"
+        f"{name}: accepted {len(found)}, "
+        f"false {len(false_ones(found))}, of {len(true)} true pairs {recall:.1%}, "
+        f"error median {100 * median[0]:.1f} cm {median[1]:.2f} deg, worst {100 * errors[:, 0].max():.0f} cm"
     )
     return recall
 

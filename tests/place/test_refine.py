@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-
 from place_sim import FOCAL, SIGMA_PX, SIGMA_RHO
+
 from share.geometry import se3
 from share.place.refine import Noise, move, refine
 from share.types import F64
@@ -10,7 +10,7 @@ NOISE = Noise(SIGMA_PX / FOCAL, SIGMA_RHO)
 NAN = np.nan
 
 
-def numerical(f, at: F64, step: float = 1e-6) -> F64:  # noqa: ANN001
+def numerical(f, at: F64, step: float = 1e-6) -> F64:
     columns = [(f(at + step * e) - f(at - step * e)) / (2 * step) for e in np.eye(len(at))]
     return np.stack(columns, axis=-1)
 

@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from place_sim import bodies, sights
+
 from share.config import PlaceConfig
 from share.geometry import se3
 from share.place.verify import Refusal, Sight, Verified, verify
