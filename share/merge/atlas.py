@@ -147,8 +147,8 @@ class Atlas:
             tuple(stretches),
             tuple(nodes),
             np.array([self._poses[n] for n in nodes]),
-            tuple(_renumbered(e, local) for e in self._trails.edges if e.a in local),
-            tuple(_renumbered(e, local) for e in loops.values()),
+            tuple(e for e in self._trails.edges if e.a in local),
+            tuple(loops.values()),
             tuple(loops),
             tuple(local[self._trails.stretches[s][-1]] for s in stretches),
             tuple((agent, self._answers.pop(agent)) for agent in sorted(agents & self._answers.keys())),
@@ -366,7 +366,3 @@ class Atlas:
             low, high = sorted(find(self._trails.nodes[n].stretch) for n in (edge.a, edge.b))
             root[high] = low
         self._founder = [find(i) for i in range(len(root))]
-
-
-def _renumbered(edge: Edge, local: dict[int, int]) -> Edge:
-    return Edge(local[edge.a], local[edge.b], edge.T_a_b, edge.cov)

@@ -11,9 +11,9 @@ from share.types import F64
 
 @dataclass(frozen=True, eq=False)
 class SolveJob:
-    """All that is known of one map. Edges count within `nodes`; the first node is the gauge.
+    """All that is known of one map. The first node is the gauge.
 
-    nodes: the atlas's numbers of the poses (N, 4, 4). last: per stretch in `stretches`, which node
+    nodes: the atlas's numbers of the poses (N, 4, 4); edges go by them. last: per stretch in `stretches`, which pose
     is its newest. loop_ids: the atlas's numbers of `loops`. answers: per agent, the keyframe
     whose loop is answered.
     """
@@ -37,5 +37,8 @@ class SolveResult:
 
 def run_job(job: SolveJob, config: GraphConfig) -> SolveResult:
     """Solve; pure, so it may run in any thread or process."""
-    solved = solve(job.poses, job.odometry, job.loops, (0,), config, covariances_of=job.last)
-    return SolveResult(job, solved)
+    local = {number: i for i, number in enumerate(job.nodes)}
+    odometry, loops = (
+        [Edge(local[e.a], local[e.b], e.T_a_b, e.cov) for e in edges] for edges in (job.odometry, job.loops)
+    )
+    return SolveResult(job, solve(job.poses, odometry, loops, (0,), config, covariances_of=job.last))

@@ -1,3 +1,4 @@
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -307,7 +308,12 @@ def test_snapshot_is_untouched_by_what_comes_after(ann: Walker, bob: Walker) -> 
     for x in loops[3:]:
         atlas.propose(x)
     settle(atlas)
+    sent = pickle.loads(pickle.dumps(job))  # as to another process
     assert run_job(job, GRAPH).solved.poses.tobytes() == first.solved.poses.tobytes()
+    assert (
+        pickle.loads(pickle.dumps(run_job(sent, GRAPH))).solved.poses.tobytes()
+        == first.solved.poses.tobytes()
+    )
 
 
 def test_what_cannot_be_is_refused_by_name(ann: Walker) -> None:
