@@ -1,0 +1,372 @@
+"""The agent's protocol machine, one duty at a time: scripted events, and what comes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+import pytest
+from model_edge import COV, HELLO, MS, S, handle, tracked
+
+from share.config import Config
+from share.core import events as ev
+from share.core.agent import Agent
+from share.errors import UsageError
+from share.geometry import se3
+from share.types import Correction, Keyframe, TrackState
+from share.wire import messages as m
+from share.wire.codec import decode, encode
+
+T = TypeVar("T")
+SESSION = 77
+
+
+def said(effects: Sequence[ev.AgentEffect]) -> list[str]:
+    return [effect.text for effect in effects if isinstance(effect, ev.Say)]
+
+
+def sent(effects: Sequence[ev.AgentEffect]) -> list[Any]:
+    return [decode(effect.frames) for effect in effects if isinstance(effect, ev.Send)]
+
+
+def only(kind: type[T], effects: Sequence[ev.AgentEffect], messages: bool = False) -> list[T]:
+    return [x for x in (sent(effects) if messages else effects) if isinstance(x, kind)]
+
+
+def tell(agent: Agent, message: m.Message, now_ns: int) -> list[ev.AgentEffect]:
+    return handle(agent, ev.Received(encode(message)), now_ns)
+
+
+def welcomed(config: Config | None = None) -> Agent:
+    """An agent at time 0, connected."""
+    agent = Agent(HELLO, config or Config())
+    handle(agent, ev.Tick(), 0)
+    tell(agent, m.Welcome(SESSION, 0), 0)
+    return agent
+
+
+def pose(x: float = 0.0, yaw: float = 0.0) -> np.ndarray:
+    return se3.compose(se3.so3_exp(np.array([0, 0, yaw])), np.array([x, 0, 0.0]))
+
+
+def correction(T: np.ndarray, revision: int, answers: int = -1, map_id: str = "a") -> Correction:
+    return Correction(T, COV, map_id, revision, answers)
+
+
+# ---------------------------------------------------------------- being connected
+
+
+def test_says_hello_until_welcomed() -> None:
+    agent = Agent(HELLO, Config())
+    hellos = [bool(sent(handle(agent, ev.Tick(), t * 100 * MS))) for t in range(11)]
+    assert [t for t, hello in enumerate(hellos) if hello] == [0, 5, 10]
+    effects = tell(agent, m.Welcome(SESSION, 0), 1100 * MS)
+    assert said(effects) == ["connected to the edge"]
+    later = [x for t in range(12, 30) for x in sent(handle(agent, ev.Tick(), t * 100 * MS))]
+    assert {type(x) for x in later} == {m.Ping}
+
+
+def test_an_edge_that_never_answers_is_said_once() -> None:
+    agent = Agent(HELLO, Config())
+    lines = [line for t in range(100) for line in said(handle(agent, ev.Tick(), t * 100 * MS))]
+    assert lines == ["no edge answers yet; tracking goes on alone"]
+
+
+def test_silence_and_return_are_said_once_each() -> None:
+    agent = welcomed()
+    effects = [x for t in range(1, 100) for x in handle(agent, ev.Tick(), t * 100 * MS)]
+    assert said(effects) == ["the edge is silent; tracking goes on alone"]
+    assert len(only(m.Hello, effects, messages=True)) == pytest.approx(14, abs=1)
+    assert said(tell(agent, m.Welcome(SESSION, 0), 10 * S)) == ["the edge is back"]
+    assert agent.report()["connected"]
+    assert agent.report()["edge_sessions"] == 1
+
+
+def test_a_taken_name_ends_the_run_with_the_edges_reason() -> None:
+    agent = Agent(HELLO, Config())
+    handle(agent, ev.Tick(), 0)
+    [fail] = tell(agent, m.Refused("the name is in use"), 1)
+    assert isinstance(fail, ev.Fail)
+    assert isinstance(fail.error, UsageError)
+    assert str(fail.error) == "the edge refuses 'ann': the name is in use"
+    assert handle(agent, ev.Tick(), 2) == []
+
+
+def test_a_refusal_by_a_restarted_edge_does_not_end_the_run() -> None:
+    agent = welcomed()
+    assert said(tell(agent, m.Refused("full"), S)) == ["the edge refuses 'ann': full; tracking goes on alone"]
+    hellos = [
+        t for t in range(11, 80) if only(m.Hello, handle(agent, ev.Tick(), t * 100 * MS), messages=True)
+    ]
+    assert hellos[0] == 60
+    assert only(ev.Localised, handle(agent, tracked(200), 10 * S))
+
+
+def test_bad_messages_are_counted_and_said_once_a_kind() -> None:
+    agent = welcomed()
+    lines = []
+    for frames in ([b"junk"], [b"junk"], [], encode(m.Bye()), encode(m.Bye())):
+        lines += said(handle(agent, ev.Received(frames), S))
+    assert agent.report()["bad_messages"] == 5
+    assert len(lines) == 3
+    assert lines[-1] == "the edge sent a Bye, which only agents send"
+
+
+def test_another_wire_version_is_said_in_words() -> None:
+    agent = Agent(HELLO, Config())
+    newer = b"\x94\x02\x01\x90\x90"
+    assert said(handle(agent, ev.Received([newer]), 0)) == [
+        "a message from the edge is not understood: "
+        "header: peer speaks version 2, this is 1; update the older one"
+    ]
+
+
+def test_a_pong_of_another_session_brings_hello_and_then_everything_held() -> None:
+    agent = welcomed()
+    for k in range(3):
+        handle(agent, tracked(k, pose(k), candidate=True), k * 50 * MS)
+    tell(agent, m.Ack(3), 160 * MS)
+    [ping] = only(m.Ping, handle(agent, ev.Tick(), 500 * MS), messages=True)
+    effects = tell(agent, m.Pong(ping.sequence, ping.sent_ns, 1, 2, SESSION + 1), 501 * MS)
+    assert only(m.Hello, effects, messages=True)
+    effects = tell(agent, m.Welcome(SESSION + 1, 0), 502 * MS)
+    assert said(effects) == ["the edge has restarted; it is sent 3 keyframes again"]
+    assert [k.id for k in only(Keyframe, effects, messages=True)] == [0, 1, 2]
+    assert tell(agent, m.Welcome(SESSION, 0), 503 * MS) == []  # overtaken on its way
+
+
+def test_ping_and_pong_give_round_trip_and_clock() -> None:
+    agent = welcomed()
+    for t in range(1, 40):
+        now = t * 500 * MS
+        for ping in only(m.Ping, handle(agent, ev.Tick(), now), messages=True):
+            edge = now + MS + 3 * S
+            tell(agent, m.Pong(ping.sequence, ping.sent_ns, edge, edge, SESSION), now + 2 * MS)
+            tell(agent, m.Pong(ping.sequence, ping.sent_ns, edge, edge, SESSION), now + 90 * MS)  # twice
+    report = agent.report()
+    assert report["rtt_ms"] == pytest.approx(2.0)
+    assert report["clock_offset_ns"] == pytest.approx(3 * S, abs=20_000)
+    assert abs(report["clock_drift_ppm"]) < 1
+
+
+# ---------------------------------------------------------------- frames
+
+
+def test_every_frame_is_localised_and_done_with_or_without_an_edge() -> None:
+    agent = Agent(HELLO, Config())
+    [localised] = only(ev.Localised, effects := handle(agent, tracked(3, pose(1)), 160 * MS))
+    assert (localised.index, localised.T_map_odom, localised.map_id) == (3, None, None)
+    np.testing.assert_array_equal(localised.T_odom_body, pose(1))
+    assert only(ev.FrameDone, effects) == [
+        ev.FrameDone(10**15 + 150 * MS, 4.0, TrackState.OK, keyframe=False, sent=False)
+    ]
+
+
+def test_a_lost_frame_has_no_pose_but_is_done() -> None:
+    agent = welcomed()
+    lost = ev.FrameTracked(0, 0, 0, MS, TrackState.LOST)
+    effects = handle(agent, lost, MS)
+    assert only(ev.Localised, effects) == only(m.PoseUpdate, effects, messages=True) == []
+    assert only(ev.FrameDone, effects)[0].state is TrackState.LOST
+
+
+def test_poses_go_relative_to_the_last_keyframe_that_the_edge_has() -> None:
+    agent = welcomed()
+    handle(agent, tracked(0, pose(1), candidate=True), 0)
+    [before] = only(m.PoseUpdate, handle(agent, tracked(1, pose(2)), 50 * MS), messages=True)
+    assert before.keyframe == -1
+    np.testing.assert_array_equal(before.T_keyframe_body, pose(2))
+    tell(agent, m.Ack(1), 60 * MS)
+    [after] = only(m.PoseUpdate, handle(agent, tracked(2, pose(2.5)), 100 * MS), messages=True)
+    assert after.keyframe == 0
+    np.testing.assert_allclose(after.T_keyframe_body, pose(1.5))
+    broken = handle(agent, tracked(3, pose(9), candidate=True, new_stretch=True), 150 * MS)
+    for effects in (broken, handle(agent, tracked(4, pose(9)), 200 * MS)):
+        assert [p.keyframe for p in only(m.PoseUpdate, effects, messages=True)] == [-1]
+
+
+def test_keyframes_are_numbered_sent_and_evaluated() -> None:
+    agent = welcomed()
+    [ping] = only(m.Ping, handle(agent, ev.Tick(), 500 * MS), messages=True)
+    tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
+    effects = handle(agent, tracked(11, pose(1), candidate=True, ms=5), 560 * MS)
+    [keyframe] = only(Keyframe, effects, messages=True)
+    assert (keyframe.id, keyframe.reference, keyframe.stamp_ns) == (0, -1, 10**15 + 550 * MS)
+    assert only(m.Evaluation, effects, messages=True) == [m.Evaluation(0, 8.0, None)]
+    assert only(ev.FrameDone, effects)[0].sent
+
+
+def test_keyframes_made_without_an_edge_are_sent_when_one_comes() -> None:
+    agent = Agent(HELLO, Config())
+    for k in range(40):
+        effects = handle(agent, tracked(k, pose(k), candidate=True), k * 50 * MS)
+        assert not only(Keyframe, effects, messages=True)
+    effects = tell(agent, m.Welcome(SESSION, 0), 2 * S)
+    assert [k.id for k in only(Keyframe, effects, messages=True)] == list(range(Config().link.window))
+
+
+# ---------------------------------------------------------------- rate
+
+
+def test_a_rate_is_spent_as_a_token_bucket_and_the_newest_candidate_waits() -> None:
+    agent = welcomed()
+    tell(agent, m.Rate(2.0), 0)
+    done, keyframes = [], []
+    for k in range(100):  # 5 s, a candidate every frame
+        effects = handle(agent, tracked(k, pose(k), candidate=True), k * 50 * MS)
+        done += only(ev.FrameDone, effects)
+        keyframes += only(Keyframe, effects, messages=True)
+        tell(agent, m.Ack(len(keyframes)), k * 50 * MS)
+    assert len(keyframes) == pytest.approx(2 + 2 * 5, abs=1)
+    report = agent.report()
+    assert report["candidates"] == 100 == report["keyframes"] + report["drop_rate"] + 1  # one still waits
+    assert [d.stamp_ns for d in done] == sorted({d.stamp_ns for d in done})
+    assert [d.stamp_ns for d in done if d.sent] == [k.stamp_ns for k in keyframes]
+    T = np.eye(4)
+    for keyframe in keyframes:  # the chain still leads to where the body was
+        T = T @ keyframe.T_ref_body
+        assert T[0, 3] == pytest.approx((keyframe.stamp_ns - 10**15) / (50 * MS))
+
+
+def test_a_waiting_candidate_goes_when_its_token_comes_without_another_frame() -> None:
+    agent = welcomed()
+    tell(agent, m.Rate(1.0), 0)
+    for k in range(3):
+        handle(agent, tracked(k, candidate=True), k * 50 * MS)
+    tell(agent, m.Ack(2), 200 * MS)
+    assert not only(Keyframe, handle(agent, ev.Tick(), 900 * MS), messages=True)
+    assert [k.id for k in only(Keyframe, handle(agent, ev.Tick(), 1000 * MS), messages=True)] == [2]
+
+
+# ---------------------------------------------------------------- corrections
+
+
+def corrected_agent() -> Agent:
+    """Connected, keyframe 0 of frame 0 sent and acknowledged."""
+    agent = welcomed()
+    handle(agent, tracked(0, candidate=True), 4 * MS)
+    tell(agent, m.Ack(1), 10 * MS)
+    return agent
+
+
+def in_force(agent: Agent, now_ns: int) -> Any:
+    [localised] = only(ev.Localised, handle(agent, tracked(now_ns // (50 * MS)), now_ns))
+    return localised.T_map_odom
+
+
+def test_the_first_correction_applies_at_once_and_is_timed() -> None:
+    agent = corrected_agent()
+    effects = tell(agent, correction(pose(5), 1, answers=0), 31 * MS)
+    assert only(ev.CorrectionApplied, effects) == [
+        ev.CorrectionApplied(0, 0, 10**15, 31.0, "a", 1, new_map=True)
+    ]
+    np.testing.assert_array_equal(in_force(agent, 50 * MS), pose(5))
+    [second] = only(ev.CorrectionApplied, tell(agent, correction(pose(5), 2, answers=0), 60 * MS))
+    assert (second.keyframe, second.corrected_ms, second.new_map) == (0, None, False)
+    [anothers] = only(ev.CorrectionApplied, tell(agent, correction(pose(5), 3), 60 * MS))
+    assert (anothers.keyframe, anothers.stamp_ns, anothers.corrected_ms) == (None, None, None)
+
+
+def test_large_corrections_are_blended_and_small_ones_are_not() -> None:
+    agent = corrected_agent()
+    tell(agent, correction(pose(0), 1), 100 * MS)
+    tell(agent, correction(pose(0.04), 2), 200 * MS)
+    np.testing.assert_array_equal(in_force(agent, 200 * MS), pose(0.04))
+    tell(agent, correction(pose(1.04), 3), 1000 * MS)
+    xs = [in_force(agent, t * MS)[0, 3] for t in (1000, 1100, 1250, 1500, 2000)]
+    np.testing.assert_allclose(xs, [0.04, 0.24, 0.54, 1.04, 1.04], atol=1e-12)
+    tell(agent, correction(pose(3.04), 4), 3000 * MS)
+    in_force(agent, 3250 * MS)
+    tell(agent, correction(pose(2.04), 5), 3250 * MS)  # while blending: no step
+    np.testing.assert_allclose(in_force(agent, 3250 * MS), pose(2.04), atol=1e-12)
+
+
+def test_a_small_turn_far_from_the_origin_is_a_large_correction() -> None:
+    agent = corrected_agent()
+    handle(agent, tracked(1, pose(10)), 50 * MS)
+    tell(agent, correction(pose(0), 1), 100 * MS)
+    tell(agent, correction(pose(0, yaw=0.01), 2), 100 * MS)
+    np.testing.assert_allclose(in_force(agent, 100 * MS), pose(0), atol=1e-12)
+
+
+def test_another_map_applies_at_once() -> None:
+    agent = corrected_agent()
+    tell(agent, correction(pose(0), 1), 100 * MS)
+    [applied] = only(ev.CorrectionApplied, tell(agent, correction(pose(9), 2, map_id="b"), 200 * MS))
+    assert applied.new_map
+    np.testing.assert_array_equal(in_force(agent, 200 * MS), pose(9))
+
+
+def test_old_corrections_are_counted_and_ignored() -> None:
+    agent = corrected_agent()
+    tell(agent, correction(pose(1), 5), 100 * MS)
+    for revision in (5, 4, 1):
+        assert not only(ev.CorrectionApplied, tell(agent, correction(pose(2), revision), 200 * MS))
+    assert agent.report()["corrections_stale"] == 3
+    np.testing.assert_array_equal(in_force(agent, 300 * MS), pose(1))
+
+
+def test_after_odometry_broke_only_corrections_of_the_new_stretch_count() -> None:
+    agent = corrected_agent()
+    tell(agent, correction(pose(1), 1, answers=0), 100 * MS)
+    handle(agent, tracked(4, pose(0), candidate=True, new_stretch=True), 200 * MS)
+    assert in_force(agent, 250 * MS) is None
+    for late in (correction(pose(1), 2, answers=0), correction(pose(1), 2)):
+        assert not only(ev.CorrectionApplied, tell(agent, late, 260 * MS))
+    [applied] = only(ev.CorrectionApplied, tell(agent, correction(pose(7), 3, answers=1), 300 * MS))
+    assert applied.keyframe == 1
+    np.testing.assert_array_equal(in_force(agent, 300 * MS), pose(7))
+
+
+def test_a_correction_for_a_replayed_keyframe_is_not_a_latency() -> None:
+    agent = corrected_agent()
+    tell(agent, m.Welcome(SESSION + 1, 0), 60 * S)
+    tell(agent, m.Ack(1), 60 * S)
+    [applied] = only(ev.CorrectionApplied, tell(agent, correction(pose(1), 1, answers=0), 60 * S))
+    assert (applied.keyframe, applied.corrected_ms) == (0, None)
+
+
+# ---------------------------------------------------------------- the end
+
+
+def test_the_end_waits_for_acknowledgements() -> None:
+    agent = welcomed()
+    handle(agent, tracked(0, candidate=True), 0)
+    assert not only(ev.Stop, handle(agent, ev.Finished(), 100 * MS))
+    assert only(Keyframe, handle(agent, ev.Tick(), 1000 * MS), messages=True)  # resent meanwhile
+    effects = tell(agent, m.Ack(1), 1100 * MS)
+    assert isinstance(sent(effects)[-1], m.Bye)
+    assert isinstance(effects[-1], ev.Stop)
+    assert handle(agent, ev.Tick(), 2 * S) == []
+
+
+def test_the_end_does_not_wait_for_ever() -> None:
+    agent = Agent(HELLO, Config())
+    handle(agent, tracked(0, candidate=True), 0)
+    handle(agent, ev.Finished(), S)
+    stops = [t for t in range(1, 100) if only(ev.Stop, handle(agent, ev.Tick(), S + t * 100 * MS))]
+    assert stops == [50]
+    assert agent.report()["open"] == 1
+
+
+def test_with_nothing_open_the_end_is_now() -> None:
+    effects = Agent(HELLO, Config()).handle(ev.Finished(), 0)
+    assert isinstance(effects[-1], ev.Stop)
+    assert not only(m.Bye, effects, messages=True)
+
+
+def test_a_candidate_that_waits_at_the_end_is_done_but_not_sent() -> None:
+    agent = welcomed()
+    tell(agent, m.Rate(0.0), 0)
+    for k in range(3):
+        handle(agent, tracked(k, candidate=True), k * 50 * MS)
+    [done] = only(ev.FrameDone, handle(agent, ev.Finished(), S))
+    assert (done.keyframe, done.sent) == (True, False)
+
+
+def test_the_report_is_plain_data() -> None:
+    report = corrected_agent().report()
+    assert all(value is None or type(value) in (int, float, str, bool) for value in report.values())
+    assert (report["sent"], report["acknowledged"], report["open"]) == (1, 1, 0)
+    assert report["bytes_up"] > report["bytes_down"] > 0
