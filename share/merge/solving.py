@@ -13,9 +13,9 @@ from share.types import F64
 class SolveJob:
     """All that is known of one map. The first node is the gauge.
 
-    nodes: the atlas's numbers of the poses (N, 4, 4); edges go by them. last: per stretch in `stretches`, which pose
-    is its newest. loop_ids: the atlas's numbers of `loops`. answers: per agent, the keyframe
-    whose loop is answered.
+    nodes: the atlas's numbers of the poses (N, 4, 4); edges go by them. last: per stretch in
+    `stretches`, which pose is its newest. loop_ids: the atlas's numbers of `loops`. answers: per
+    agent, the keyframe whose loop is answered.
     """
 
     map_id: str

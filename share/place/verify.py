@@ -18,6 +18,9 @@ from share.place.matching import match
 from share.place.refine import Noise, refine
 from share.types import F64, View
 
+_NEAR, _FAR = 0.05, 1000.0  # m; a depth outside says nothing
+_WIDEST = 10.0  # |u|, |v| of a keypoint that a lens can see (84 degrees off the axis)
+
 
 @dataclass(frozen=True, eq=False)
 class Sight:
@@ -34,8 +37,10 @@ class Sight:
 
     @property
     def y(self) -> F64:
-        """Keypoints (N, 3): u, v and inverse depth [1/m], NaN where depth is unknown."""
-        return np.column_stack([self.view.uv, 1 / self.view.points[:, 2]]).astype(np.float64)
+        """Keypoints (N, 3): u, v and inverse depth [1/m], NaN where depth is unknown or absurd."""
+        z = self.view.points[:, 2].astype(np.float64)
+        z[~((z > _NEAR) & (z < _FAR))] = np.nan
+        return np.column_stack([self.view.uv.astype(np.float64), 1 / z])
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +80,16 @@ def verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int = 0) -
         return _verify(query, candidate, config, seed)
     except _RefusedError as failed:
         return Refusal(str(failed))
+    except np.linalg.LinAlgError:
+        return Refusal("degenerate geometry: the matches do not determine a pose")
 
 
 def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> Verified:
     pairs = match(query.view.descriptors, candidate.view.descriptors, config.max_distance_bits, config.ratio)
     _need(len(pairs), config.min_matches, "matches")
     y_q, y_c = query.y[pairs[:, 0]], candidate.y[pairs[:, 1]]
+    possible = (np.abs(y_q[:, :2]) < _WIDEST).all(1) & (np.abs(y_c[:, :2]) < _WIDEST).all(1)
+    y_q, y_c = y_q[possible], y_c[possible]
     rough = _both_ways(y_q, y_c, query.focal, candidate.focal, config, seed)
     with_depth = np.isfinite(y_q[:, 2]) | np.isfinite(y_c[:, 2])
     y_q, y_c = y_q[with_depth], y_c[with_depth]
@@ -138,7 +147,10 @@ def _absolute_pose(source: F64, target: F64, focal: float, whose: str, config: P
     }
     pose, info = poselib.estimate_absolute_pose(target[known, :2] * focal, points, camera, ransac, {})
     _need(int(info["num_inliers"]), config.min_direction_inliers, f"inliers of the {whose} points")
-    return se3.compose(np.asarray(pose.R), np.asarray(pose.t))
+    T = se3.compose(np.asarray(pose.R), np.asarray(pose.t))
+    if not np.isfinite(T).all():
+        raise _RefusedError(f"no pose from the {whose} points")
+    return T
 
 
 def _check_spread(y: F64, whose: str, config: PlaceConfig) -> None:
@@ -161,7 +173,7 @@ def _check_gravity(T_c_q: F64, query: Sight, candidate: Sight, config: PlaceConf
     if not (query.up.any() and candidate.up.any()):
         return
     up_q, up_c = (s.T_body_cam0[:3, :3].T @ s.up for s in (query, candidate))
-    cosine = float((T_c_q[:3, :3] @ up_q) @ up_c)
+    cosine = float((T_c_q[:3, :3] @ up_q) @ up_c / (np.linalg.norm(up_q) * np.linalg.norm(up_c)))
     degrees = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
     if degrees > config.gravity_deg:
         raise _RefusedError(f"gravity differs by {degrees:.1f}°, {config.gravity_deg:.1f}° allowed")

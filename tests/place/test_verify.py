@@ -110,3 +110,32 @@ def test_empty_views_are_refused() -> None:
     query, candidate = sights(11, T_C_Q)
     assert reason(replace(query, view=empty), candidate) == "0 matches of 25 needed"
     assert reason(query, replace(candidate, view=empty)) == "0 matches of 25 needed"
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_hostile_numbers_do_not_raise(seed: int) -> None:
+    """Finite values of any size, repeated, collinear or absurd, as a broken peer may send them."""
+    rng = np.random.default_rng(seed)
+    query, candidate = sights(12, T_C_Q)
+    uv, points = query.view.uv.copy(), query.view.points.copy()
+    some = rng.random(len(uv)) < 0.5 + 0.5 * (seed % 2)
+    kind = seed % 5
+    if kind == 0:
+        uv[some], points[some] = 1e38, 1e38
+    elif kind == 1:
+        points[some, 2] = rng.choice([0.0, -1.0, 1e-30, 1e30], some.sum())
+    elif kind == 2:
+        uv[some], points[some] = uv[0], points[0]
+    elif kind == 3:
+        uv[some, 1], points[some, 1] = 0, 0
+    else:
+        points[some] = points[some][:, ::-1]
+    broken = replace(
+        query, view=View(uv, points, query.view.descriptors), up=rng.normal(0, 10.0 ** (seed % 9), 3)
+    )
+    for result in (
+        verify(broken, candidate, CONFIG),
+        verify(candidate, broken, CONFIG),
+        verify(broken, broken, CONFIG),
+    ):
+        assert isinstance(result, Verified | Refusal)
