@@ -71,7 +71,7 @@ def finish(run: World) -> None:
 
 
 @given(seeds, networks)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_over_a_bad_network_every_keyframe_counts_once_and_in_order(
     seed: int, network: dict[str, float]
 ) -> None:
@@ -88,7 +88,7 @@ def test_over_a_bad_network_every_keyframe_counts_once_and_in_order(
 
 
 @given(seeds, networks, st.integers(1, 12), st.integers(20, FRAMES - 20), st.integers(1, 150))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_an_outage_that_overflows_the_ledger_leaves_a_sound_chain(
     seed: int, network: dict[str, float], keep: int, gone_at: int, gone_for: int
 ) -> None:
@@ -116,7 +116,7 @@ def test_an_outage_that_overflows_the_ledger_leaves_a_sound_chain(
     st.integers(1, 60),
     st.lists(st.tuples(st.integers(1, FRAMES - 1), st.booleans()), max_size=3),
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_restarted_edges_get_what_they_lack(
     seed: int, network: dict[str, float], keep: int, kills: list[tuple[int, bool]]
 ) -> None:
@@ -134,7 +134,9 @@ def test_restarted_edges_get_what_they_lack(
     for edge in lives:
         check_applied(edge.applied, walk, edge.next_keyframe)
     assert run.agent.report()["open"] == 0
-    if lives[-1].applied or not lives[-1].next_keyframe:
+    if (
+        run.agent._session == lives[-1].session and lives[-1].applied
+    ):  # else the end came before it was noticed
         assert lives[-1].applied[-1].id == run.agent.report()["keyframes"] - 1
 
 
