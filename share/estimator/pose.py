@@ -52,32 +52,41 @@ def refine(
     for _ in range(iterations):
         r, J = reprojection(T, points, uv, scale)
         w = 1 / (1 + (r * r).sum(axis=1) / 4.0)  # Cauchy, 2 sigma
-        H = np.einsum("nij,n,nik->jk", J, w, J)
-        g = np.einsum("nij,n,ni->j", J, w, r)
-        step = -np.linalg.solve(H + 1e-9 * np.eye(6), g)
+        H, g = _normal_equations(r, J, w)
+        step = -np.linalg.solve(H, g)
         T = T @ se3.exp(step)
-        if np.abs(step).max() < 1e-7:
+        if np.abs(step).max() < 1e-6:
             break
     r, J = reprojection(T, points, uv, scale)
     squared = (r * r).sum(axis=1)
     inliers = squared < gate_px**2
-    H = np.einsum("nij,n,nik->jk", J, inliers.astype(float), J) + 1e-9 * np.eye(6)
+    H, _ = _normal_equations(r, J, inliers.astype(np.float64))
     excess = squared[inliers].mean() / 2 if inliers.any() else 1.0
     return PoseEstimate(T, np.linalg.inv(H) * max(1.0, excess), inliers)
+
+
+def _normal_equations(r: F64, J: F64, w: F64) -> tuple[F64, F64]:
+    """sum w J'J (6, 6), never quite singular, and sum w J'r (6,)."""
+    flat = J.reshape(-1, 6)
+    weighted = flat * np.repeat(w, 2)[:, None]
+    return weighted.T @ flat + 1e-9 * np.eye(6), weighted.T @ r.ravel()
 
 
 def reprojection(T: F64, points: F64, uv: F64, scale: F64) -> tuple[F64, F64]:
     """Residuals (N, 2) = scale (projection - uv), and d/d(xi) (N, 2, 6) for T Exp(xi).
 
-    With p_c = R p + t, T Exp(xi) moves it by R (rho - p x phi): dp_c = R [-hat(p) | I].
+    With p_c = R p + t, T Exp(xi) moves it by R (rho - p x phi). So a row d of D R, where D is the
+    derivative of the projection, becomes [p x d | d].
     """
     R = T[:3, :3]
     p = points @ R.T + T[:3, 3]
     iz = 1 / np.where(p[:, 2] > 1e-3, p[:, 2], 1e-3)
     projected = p[:, :2] * iz[:, None]
-    D = np.zeros((len(p), 2, 3))
-    D[:, 0, 0] = D[:, 1, 1] = iz
-    D[:, :, 2] = -projected * iz[:, None]
-    DR = (D @ R) * scale[:, None, None]
-    J = np.concatenate([-DR @ se3.hat(points), DR], axis=2)
+    d = (R[None, :2] - projected[:, :, None] * R[2]) * (iz * scale)[:, None, None]
+    J = np.empty((len(p), 2, 6))
+    J[:, :, 3:] = d
+    x, y, z = points.T[:, :, None]
+    J[:, :, 0] = y * d[:, :, 2] - z * d[:, :, 1]
+    J[:, :, 1] = z * d[:, :, 0] - x * d[:, :, 2]
+    J[:, :, 2] = x * d[:, :, 1] - y * d[:, :, 0]
     return (projected - uv) * scale[:, None], J

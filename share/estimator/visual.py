@@ -25,6 +25,7 @@ from share.vision import corners, klt
 from share.vision.view import depth_at, make_view
 
 RESEMBLANCE = 0.8  # NCC below which a re-found patch is another thing
+MIN_TO_LOOK_FOR = 8  # fewer points of an old keyframe are not worth an image pyramid
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +135,7 @@ class VisualTracker:
             se3.transform(se3.inverse(T_predicted), self._map.points[rows[rows >= 0]])
         )
         guess = np.where(np.isnan(expected), tracks.px, expected).astype(np.float32)
-        px, found = klt.follow(self._image, image, tracks.px, guess)
+        px, found = klt.follow(self._image, image, tracks.px, guess, levels=2)
         return _Tracks(tracks.ids, px).take(found)
 
     def _pose(
@@ -191,15 +192,17 @@ class VisualTracker:
         for host in hosts[: config.reobserve_hosts]:
             rows, guess = self._map.visible(T_cam_odom, self._rig.cam0, [host])
             fresh = ~np.isin(self._map.ids[rows], self._tracks.ids)
-            found = found.join(self._look_for(frame.image0, host, rows[fresh], guess[fresh]))
+            if fresh.sum() >= MIN_TO_LOOK_FOR:
+                found = found.join(self._look_for(frame.image0, host, rows[fresh], guess[fresh]))
         estimate, tracks = self._pose(self._tracks.join(found), self._T_odom_cam)
         if estimate is not None:
             self._T_odom_cam, self._tracks = se3.inverse(estimate.T), tracks
 
     def _look_for(self, image: U8, host: int, rows: I64, guess: F32) -> _Tracks:
         source = self._map.keyframes[host].image
-        px, found = klt.follow(source, image, self._map.host_px[rows], guess, levels=1)
-        found &= klt.resemblance(source, image, self._map.host_px[rows], px) > RESEMBLANCE
+        host_px = self._map.host_px[rows]
+        px, found = klt.follow(source, image, host_px, guess, window=15, levels=1, back_check_px=None)
+        found &= klt.resemblance(source, image, host_px, px) > RESEMBLANCE
         return _Tracks(self._map.ids[rows], px).take(found)
 
     def _add_corners(self, frame: Frame, host: int) -> None:

@@ -78,10 +78,12 @@ def from_stereo(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, guess_m: F64
     expected = np.full(len(px), np.nan) if guess_m is None else guess_m
     for fallback in (3.0, 1.2):
         todo = np.flatnonzero(np.isnan(out))
+        if len(todo) == 0:
+            break
         z = np.where(np.isnan(expected[todo]), fallback, expected[todo])
         guess = rig.cam1.project(se3.transform(rig.T_cam1_cam0, rays[todo] * z[:, None]))
         start = np.where(np.isnan(guess), px[todo], guess).astype(np.float32)
-        right, found = klt.follow(image0, image1, px[todo], start)
+        right, found = klt.follow(image0, image1, px[todo], start, window=15, levels=2, back_check_px=None)
         depth, error_px = _two_rays(rig, rays[todo], rig.cam1.normalise(right.astype(np.float64)))
         found &= (error_px < 1.5) & (depth > MIN_DEPTH) & (depth < MAX_DEPTH * 2)
         found &= klt.resemblance(image0, image1, px[todo], right) > 0.8

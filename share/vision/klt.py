@@ -19,21 +19,22 @@ def follow(
     guess: F32,
     window: int = 21,
     levels: int = 3,
-    back_check_px: float = 0.5,
+    back_check_px: float | None = 0.5,
 ) -> tuple[F32, NDArray[np.bool_]]:
     """Where the patches round `px` (N, 2) of `source` lie in `target`, and which were found.
 
-    guess (N, 2): where to begin. A point is found if following it back ends within
-    `back_check_px` of where it came from, and it is inside the image.
+    guess (N, 2): where to begin. A point is found if it is inside the image and following it back
+    ends within `back_check_px` of where it came from; None where the caller has a better check.
     """
     if len(px) == 0:
         return guess.copy(), np.zeros(0, bool)
     ahead, ok = _lucas_kanade(source, target, px, guess, window, levels)
-    # The way back begins at the answer's own source, so one level is enough to see whether it agrees.
-    back, ok_back = _lucas_kanade(target, source, ahead, px, window, 0)
     height, width = target.shape
-    found = ok & ok_back
-    found &= np.linalg.norm(back - px, axis=1) <= back_check_px
+    found = ok
+    if back_check_px is not None:
+        # The way back begins at its own end, so one level is enough to see whether it agrees.
+        back, ok_back = _lucas_kanade(target, source, ahead, px, window, 0)
+        found = ok & ok_back & (np.linalg.norm(back - px, axis=1) <= back_check_px)
     found &= ((ahead >= 1) & (ahead <= (width - 2, height - 2))).all(axis=1)
     return ahead, found
 
