@@ -81,6 +81,18 @@ def checked_pose(name: str, value: ArrayLike) -> F64:
     return T
 
 
+def checked_cov(name: str, value: ArrayLike) -> F64:
+    """`value` as a read-only covariance (6, 6). Raises ValueError unless symmetric and not negative:
+    one that is neither would stop the solver for everybody in the map."""
+    cov = checked(name, value, (6, 6), np.float64)
+    size = np.abs(cov).max()
+    if size > 1e12 or np.abs(cov - cov.T).max() > 1e-6 * size:
+        raise ValueError(f"{name}: is not symmetric, or beyond all measure")
+    if np.linalg.eigvalsh(cov)[0] < -1e-9 * size:
+        raise ValueError(f"{name}: has a negative variance")
+    return cov
+
+
 def _set(obj: object, **values: object) -> None:
     """Replace fields of a frozen dataclass during its own __post_init__."""
     for key, value in values.items():
@@ -177,7 +189,7 @@ class Candidate:
         _set(
             self,
             T_odom_body=checked_pose("T_odom_body", self.T_odom_body),
-            cov=checked("cov", self.cov, (6, 6), np.float64),
+            cov=checked_cov("cov", self.cov),
             up=checked("up", self.up, (3,), np.float64),
         )
 
@@ -211,7 +223,7 @@ class Keyframe:
         _set(
             self,
             T_ref_body=checked_pose("T_ref_body", self.T_ref_body),
-            cov=checked("cov", self.cov, (6, 6), np.float64),
+            cov=checked_cov("cov", self.cov),
             up=checked("up", self.up, (3,), np.float64),
         )
 
@@ -235,5 +247,5 @@ class Correction:
         _set(
             self,
             T_map_odom=checked_pose("T_map_odom", self.T_map_odom),
-            cov=checked("cov", self.cov, (6, 6), np.float64),
+            cov=checked_cov("cov", self.cov),
         )

@@ -20,7 +20,7 @@ def main() -> None:
         if done.returncode:
             sys.exit(f"{script.name} failed:\n{done.stderr}")
         results[script.stem.removeprefix("bench_")] = json.loads(done.stdout)
-    machine = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.platform()}
+    machine = {"python": platform.python_version(), "system": platform.platform()}
     OUT.parent.mkdir(exist_ok=True)
     OUT.write_text(json.dumps({"machine": machine, **results}, indent=2) + "\n")
     print(OUT.read_text(), end="")

@@ -6,13 +6,15 @@ from share import process
 
 process.prepare()  # before anything below can import numpy
 
+import difflib  # noqa: E402
 import importlib  # noqa: E402
 import sys  # noqa: E402
+from typing import Any  # noqa: E402
 
 import click  # noqa: E402
 
 from share import __version__  # noqa: E402
-from share.errors import ShareError  # noqa: E402
+from share.errors import ShareError, UsageError  # noqa: E402
 
 # name: (module, attribute, one line of help). Literal, so that a freezer sees every module.
 COMMANDS = {
@@ -37,6 +39,19 @@ class _Lazy(click.Group):
         command: click.Command = getattr(importlib.import_module(module), attribute)
         return command
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args[0] not in COMMANDS and not args[0].startswith("-"):
+            raise UsageError(f"no command '{args[0]}'; {_nearest(args[0])} (see `share --help`)")
+        return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:  # click would put an empty line before ours
+            raise _Interrupted("interrupted") from None
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, _, text) in COMMANDS.items()])
@@ -54,10 +69,21 @@ def cli() -> None:
     """
 
 
-def main() -> None:
-    """The one place that turns an error into a line and an exit code."""
+class _Interrupted(ShareError):
+    """By Ctrl-C. The exit code is what shells give for SIGINT."""
+
+    exit_code = 130
+
+
+def _nearest(name: str) -> str:
+    near = difflib.get_close_matches(name, COMMANDS, n=1)
+    return f"did you mean '{near[0]}'?" if near else f"there are {', '.join(COMMANDS)}"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The one place that turns an error into a line and an exit code. arguments: of the process if None."""
     try:
-        code = cli.main(standalone_mode=False)
+        code = cli.main(arguments, prog_name="share", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     except ShareError as error:
         _fail(str(error), error.exit_code)

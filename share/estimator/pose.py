@@ -53,7 +53,7 @@ def refine(
         r, J = reprojection(T, points, uv, scale)
         w = 1 / (1 + (r * r).sum(axis=1) / 4.0)  # Cauchy, 2 sigma
         H, g = _normal_equations(r, J, w)
-        step = -np.linalg.solve(H, g)
+        step: F64 = np.asarray(-np.linalg.solve(H, g), np.float64)
         T = T @ se3.exp(step)
         if np.abs(step).max() < 1e-6:
             break

@@ -17,7 +17,7 @@ def test_normalise_inverts_projection_everywhere_in_the_image(camera, rng):
 
 
 def test_projection_is_opencvs(rng):
-    points = rng.normal(size=(100, 3)) + (0, 0, 5)
+    points = rng.normal((0, 0, 5), 1, (100, 3))
     want, _ = cv2.projectPoints(
         points, np.zeros((3, 1)), np.zeros((3, 1)), EUROC.K, np.array(EUROC.distortion)
     )
@@ -52,7 +52,7 @@ def test_inside_counts_pixel_centres():
     ],
 )
 def test_nonsense_is_refused_by_name(change, says):
-    values = dict(width=640, height=480, fx=400.0, fy=400.0, cx=320.0, cy=240.0) | change
+    values = {"width": 640, "height": 480, "fx": 400.0, "fy": 400.0, "cx": 320.0, "cy": 240.0} | change
     with pytest.raises(ValueError, match=says):
         Camera(**values)
 

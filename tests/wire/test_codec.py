@@ -295,3 +295,15 @@ def test_huge_declarations_allocate_nothing() -> None:
             assert tracemalloc.get_traced_memory()[1] - before < 256 * 1024
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize("bad", [-np.eye(6), np.triu(np.ones((6, 6))), 1e300 * np.eye(6)])
+def test_a_covariance_that_is_none_never_reaches_the_solver(bad: np.ndarray) -> None:
+    """Sent by a peer that does not check itself: our own types refuse to build such a message."""
+    good = Correction(np.eye(4), np.eye(6), "map", 1)
+    frames = [bytes(frame) for frame in codec.encode(good)]
+    raw = np.eye(6).tobytes()
+    spoiled = [bad.astype("<f8").tobytes() if frame == raw else frame for frame in frames]
+    assert spoiled != frames
+    with pytest.raises(WireError):
+        codec.decode(spoiled)

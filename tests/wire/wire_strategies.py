@@ -14,7 +14,7 @@ int64 = st.integers(-(2**63), 2**63 - 1)
 ids = st.integers(0, 2**63 - 1)
 finite = st.floats(-1e6, 1e6)
 names = st.text(st.characters(categories=["L", "N"]), min_size=1, max_size=64)
-covs = hnp.arrays(np.float64, (6, 6), elements=finite)
+covs = hnp.arrays(np.float64, (6, 6), elements=st.floats(-1e4, 1e4)).map(lambda A: A @ A.T)
 ups = hnp.arrays(np.float64, 3, elements=finite)
 
 
