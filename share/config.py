@@ -164,6 +164,7 @@ class EdgeConfig:
     policy: str = "covins-g"  # every keyframe is sent, every verified loop is merged
     silent_s: float = 3.0  # nothing heard of an agent for this long: it is taken as gone
     name_hold_s: float = 3.0  # a name stays taken so long after its agent was last heard
+    max_agents: int = 64  # present at a time; more are refused
 
 
 @dataclass(frozen=True)

@@ -158,11 +158,7 @@ class Edge:
     def _greet(self, peer_id: bytes, hello: wire.Hello, now_ns: int) -> None:
         """Welcome a new run or a known one; refuse a name that somebody else is using."""
         if peer_id not in self._peers:
-            holder = next(
-                (p for p in self._peers.values() if p.hello.name == hello.name and not p.gone), None
-            )
-            if holder is not None and now_ns - holder.heard_ns < self._config.edge.name_hold_s * 1e9:
-                reason = f"the name '{hello.name}' is in use by another agent; choose another with --name"
+            if (reason := self._objection(hello, now_ns)) is not None:
                 self._send(peer_id, wire.Refused(reason))
                 self._record(now_ns, "refused", None, reason)
                 return
@@ -171,6 +167,17 @@ class Edge:
             self._by_key[key] = peer_id
             self._record(now_ns, "joined the edge", self._peers[peer_id], f"{hello.kind} '{hello.name}'")
         self._send(peer_id, wire.Welcome(self._session, self._peers[peer_id].inorder.next_keyframe))
+
+    def _objection(self, hello: wire.Hello, now_ns: int) -> str | None:
+        """Why a new run cannot be taken in, if it cannot."""
+        edge = self._config.edge
+        present = [peer for peer in self._peers.values() if not peer.gone]
+        for peer in present:
+            if peer.hello.name == hello.name and now_ns - peer.heard_ns < edge.name_hold_s * 1e9:
+                return f"the name '{hello.name}' is in use by another agent; choose another with --name"
+        if len(present) >= edge.max_agents:
+            return f"the edge serves {len(present)} agents already, as many as it may (edge.max_agents)"
+        return None
 
     def _keyframe(self, peer_id: bytes, peer: _Peer, keyframe: Keyframe, now_ns: int) -> None:
         applicable = peer.inorder.push(keyframe)

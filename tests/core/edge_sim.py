@@ -1,0 +1,188 @@
+"""A real edge and real agents in virtual time, in a room of points; only cameras and sockets are missing."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from share.config import Config
+from share.core import edge as ed
+from share.core import events as ev
+from share.core.agent import Agent
+from share.geometry import se3
+from share.types import F64, U8, AgentKind, Candidate, Keyframe, TrackState, View
+from share.wire.codec import decode
+from share.wire.messages import Hello, peer_id
+
+MS = 1_000_000
+FOCAL = 400.0
+_FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # camera axes in (ahead, left, up)
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Points (n, 3) on the walls of an 8 x 6 x 3 m room, each with a descriptor of its own."""
+
+    points: F64
+    descriptors: U8
+
+
+def walls(seed: int, n: int = 4000) -> Walls:
+    rng = np.random.default_rng(seed)
+    size = np.array([8.0, 6.0, 3.0])
+    points = rng.uniform(0, size, (n, 3))
+    axis = rng.integers(0, 2, n)
+    points[np.arange(n), axis] = size[axis] * rng.integers(0, 2, n)
+    return Walls(points, rng.integers(0, 256, (n, 32), np.uint8))
+
+
+def look(place: Walls, T_world_cam: F64, rng: np.random.Generator) -> View:
+    """Up to 300 of the points in view, as stereo sees them: 0.5 px, and 1 % of inverse depth."""
+    seen = se3.transform(se3.inverse(T_world_cam), place.points)
+    uv = seen[:, :2] / np.where(seen[:, 2:] > 0.3, seen[:, 2:], np.nan)
+    visible = np.flatnonzero((np.abs(uv) < (0.8, 0.6)).all(axis=1))[:300]
+    uv = uv[visible] + rng.normal(0, 0.5 / FOCAL, (len(visible), 2))
+    rho = 1 / seen[visible, 2] + rng.normal(0, 0.003, len(visible))
+    flips = np.packbits(rng.random((len(visible), 256)) < 0.04, axis=1)
+    return View(
+        uv, np.column_stack([uv, np.ones(len(uv))]) / rho[:, None], place.descriptors[visible] ^ flips
+    )
+
+
+@dataclass
+class Person:
+    """Walks round the room; body = camera. Odometry starts where it stands, and drifts a little."""
+
+    name: str
+    place: Walls
+    start: float
+    run_id: int
+    kind: AgentKind = AgentKind.AR
+    T_world_body: list[F64] = field(default_factory=list)
+    T_odom_body: list[F64] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.rng = np.random.default_rng(self.run_id)
+
+    @property
+    def hello(self) -> Hello:
+        return Hello(self.name, self.kind, self.run_id, FOCAL, np.eye(4))
+
+    def step(self) -> tuple[F64, View]:
+        """0.2 m on along a ring, looking at the wall outside. Returns T_odom_body and the view."""
+        angle = self.start + 0.1 * len(self.T_world_body)
+        R = se3.so3_exp(np.array([0, 0, angle])) @ _FORWARD
+        T = se3.compose(R, np.array([4 + 1.5 * np.cos(angle), 3 + 1.0 * np.sin(angle), 1.5]))
+        if self.T_world_body:
+            moved = se3.inverse(self.T_world_body[-1]) @ T @ se3.exp(self.rng.normal(0, 1, 6) * 0.002)
+            self.T_odom_body.append(self.T_odom_body[-1] @ moved)
+        else:
+            self.T_odom_body.append(se3.compose(_FORWARD, np.zeros(3)))
+        self.T_world_body.append(T)
+        return self.T_odom_body[-1], look(self.place, T, self.rng)
+
+
+class Town:
+    """Everybody, their edge, and 2 ms between them. `job_ms` is how long the worker takes."""
+
+    def __init__(
+        self, people: list[Person], session: int = 1, job_ms: float = 5, config: Config | None = None
+    ):
+        self.config = config or Config()
+        self.people: dict[bytes, Person] = {}
+        self.agents: dict[bytes, Agent] = {}
+        self.agent_effects: dict[bytes, list[ev.AgentEffect]] = {}
+        for person in people:
+            self.arrive(person)
+        self.edge: ed.Edge | None = ed.Edge(self.config, session)
+        self.records: list[dict[str, object]] = []
+        self.now_ns = 0
+        self._job_ns = round(job_ms * MS)
+        self._later: deque[tuple[int, Callable[[], None]]] = deque()
+
+    def arrive(self, person: Person) -> None:
+        peer = peer_id(person.run_id)
+        self.people[peer], self.agents[peer] = person, Agent(person.hello, self.config)
+        self.agent_effects[peer] = []
+
+    def vanish(self, name: str) -> None:
+        """As a process that is killed."""
+        peer = self.peer(name)
+        del self.people[peer], self.agents[peer]
+
+    def keyframes(self, name: str) -> list[Keyframe]:
+        """Those that the agent sent, in order."""
+        messages = [decode([bytes(f) for f in e.frames]) for e in self.event(ev.Send, name)]
+        return [message for message in messages if isinstance(message, Keyframe)]
+
+    def event(self, effect_type: type, name: str) -> list:
+        return [e for e in self.agent_effects[self.peer(name)] if isinstance(e, effect_type)]
+
+    def peer(self, name: str) -> bytes:
+        return next(peer for peer, p in self.people.items() if p.name == name)
+
+    def walk(self, frames: int, who: list[str] | None = None) -> None:
+        """`frames` steps of 250 ms, every one of them a keyframe."""
+        for _ in range(frames):
+            for peer, person in self.people.items():
+                if who is None or person.name in who:
+                    self._frame(peer, person)
+            self.run(250)
+
+    def run(self, ms: float) -> None:
+        until = self.now_ns + round(ms * MS)
+        while self.now_ns < until:
+            self.now_ns += MS
+            due = [act for at, act in self._later if at <= self.now_ns]
+            self._later = deque((at, act) for at, act in self._later if at > self.now_ns)
+            for act in due:
+                act()
+            if self.now_ns % (50 * MS) == 0:
+                self.to_edge(ed.Tick())
+                for peer in list(self.agents):
+                    self.to_agent(peer, ev.Tick())
+
+    def to_edge(self, event: ed.Event) -> None:
+        edge = self.edge
+        for effect in edge.handle(event, self.now_ns) if edge else ():
+            match effect:
+                case ed.Send(peer, frames):
+                    copy = [bytes(f) for f in frames]
+                    self._in(2 * MS, lambda peer=peer, copy=copy: self.to_agent(peer, ev.Received(copy)))
+                case ed.Work(job):
+                    done = ed.Done(job, job.run(), self._job_ns / MS)
+                    self._in(
+                        self._job_ns, lambda done=done: self.to_edge(done) if self.edge is edge else None
+                    )
+                case ed.Record(fields):
+                    self.records.append(fields)
+
+    def to_agent(self, peer: bytes, event: ev.AgentEvent) -> None:
+        agent = self.agents.get(peer)
+        for effect in agent.handle(event, self.now_ns) if agent else ():
+            self.agent_effects[peer].append(effect)
+            if isinstance(effect, ev.Send):
+                frames = [bytes(f) for f in effect.frames]
+                self._in(2 * MS, lambda frames=frames: self.to_edge(ed.Received(peer, frames)))
+
+    def map_error_m(self, name: str, T_world_map: F64) -> float:
+        """How far the agent's last pose in the map lies from the truth."""
+        last = self.event(ev.Localised, name)[-1]
+        assert last.T_map_odom is not None
+        found = T_world_map @ last.T_map_odom @ last.T_odom_body
+        return float(np.linalg.norm(found[:3, 3] - self.people[self.peer(name)].T_world_body[-1][:3, 3]))
+
+    def _frame(self, peer: bytes, person: Person) -> None:
+        T, view = person.step()
+        k = len(person.T_world_body) - 1
+        at = self.now_ns
+        tracked = ev.FrameTracked(k, at, at, at + 4 * MS, TrackState.OK, T, True, k == 0)
+        self.to_agent(peer, tracked)
+        candidate = Candidate(T, 4e-6 * np.eye(6), np.zeros(3), view, k == 0)
+        self.to_agent(peer, ev.KeyframeMade(tracked, candidate))
+
+    def _in(self, ns: int, act: Callable[[], None]) -> None:
+        self._later.append((self.now_ns + ns, act))
