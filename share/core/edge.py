@@ -200,6 +200,8 @@ class Edge:
             peer_id = self._by_key[finding.agent]
             peer = self._peers[peer_id]
             fields: dict[str, Any] = {}
+            if finding.correction is not None and peer.gone:
+                continue
             if finding.correction is not None:
                 peer.revision += 1
                 correction = replace(finding.correction, revision=peer.revision)

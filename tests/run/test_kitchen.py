@@ -1,0 +1,106 @@
+"""The real kitchen: 500 RGB-D frames of a Kinect, whose truth is itself good to 3 or 4 cm."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+from children import Child, start_agent, start_edge
+
+from share.io.trajectory import read_tum
+from share.metrics.ate import ate, joint_ate
+
+
+@pytest.fixture(scope="module")
+def kitchen(shared_data) -> Path:
+    return shared_data / "real" / "redkitchen_0000_0499"
+
+
+@pytest.fixture(scope="module")
+def tracked(kitchen, tmp_path_factory) -> dict[str, bytes]:
+    """What `share track` says of the whole (twice), and of each half."""
+    folder = tmp_path_factory.mktemp("track")
+    ranges = {"whole": ":", "again": ":", "ann": "0:250", "bob": "250:500"}
+    running = {
+        name: Child(
+            folder / f"{name}.log", "track", str(kitchen), "--frames", frames, "--out", str(folder / name)
+        )
+        for name, frames in ranges.items()
+    }
+    assert [child.wait(120) for child in running.values()] == [0] * 4
+    print({name: child.said.splitlines()[-1] for name, child in running.items()})
+    return {name: (folder / name).read_bytes() for name in ranges}
+
+
+def test_every_frame_is_tracked_to_five_centimetres(kitchen, tracked, tmp_path):
+    (tmp_path / "T.tum").write_bytes(tracked["whole"])
+    estimate, truth = read_tum(tmp_path / "T.tum"), read_tum(kitchen / "groundtruth.txt")
+    error = ate(estimate, truth)
+    print(f"ATE {100 * error.rmse:.2f} cm over {error.n} causal poses, SE3 alignment")
+    assert error.n == 500
+    assert error.rmse <= 0.05
+
+
+def test_the_same_recording_twice_gives_the_same_bytes(tracked):
+    assert tracked["whole"] == tracked["again"]
+
+
+def _events(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "edge" / "events.jsonl").read_text().splitlines()]
+
+
+def test_two_agents_end_in_one_map(kitchen, tracked, tmp_path):
+    edge, address = start_edge(tmp_path)
+    agents = {
+        name: start_agent(tmp_path, name, kitchen, address, "--frames", frames)
+        for name, frames in (("ann", "0:250"), ("bob", "250:500"))
+    }
+    assert [agent.wait(90) for agent in agents.values()] == [0, 0]
+    assert edge.interrupt() == 0
+    truth = read_tum(kitchen / "groundtruth.txt")
+    report = json.loads((tmp_path / "edge" / "edge.json").read_text())
+    assert len({agent["map_id"] for agent in report["agents"].values()}) == 1
+    joint = joint_ate({name: (read_tum(tmp_path / name / "map.tum"), truth) for name in agents})
+    print(f"joint ATE {100 * joint.joint.rmse:.2f} cm over {joint.joint.n} causal poses, one alignment")
+    assert joint.joint.rmse <= 0.06
+    assert joint.joint.n > 250  # of 500: from the moment on that the map was shared
+    corrections = [event for event in _events(tmp_path) if event["event"] == "correction"]
+    assert corrections
+    assert all(event["reason"] for event in _events(tmp_path))
+    for name in agents:
+        assert (tmp_path / name / "odom.tum").read_bytes() == tracked[name]
+        own = json.loads((tmp_path / name / "report.json").read_text())
+        # the last may come when the agent has said goodbye
+        assert 0 <= sum(event["agent"] == name for event in corrections) - own["corrections"] <= 1
+        assert own["corrections"] > 1
+        assert own["sent"] == own["keyframes"] == report["agents"][name]["keyframes"]
+        assert own["corrected_ms"]["n"] > 0
+
+
+def test_an_edge_that_is_killed_and_started_again(kitchen, tracked, tmp_path):
+    """Odometry does not notice; the new edge is rejoined, given the map again, and joins it again."""
+    edge, address = start_edge(tmp_path)
+    agents = {
+        name: start_agent(tmp_path, name, kitchen, address, "--frames", frames)
+        for name, frames in (("ann", "0:250"), ("bob", "250:500"))
+    }
+    for agent in agents.values():
+        agent.wait_for("connected to the edge")
+    time.sleep(3)
+    edge.kill()
+    time.sleep(1)
+    edge, _ = start_edge(tmp_path, address)
+    for agent in agents.values():
+        agent.wait_for("the edge has restarted")
+    assert [agent.wait(90) for agent in agents.values()] == [0, 0]
+    assert edge.interrupt() == 0
+    report = json.loads((tmp_path / "edge" / "edge.json").read_text())
+    assert len(report["maps"]) == 1
+    for name in agents:
+        assert (tmp_path / name / "odom.tum").read_bytes() == tracked[name]
+        own = json.loads((tmp_path / name / "report.json").read_text())
+        assert own["keyframes"] == report["agents"][name]["keyframes"]
+        assert own["protocol"]["map_id"] == report["agents"][name]["map_id"]
+        assert own["protocol"]["edge_sessions"] == 2
