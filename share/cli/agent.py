@@ -55,6 +55,7 @@ def agent(
 
     parse_address(address)
     opened = open_source(source, calib, frames)
+    options.say_notes(opened)
     run_id = secrets.randbits(63)
     rig = opened.rig
     hello = Hello(options.agent_name(name), AgentKind(kind), run_id, rig.cam0.focal, rig.T_body_cam0)

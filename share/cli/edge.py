@@ -36,9 +36,9 @@ def edge(
     Example:  share edge --bind tcp://127.0.0.1:5555 --out out/edge
     """
     settings = options.load_config(config_file)
+    from contextlib import closing
     from dataclasses import replace
 
-    from share.io.files import writable_dir
     from share.io.transport import bind as bind_link
     from share.io.transport import parse_address
     from share.run.edge import EdgeRun
@@ -46,16 +46,17 @@ def edge(
 
     parse_address(bind, bind=True)
     settings = replace(settings, edge=replace(settings.edge, policy=policy))
-    folder = None if out is None else writable_dir(Path(out))
-    link = bind_link(bind)
-    run = EdgeRun(settings, secrets.randbits(63), link, folder, lambda e: _tell(e, verbose))
-    with on_stop(run.stop):
-        click.echo(f"listening on {link.endpoint}, policy {policy}", err=True)
-        report = run.go()
+    folder = None if out is None else Path(out)
+    with closing(bind_link(bind)) as link:
+        run = EdgeRun(settings, secrets.randbits(63), link, folder, lambda e: _tell(e, verbose))
+        with on_stop(run.stop):
+            click.echo(f"listening on {link.endpoint}, policy {policy}", err=True)
+            report = run.go()
     click.echo(json.dumps(report) if as_json else _summary(report))
 
 
-_NEWS = {"joined the edge", "left", "back", "silent", "refused", "maps joined", "merge taken out"}
+_NEWS = {"joined the edge", "left", "back", "silent", "refused"}
+_NEWS |= {"maps joined", "merge taken out", "not written"}
 
 
 def _tell(event: dict[str, Any], verbose: bool) -> None:

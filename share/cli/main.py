@@ -50,7 +50,7 @@ class _Lazy(click.Group):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:  # click would put an empty line before ours
-            raise _Interrupted("interrupted") from None
+            raise _InterruptedError("interrupted") from None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
@@ -69,7 +69,7 @@ def cli() -> None:
     """
 
 
-class _Interrupted(ShareError):
+class _InterruptedError(ShareError):
     """By Ctrl-C. The exit code is what shells give for SIGINT."""
 
     exit_code = 130

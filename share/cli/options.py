@@ -12,6 +12,7 @@ from share.errors import UsageError
 
 if TYPE_CHECKING:
     from share.config import Config
+    from share.io.source import Source
 
 calib = click.option(
     "--calib",
@@ -61,3 +62,9 @@ def agent_name(value: str) -> str:
     if not re.fullmatch(r"[\w.-]{1,64}", value) or value.startswith("."):
         raise UsageError(f"--name '{value}': use 1 to 64 letters, digits, '_', '-' or '.'")
     return value
+
+
+def say_notes(source: Source) -> None:
+    """What a person should know of a recording, such as streams that are not used: a line each on stderr."""
+    for note in source.notes:
+        click.echo(f"share: {source.name}: {note}", err=True)

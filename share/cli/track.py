@@ -10,6 +10,7 @@ import click
 
 from share.cli import options
 from share.cli.progress import progress
+from share.errors import DataError, UsageError
 
 
 @click.command()
@@ -39,21 +40,43 @@ def track(
     Example:  share track rec/kitchen --out kitchen.tum --report kitchen.json
     """
     settings = options.load_config(config_file)
-    from share.io.files import atomic_write, check_writable
+    named = {"--out": out, "--report": report_file}
+    from share.io.files import atomic_write
     from share.io.source import open_source
     from share.io.trajectory import format_tum
     from share.run.track import accuracy, track
 
-    wanted = [check_writable(Path(name)) for name in (out, report_file) if name]
     opened = open_source(source, calib, frames)
+    options.say_notes(opened)
+    wanted = _targets(named, source)
+    truth = opened.truth()  # if it is damaged, better now than after tracking
     with progress(opened.images_count, "tracking") as bar:
         run = track(opened, settings, bar)
-    ate = accuracy(run, opened.truth())
+    if not len(run.trajectory.stamps_ns):
+        raise DataError(
+            f"{opened.name}: none of its {run.report['frames']} frames could be tracked; are they dark, "
+            "blurred or bare, or is the calibration another camera's?"
+        )
+    ate = accuracy(run, truth)
     report = {**run.report, "ate_m": ate.rmse if ate else None}
-    texts = {out: format_tum(run.trajectory), report_file: json.dumps(report, indent=2) + "\n"}
-    for path in wanted:
-        atomic_write(path, texts[str(path)])
+    texts = {"--out": format_tum(run.trajectory), "--report": json.dumps(report, indent=2) + "\n"}
+    for option, path in wanted.items():
+        atomic_write(path, texts[option])
     click.echo(json.dumps(report) if as_json else _summary(report, ate))
+
+
+def _targets(named: dict[str, str | None], source: str) -> dict[str, Path]:
+    """The files to write, by option. Raises UsageError if one cannot be, or would take another's place."""
+    from share.io.files import check_writable, is_special
+
+    wanted = {option: check_writable(Path(name)) for option, name in named.items() if name is not None}
+    for option, path in wanted.items():
+        if path.exists() and Path(source).exists() and path.samefile(source):
+            raise UsageError(f"{option} {path}: is the source itself; give another name")
+    paths = [path.resolve() for path in wanted.values() if not is_special(path)]
+    if len(paths) != len(set(paths)):
+        raise UsageError(f"--report {wanted['--report']}: is --out too; give another name")
+    return wanted
 
 
 def _summary(report: dict[str, Any], ate: Any) -> str:

@@ -14,26 +14,35 @@ from share.errors import ShareError, UsageError
 def atomic_write(path: Path, data: bytes | str) -> None:
     """Write beside `path`, make it durable, then take its name: `path` is old or new, never between.
 
-    Raises UsageError if the folder cannot be written to.
+    A link is followed, and a device or pipe simply written to. Raises UsageError if the folder cannot
+    be written to, ShareError if the disk is full or fails.
     """
     content = data.encode() if isinstance(data, str) else data
+    if is_special(path):
+        with writing(path):
+            path.write_bytes(content)
+        return
+    path = path.resolve() if path.is_symlink() else path
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     except OSError as error:
         raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o666 & ~_umask())  # mkstemp makes it private
-        os.replace(name, path)
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+        with writing(path):
+            _fill(handle, name, content)
+            os.replace(name, path)
     finally:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(name)
     sync_folder(path.parent)
+
+
+def _fill(handle: int, name: str, content: bytes) -> None:
+    with os.fdopen(handle, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    os.chmod(name, 0o666 & ~_umask())  # mkstemp makes it private
 
 
 @contextlib.contextmanager
@@ -59,8 +68,31 @@ def check_writable(path: Path) -> Path:
     """`path`, if a file of that name can be made (its folder may have to be made). Else UsageError."""
     if path.is_dir():
         raise UsageError(f"{path}: is a folder; give the name of a file")
-    writable_dir(path.parent)
+    if not is_special(path):
+        writable_dir(path.parent)
     return path
+
+
+def is_special(path: Path) -> bool:
+    """Whether it is a device or a pipe (/dev/null, /dev/stdout), which must not be replaced by a file."""
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
+def claim(folder: Path) -> int:
+    """Make `folder` (as `writable_dir`) and lock it for one run: two must not write the same files.
+
+    Returns a handle; closing it, or the end of the process, gives the folder free. Raises UsageError
+    while another run has it.
+    """
+    import fcntl
+
+    handle = os.open(writable_dir(folder), os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise UsageError(f"{folder}: another run is writing there; give another --out") from None
+    return handle
 
 
 def writable_dir(path: Path) -> Path:

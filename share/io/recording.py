@@ -79,9 +79,8 @@ def span_of(cam0: I64, frames: slice | None, where: str) -> Span:
         return Span(-_EVER, _EVER, -_EVER, _EVER)
     first, last, step = frames.indices(len(cam0))
     if step != 1 or first >= last:
-        raise UsageError(
-            f"{where}: frames {frames.start}:{frames.stop} selects nothing; it has {len(cam0)} frames"
-        )
+        wanted = ":".join("" if end is None else str(end) for end in (frames.start, frames.stop))
+        raise UsageError(f"{where}: --frames {wanted} selects nothing; it has {len(cam0)} frames")
     before = int(cam0[first - 1]) if first else -_EVER
     until = int(cam0[last - 1])
     return Span(

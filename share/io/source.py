@@ -68,6 +68,9 @@ def open_source(spec: str, calib: str | None = None, frames: slice | None = None
     _existing(path, "SOURCE")
     if path.name.endswith(".mcap.part"):
         raise UsageError(f"{path}: was not closed; `share dataset recover {path} --out {path.stem}` saves it")
+    if is_session(path):
+        agents = ", ".join(str(path / name) for name in read_session(path).agents)
+        raise UsageError(f"{spec}: is a session; name one of its agents: {agents}")
     known = "; ".join(reader.what for reader in READERS)
     raise UsageError(f"{spec}: is none of the recordings that SHARE reads: {known}")
 

@@ -24,7 +24,7 @@ from share import __version__, config
 from share.core import events as ev
 from share.core.agent import Agent
 from share.core.sequencer import SequencerCounters
-from share.errors import DataError, ShareError
+from share.errors import DataError
 from share.io.source import Source
 from share.io.transport import AgentLink
 from share.metrics.runlog import RunLog
@@ -77,7 +77,7 @@ class AgentRun:
         self._say, self._show = say, show
         self._machine = Agent(hello, settings)
         self._tracker = tracker_for(source, settings)
-        self._files, self._log = AgentFiles(out), RunLog()
+        self._files, self._log = AgentFiles(out, say), RunLog()
         self._counters = SequencerCounters()
         self._link = connect()  # last: whatever is wrong with the above has been said by now
         self._shared = _Shared()
@@ -98,11 +98,9 @@ class AgentRun:
             self._loop()
             self.report = self._report()
             self._files.finish(self._log, self.report)
-        except ShareError:
-            self._files.discard()
-            raise
         finally:
             self._shared.stop.set()
+            self._files.release()
             self._link.close()
             for thread in threads:
                 thread.join(timeout=2)
@@ -224,6 +222,7 @@ class AgentRun:
             case ev.Say():
                 self._say(effect.text)
             case ev.Fail():
+                self._files.discard()
                 raise effect.error
             case ev.Stop():
                 self._ended = True

@@ -8,23 +8,36 @@ taken into another map, what it wrote before is kept as `map.before-N.tum`.
 from __future__ import annotations
 
 import json
+import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
-from share.io.files import atomic_write, writable_dir
+from share.io.files import atomic_write, check_writable, claim
+from share.io.line_file import LineFile
 from share.io.trajectory import format_pose
 from share.metrics.runlog import RunLog
 from share.types import F64
 
+_NAMES = ("odom.tum", "map.tum", "latency.csv", "report.json")
+
 
 class AgentFiles:
-    """odom.tum, map.tum, latency.csv and report.json of one run in `out`; nothing where that is None."""
+    """odom.tum, map.tum, latency.csv and report.json of one run in `out`; nothing where that is None.
 
-    def __init__(self, out: Path | None) -> None:
-        self._out = None if out is None else writable_dir(out)
-        self._open: dict[str, IO[str]] = {}
+    `say` is told of a disk that is full. Raises UsageError if another run is writing there.
+    """
+
+    def __init__(self, out: Path | None, say: Callable[[str], None]) -> None:
+        self._out, self._say = out, say
+        self._claim = None if out is None else claim(out)
+        self._open: dict[str, LineFile] = {}
         self._map_id: str | None = None
         self._maps_before = 0
+        if out is not None:
+            for name in _NAMES:
+                check_writable(out / name)
+        self._remove_partials()  # of a run that was killed
 
     def odom(self, stamp_ns: int, T_odom_body: F64) -> None:
         self._line("odom.tum", stamp_ns, T_odom_body)
@@ -38,10 +51,13 @@ class AgentFiles:
         self._line("map.tum", stamp_ns, T_map_body)
 
     def finish(self, log: RunLog, report: dict[str, Any]) -> None:
-        """Close what is open and give everything its name."""
+        """Close what is open and give everything its name. Raises ShareError if the disk was full."""
+        files = list(self._open.values())
         self._close()
         if self._out is None:
             return
+        for file in files:
+            file.check()  # what there is stays, as .partial
         for old in self._out.glob("map.before-*.tum"):
             old.unlink()  # of an earlier run in the same folder
         for name in ("odom.tum", "map.tum"):
@@ -57,15 +73,25 @@ class AgentFiles:
     def discard(self) -> None:
         """The run came to nothing: leave no trace of it."""
         self._close()
-        for partial in self._out.glob("*.tum.partial") if self._out else ():
-            partial.unlink()
+        self._remove_partials()
+
+    def release(self) -> None:
+        """Give the folder free for another run."""
+        self._close()
+        if self._claim is not None:
+            os.close(self._claim)
+            self._claim = None
 
     def _line(self, name: str, stamp_ns: int, T: F64) -> None:
         if self._out is None:
             return
         if name not in self._open:
-            self._open[name] = (self._out / f"{name}.partial").open("w", buffering=1)
-        self._open[name].write(format_pose(stamp_ns, T) + "\n")
+            self._open[name] = LineFile(self._out / f"{name}.partial", self._say)
+        self._open[name].write(format_pose(stamp_ns, T))
+
+    def _remove_partials(self) -> None:
+        for partial in self._out.glob("*.tum.partial") if self._out else ():
+            partial.unlink()
 
     def _close(self) -> None:
         for file in self._open.values():

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from share.config import Config
 from share.core.edge import Done, Edge, Effect, Event, Received, Record, Send, Tick, Work
-from share.io.files import atomic_write, writable_dir
+from share.io.files import atomic_write, check_writable, claim
+from share.io.line_file import LineFile
 from share.io.transport import EdgeLink
 from share.run.worker import Worker
 
@@ -33,11 +35,13 @@ class EdgeRun:
         self._machine = Edge(settings, session)
         self._inbox: queue.SimpleQueue[Done] = queue.SimpleQueue()
         self._worker = Worker(self._done)
-        self._out = None if out is None else writable_dir(out)
-        self._events: IO[str] | None = None
+        self._out = out
+        self._claim = None if out is None else claim(out)
+        self._events: LineFile | None = None
+        if out is not None:
+            check_writable(out / "edge.json")
+            self._events = LineFile(check_writable(out / "events.jsonl"), self._complain)
         self._stopping = False
-        if self._out is not None:
-            self._events = (self._out / "events.jsonl").open("w", buffering=1)
 
     def stop(self) -> None:
         """From any thread or a signal handler."""
@@ -45,7 +49,7 @@ class EdgeRun:
         self._link.wake()
 
     def go(self) -> dict[str, Any]:
-        """The report, once stopped."""
+        """The report, once stopped. Raises ShareError if it could not be written, or not all events."""
         try:
             while not self._stopping:
                 self._step()
@@ -53,11 +57,19 @@ class EdgeRun:
             self._worker.close()
             self._link.close()
             report = self._machine.report()
-            if self._events is not None:
-                self._events.close()
-            if self._out is not None:
-                atomic_write(self._out / "edge.json", json.dumps(report, indent=2) + "\n")
+            self._finish(report)
         return report
+
+    def _finish(self, report: dict[str, Any]) -> None:
+        if self._out is None or self._events is None or self._claim is None:
+            return
+        self._events.close()
+        atomic_write(self._out / "edge.json", json.dumps(report, indent=2) + "\n")
+        os.close(self._claim)
+        self._events.check()
+
+    def _complain(self, text: str) -> None:
+        self._tell({"t_s": 0.0, "event": "not written", "agent": None, "reason": text})
 
     def _step(self) -> None:
         message = self._link.receive(TICK_MS)
@@ -79,7 +91,7 @@ class EdgeRun:
                 self._worker.give(effect.job)
             case Record():
                 if self._events is not None:
-                    self._events.write(json.dumps(effect.fields) + "\n")
+                    self._events.write(json.dumps(effect.fields))
                 self._tell(effect.fields)
 
     def _done(self, done: Done) -> None:

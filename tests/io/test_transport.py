@@ -212,7 +212,7 @@ def test_addresses() -> None:
 
 
 def test_only_loopback_without_keys() -> None:
-    with pytest.raises(TransportError, match=r"0\.0\.0\.0.*without keys"):
+    with pytest.raises(UsageError, match=r"0\.0\.0\.0.*without keys"):
         bind("tcp://0.0.0.0:0")
 
 

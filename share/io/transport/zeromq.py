@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import zmq
 
-from share.errors import TransportError
+from share.errors import TransportError, UsageError
 from share.io.transport import LINGER_MS, QUEUE_MESSAGES, Address, parse_address
 from share.wire.codec import MAX_ARRAYS, MAX_FRAME_BYTES, Bytes
 from share.wire.messages import PEER_BYTES, peer_id
@@ -104,7 +104,11 @@ class ZmqAgentLink:
         target = parse_address(address)
         self._link = _Socket(zmq.DEALER, _DEALER, target)
         self._link.socket.setsockopt(zmq.ROUTING_ID, peer_id(run_id))
-        self._link.socket.connect(str(target))
+        try:
+            self._link.socket.connect(str(target))
+        except zmq.ZMQError:
+            self._link.close()
+            raise UsageError(f"{target}: '{target.host}' cannot be the name of a machine") from None
 
     def send(self, frames: Sequence[Bytes]) -> bool:
         return self._link.send(frames)
@@ -120,12 +124,12 @@ class ZmqAgentLink:
 
 
 class ZmqEdgeLink:
-    """`EdgeLink` on tcp://HOST:PORT. Raises UsageError, or TransportError if it cannot be bound."""
+    """`EdgeLink` on tcp://HOST:PORT. Raises UsageError (also where keys would be needed), or TransportError if it cannot be bound."""
 
     def __init__(self, address: str) -> None:
         target = parse_address(address, bind=True)
         if not target.local:
-            raise TransportError(
+            raise UsageError(
                 f"{target}: only this machine may be served without keys; bind tcp://127.0.0.1:{target.port}"
             )
         self._link = _Socket(zmq.ROUTER, _ROUTER, target)

@@ -1,0 +1,54 @@
+"""A text file that a live run appends to, and that never ends the run: a full disk is said once."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO
+
+from share.errors import ShareError
+
+
+class LineFile:
+    """Every line is in the system's hands when `write` returns, so a crash loses none.
+
+    After the first line that cannot be written (disk full, quota), `say` is told once and nothing
+    more is tried: what is there stays readable, with at most its last line cut.
+    """
+
+    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
+        self.path, self._say = path, say
+        self._file: IO[str] | None = None
+        self._failure = ""
+        try:
+            self._file = path.open("w", buffering=1)
+        except OSError as error:
+            self._fail(error)
+
+    def write(self, line: str) -> None:
+        """One line, without its end."""
+        if self._file is None:
+            return
+        try:
+            self._file.write(line + "\n")
+        except OSError as error:
+            self._fail(error)
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def check(self) -> None:
+        """Raises ShareError if a line is missing."""
+        if self._failure:
+            raise ShareError(f"{self.path}: is not complete: {self._failure}")
+
+    def _fail(self, error: OSError) -> None:
+        self._failure = error.strerror or str(error)
+        if self._file is not None:
+            with contextlib.suppress(OSError):  # what it still holds cannot be written either
+                self._file.close()
+            self._file = None
+        self._say(f"{self.path}: cannot be written: {self._failure}; the run goes on without it")
