@@ -33,59 +33,59 @@ class SequencerConfig:
 class TrackerConfig:
     """Tracking by camera alone (`share.estimator.visual`)."""
 
-    corners: int = 250  # tracked at a time
-    spacing_px: float = 14.0  # between corners
-    view_features: int = 500  # ORB features of a keyframe
-    noise_px: float = 1.0  # of one tracked corner
-    ransac_px: float = 3.0
+    corners: int = 250  # points tracked at a time
+    spacing_px: float = 14.0  # least distance between corners
+    view_features: int = 500  # ORB features of a keyframe, for other agents and for relocalisation
+    noise_px: float = 1.0  # standard deviation of one tracked corner
+    ransac_px: float = 3.0  # reprojection error up to which a point belongs to the consensus
     gate_sigma: float = 3.0  # an observation further off is an outlier
-    min_inliers: int = 15  # fewer: LOST
+    min_inliers: int = 15  # points that agree with a pose; fewer: LOST
     weak_inliers: int = 40  # fewer: WEAK
-    keyframe_m: float = 0.15  # a keyframe after this much motion,
-    keyframe_rad: float = 0.15
+    keyframe_m: float = 0.15  # a keyframe after this much motion since the last one,
+    keyframe_rad: float = 0.15  # or this much turning,
     keyframe_tracked: float = 0.6  # or when fewer than this part of its points are left
     keyframe_gap_s: float = 0.1  # but never sooner
-    max_keyframes: int = 60  # of the local map
+    max_keyframes: int = 60  # of the local map; a full one drops the keyframe nearest to another
     reobserve_hosts: int = 6  # earlier keyframes whose points are looked for again
-    reobserve_m: float = 1.0
-    reobserve_rad: float = 0.5
+    reobserve_m: float = 1.0  # which of them: no further away than this,
+    reobserve_rad: float = 0.5  # and turned by no more than this
     new_stretch_s: float = 3.0  # LOST this long: odometry begins anew
     max_speed_m_s: float = 5.0  # a pose that implies more is not believed
-    max_turn_rad_s: float = 12.0
+    max_turn_rad_s: float = 12.0  # the same, for turning
 
 
 @dataclass(frozen=True)
 class PlaceConfig:
     """When two views are taken for the same place."""
 
-    candidates: int = 8  # verified per query, best first
+    candidates: int = 8  # keyframes verified per query, best first
     tables: int = 8  # hash tables of the index
     hash_bits: int = 16  # descriptor bits that make a word in each of them
     index_seed: int = 1  # which bits
     max_distance_bits: int = 64  # of 256: a match of two descriptors
-    ratio: float = 1.0  # best distance below this share of the runner-up's; below 1 loses half of the recall
+    ratio: float = 1.0  # best distance below this share of the runner-up's: no test at 1, lost recall below
     min_matches: int = 25  # mutual nearest neighbours, before any geometry
     ransac_px: float = 6.0  # reprojection error of a consensus
-    ransac_iterations: int = 1000
+    ransac_iterations: int = 1000  # at most
     min_direction_inliers: int = 12  # 3D points of either view in the other's image
     agree_depth_ratio: float = 0.05  # the two directions' positions differ less than this times the depth
     agree_deg: float = 2.5  # … and their rotations less than this
-    sigma_px: float = 1.5  # of a keypoint
+    sigma_px: float = 1.5  # standard deviation of a keypoint
     sigma_inverse_depth: float = 0.01  # 1/m, of a keypoint's depth: disparity noise / (focal * baseline)
     inlier_chi2: float = 11.3  # squared Mahalanobis distance of an inlier (99 %, 3 dof)
-    min_inliers: int = 20
+    min_inliers: int = 20  # after refinement; fewer: refused
     max_sigma_deg: float = 0.6  # a pose more uncertain than this is refused: false ones begin at 0.75
     min_spread: float = 0.06  # narrow side (1 sigma) of the inliers, normalised coordinates
     gravity_deg: float = 6.0  # rotation must keep "up" within this, where both views know it
     floor_deg: float = 0.1  # added to what the residuals say: what inliers do not average away
-    floor_m: float = 0.005
+    floor_m: float = 0.005  # the same, for the position
 
 
 @dataclass(frozen=True)
 class AgentConfig:
     """What an agent keeps, sends and makes of corrections."""
 
-    keep_keyframes: int = 600  # sent ones too: a restarted edge is given them again
+    keep_keyframes: int = 600  # that an agent remembers, sent ones too: a restarted edge is given them again
     rate_burst: float = 2.0  # keyframes that may be saved up under a rate limit
     blend_jump_m: float = 0.05  # a correction that moves the body further, or turns it more,
     blend_jump_rad: float = 0.02  # is blended in
@@ -102,13 +102,13 @@ class AgentConfig:
 class LinkConfig:
     """The rhythm of an agent's talk with its edge."""
 
-    hello_s: float = 0.5  # until welcomed
+    hello_s: float = 0.5  # between hellos, until welcomed
     refused_s: float = 5.0  # a refused agent that already runs asks again after this
-    ping_s: float = 0.5
+    ping_s: float = 0.5  # between pings
     silent_s: float = 3.0  # nothing heard for this long: the edge is taken as gone
     window: int = 16  # keyframes in flight
     resend_s: float = 1.0  # first wait for an acknowledgement; doubles
-    resend_max_s: float = 8.0
+    resend_max_s: float = 8.0  # the longest wait it doubles to
     gap_s: float = 0.1  # the same, for a keyframe that later ones have overtaken
 
     def __post_init__(self) -> None:
@@ -119,11 +119,11 @@ class LinkConfig:
 class ClockConfig:
     """The filter of the edge's clock against the agent's."""
 
-    noise_us: float = 20.0  # of an exchange that met no queue
+    noise_us: float = 20.0  # standard deviation of an exchange that met no queue
     asymmetry: float = 0.5  # one-way error of an exchange per delay beyond the least; 0.5 is all of it
-    offset_walk_us: float = 4.0  # per sqrt(s)
-    drift_walk_ppm: float = 0.05  # per sqrt(s)
-    drift_ppm: float = 100.0  # before anything is known (1 sigma)
+    offset_walk_us: float = 4.0  # random walk of the offset, per sqrt(s)
+    drift_walk_ppm: float = 0.05  # random walk of the drift, per sqrt(s)
+    drift_ppm: float = 100.0  # standard deviation of the drift before anything is known
     least_of: int = 64  # exchanges among which the least delay is sought
     gate_sigma: float = 4.0  # an exchange further off is not believed
     step_after: int = 5  # but so many in a row are: the clock was set
@@ -137,7 +137,7 @@ class GraphConfig:
     """How the pose graph is solved."""
 
     cauchy: float = 3.0  # whitened residual (6 dof: 2.4 is usual) at which a loop begins to lose weight
-    max_iterations: int = 100
+    max_iterations: int = 100  # of Levenberg-Marquardt
     relative_tolerance: float = 1e-6  # of the cost, between two iterations
     anchor_sigma: float = 1e-4  # rad and m; holds the gauge, removed again after solving
 
@@ -151,7 +151,7 @@ class MergeConfig:
     surprise_chi2: float = 200.0  # beyond this a loop contradicts the map whatever witnesses say
     odometry_scale: float = 2.0  # agents' sigmas are this much too small
     odometry_floor_deg: float = 0.02  # per edge, added in quadrature
-    odometry_floor_m: float = 0.002
+    odometry_floor_m: float = 0.002  # the same, for the position
     sole_witness_inliers: int = 0  # a loop with so many inliers joins two maps alone; 0 = never
     max_pending: int = 200  # loops that wait for a witness; the oldest is dropped
     drop_chi2: float = 1000.0  # a solved graph at odds with a loop by more than this drops it
@@ -161,7 +161,7 @@ class MergeConfig:
 class EdgeConfig:
     """How the edge serves its agents."""
 
-    policy: str = "covins-g"  # every keyframe is sent, every verified loop is merged
+    policy: str = "covins-g"  # what `share edge --policy` says goes before it
     silent_s: float = 3.0  # nothing heard of an agent for this long: it is taken as gone
     name_hold_s: float = 3.0  # a name stays taken so long after its agent was last heard
     max_agents: int = 64  # present at a time; more are refused
