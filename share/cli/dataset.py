@@ -22,7 +22,7 @@ def dataset() -> None:
     """
 
 
-@dataset.command()
+@dataset.command(short_help="Say what is in a recording.")
 @click.argument("source")
 @options.calib
 @options.frames
@@ -40,7 +40,7 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
     click.echo(json.dumps(description) if as_json else _text(description))
 
 
-@dataset.command()
+@dataset.command(short_help="Write a recording as MCAP or as an EuRoC/ASL folder.")
 @click.argument("source")
 @click.option("--out", required=True, metavar="PATH", help="X.mcap, or a new folder with --format euroc.")
 @options.calib
@@ -81,7 +81,7 @@ def convert(
     click.echo(f"{target}: {opened.images_count} frames")
 
 
-@dataset.command()
+@dataset.command(short_help="Save what is whole of a broken recording.")
 @click.argument("broken")
 @click.option("--out", required=True, metavar="GOOD.mcap", help="Where the recovered recording goes.")
 @options.as_json

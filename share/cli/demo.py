@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,8 +17,18 @@ if TYPE_CHECKING:
     from share.run.score import SessionScore
 
 
+class _Seconds(click.FloatRange):
+    """Refuses NaN too, which is below no least and above no greatest."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number = float(super().convert(value, param, ctx))
+        if math.isnan(number):
+            self.fail(f"'{value}' is not a number of seconds", param, ctx)
+        return number
+
+
 @click.command()
-@click.option("--seconds", type=click.FloatRange(2, 600), default=20, show_default=True)
+@click.option("--seconds", type=_Seconds(2, 600), default=20, show_default=True)
 @click.option("--policy", type=click.Choice(["covins-g"]), default="covins-g", show_default=True)
 @click.option("--out", metavar="DIR", default="share-demo", show_default=True, help="Everything it leaves.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Which room.")

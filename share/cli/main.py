@@ -6,6 +6,7 @@ from share import process
 
 process.prepare()  # before anything below can import numpy
 
+import contextlib  # noqa: E402
 import difflib  # noqa: E402
 import importlib  # noqa: E402
 import sys  # noqa: E402
@@ -99,6 +100,10 @@ def main(arguments: list[str] | None = None) -> None:
     except BrokenPipeError:  # the reader of our output went away; nothing is left to tell it
         sys.stderr.close()
         sys.exit(1)
+    except OSError as error:  # what nobody foresaw: files have been checked, so most likely stdout
+        with contextlib.suppress(OSError):  # or Python would try again at its end, and complain itself
+            sys.stdout.close()
+        _fail(f"{error.filename or 'cannot write the output'}: {error.strerror or error}", 1)
 
 
 def _fail(text: str, code: int) -> None:

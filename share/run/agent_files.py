@@ -22,6 +22,12 @@ from share.types import F64
 _NAMES = ("odom.tum", "map.tum", "latency.csv", "report.json")
 
 
+def _claim(out: Path) -> int:
+    for name in _NAMES:
+        check_writable(out / name)
+    return claim(out)
+
+
 class AgentFiles:
     """odom.tum, map.tum, latency.csv and report.json of one run in `out`; nothing where that is None.
 
@@ -30,13 +36,10 @@ class AgentFiles:
 
     def __init__(self, out: Path | None, say: Callable[[str], None]) -> None:
         self._out, self._say = out, say
-        self._claim = None if out is None else claim(out)
         self._open: dict[str, LineFile] = {}
         self._map_id: str | None = None
         self._maps_before = 0
-        if out is not None:
-            for name in _NAMES:
-                check_writable(out / name)
+        self._claim = None if out is None else _claim(out)
         self._remove_partials()  # of a run that was killed
 
     def odom(self, stamp_ns: int, T_odom_body: F64) -> None:

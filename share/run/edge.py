@@ -36,11 +36,13 @@ class EdgeRun:
         self._inbox: queue.SimpleQueue[Done] = queue.SimpleQueue()
         self._worker = Worker(self._done)
         self._out = out
-        self._claim = None if out is None else claim(out)
+        self._claim: int | None = None
         self._events: LineFile | None = None
         if out is not None:
             check_writable(out / "edge.json")
-            self._events = LineFile(check_writable(out / "events.jsonl"), self._complain)
+            check_writable(out / "events.jsonl")
+            self._claim = claim(out)
+            self._events = LineFile(out / "events.jsonl", self._complain)
         self._stopping = False
 
     def stop(self) -> None:

@@ -124,7 +124,8 @@ class ZmqAgentLink:
 
 
 class ZmqEdgeLink:
-    """`EdgeLink` on tcp://HOST:PORT. Raises UsageError (also where keys would be needed), or TransportError if it cannot be bound."""
+    """`EdgeLink` on tcp://HOST:PORT. Raises UsageError if that is no address, or one that others can
+    reach, and TransportError if it cannot be bound."""
 
     def __init__(self, address: str) -> None:
         target = parse_address(address, bind=True)
