@@ -85,6 +85,7 @@ class _Peer:
     counts: Counter[str] = field(default_factory=Counter)
     revision: int = 0
     gone: bool = False
+    missed: Finding | None = None  # the newest correction while it was gone
 
 
 class Edge:
@@ -150,10 +151,10 @@ class Edge:
                 counts["unexpected"] += 1
 
     def _heard(self, peer: _Peer, now_ns: int) -> None:
+        peer.heard_ns = now_ns
         if peer.gone:
             peer.gone = False
             self._record(now_ns, "back", peer, "is heard again")
-        peer.heard_ns = now_ns
 
     def _greet(self, peer_id: bytes, hello: wire.Hello, now_ns: int) -> None:
         """Welcome a new run or a known one; refuse a name that somebody else is using."""
@@ -166,7 +167,11 @@ class Edge:
             self._peers[peer_id] = _Peer(hello, key, now_ns, InOrder())
             self._by_key[key] = peer_id
             self._record(now_ns, "joined the edge", self._peers[peer_id], f"{hello.kind} '{hello.name}'")
-        self._send(peer_id, wire.Welcome(self._session, self._peers[peer_id].inorder.next_keyframe))
+        peer = self._peers[peer_id]
+        self._send(peer_id, wire.Welcome(self._session, peer.inorder.next_keyframe))
+        if peer.missed is not None:
+            missed, peer.missed = peer.missed, None
+            self._correct(peer_id, peer, missed, now_ns)
 
     def _objection(self, hello: wire.Hello, now_ns: int) -> str | None:
         """Why a new run cannot be taken in, if it cannot."""
@@ -199,20 +204,21 @@ class Edge:
         for finding in findings:
             peer_id = self._by_key[finding.agent]
             peer = self._peers[peer_id]
-            fields: dict[str, Any] = {}
-            if finding.correction is not None and peer.gone:
-                continue
-            if finding.correction is not None:
-                peer.revision += 1
-                correction = replace(finding.correction, revision=peer.revision)
-                self._send(peer_id, correction)
-                peer.counts["corrections"] += 1
-                fields = {
-                    "revision": correction.revision,
-                    "answers": correction.answers,
-                    "map_id": correction.map_id,
-                }
-            self._record(now_ns, finding.what, peer, finding.reason, **fields)
+            if finding.correction is None:
+                self._record(now_ns, finding.what, peer, finding.reason)
+            elif peer.gone:
+                peer.missed = finding
+            else:
+                self._correct(peer_id, peer, finding, now_ns)
+
+    def _correct(self, peer_id: bytes, peer: _Peer, finding: Finding, now_ns: int) -> None:
+        assert finding.correction is not None
+        peer.revision += 1
+        peer.counts["corrections"] += 1
+        correction = replace(finding.correction, revision=peer.revision)
+        self._send(peer_id, correction)
+        fields = {"map_id": correction.map_id, "revision": peer.revision, "answers": correction.answers}
+        self._record(now_ns, finding.what, peer, finding.reason, **fields)
 
     def _give_work(self) -> None:
         if not self._working and (job := self._mapper.next_job()) is not None:

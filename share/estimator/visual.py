@@ -111,7 +111,7 @@ class VisualTracker:
         dt = (frame.stamp_ns - self._stamp_ns) * 1e-9
         T_predicted = T_last @ se3.exp(self._velocity * dt)
         tracks = self._find(frame.image0, T_predicted)
-        estimate, tracks = self._pose(tracks, T_predicted)
+        estimate, tracks = self._pose(tracks)
         if estimate is None or not self._plausible(T_last, estimate, dt):
             self._lost_since_ns, self._velocity = frame.stamp_ns, np.zeros(6)
             return TrackResult(TrackState.LOST, None)
@@ -131,21 +131,21 @@ class VisualTracker:
         assert self._image is not None
         rows = self._map.rows(self._tracks.ids)
         tracks = self._tracks.take(rows >= 0)
-        expected = self._rig.cam0.project(
-            se3.transform(se3.inverse(T_predicted), self._map.points[rows[rows >= 0]])
-        )
+        expected = self._project(se3.inverse(T_predicted), rows[rows >= 0])
         guess = np.where(np.isnan(expected), tracks.px, expected).astype(np.float32)
         px, found = klt.follow(self._image, image, tracks.px, guess, levels=2)
         return _Tracks(tracks.ids, px).take(found)
 
-    def _pose(
-        self, tracks: _Tracks, T_predicted: F64, threshold_px: float | None = None
-    ) -> tuple[PoseEstimate | None, _Tracks]:
+    def _project(self, T_cam_odom: F64, rows: I64) -> F64:
+        """Where the map's points should be seen, (N, 2) px, NaN behind the camera."""
+        return self._rig.cam0.project(se3.transform(T_cam_odom, self._map.points[rows]))
+
+    def _pose(self, tracks: _Tracks) -> tuple[PoseEstimate | None, _Tracks]:
         """Pose T_cam_odom from tracks; the tracks that agree with it."""
         config, focal = self._config, self._rig.cam0.focal
         points = self._map.points[self._map.rows(tracks.ids)]
         uv = self._rig.cam0.normalise(tracks.px.astype(np.float64))
-        first = consensus(points, uv, focal, threshold_px or config.ransac_px, self._seed)
+        first = consensus(points, uv, focal, config.ransac_px, self._seed)
         if first is None or first.inliers.sum() < config.min_inliers:
             return None, _NO_TRACKS
         sigma = np.full(len(points), config.noise_px)
@@ -184,6 +184,12 @@ class VisualTracker:
         self._T_odom_keyframe, self._new_stretch = self._T_odom_cam, new_stretch
 
     def _reobserve(self, frame: Frame) -> None:
+        """Take up points of earlier keyframes that lie where they should.
+
+        Those that do not would pull odometry back over all it has drifted since, in one frame: a
+        jump that a headset shows and that the edge's map takes for motion. Closing loops is the
+        edge's business.
+        """
         config = self._config
         assert self._T_odom_cam is not None
         T_cam_odom = se3.inverse(self._T_odom_cam)
@@ -194,7 +200,9 @@ class VisualTracker:
             fresh = ~np.isin(self._map.ids[rows], self._tracks.ids)
             if fresh.sum() >= MIN_TO_LOOK_FOR:
                 found = found.join(self._look_for(frame.image0, host, rows[fresh], guess[fresh]))
-        estimate, tracks = self._pose(self._tracks.join(found), self._T_odom_cam)
+        expected = self._project(T_cam_odom, self._map.rows(found.ids))
+        found = found.take(np.linalg.norm(found.px - expected, axis=1) < config.reobserve_px)
+        estimate, tracks = self._pose(self._tracks.join(found))
         if estimate is not None:
             self._T_odom_cam, self._tracks = se3.inverse(estimate.T), tracks
 

@@ -127,6 +127,19 @@ def test_a_restarted_agent_is_a_new_run_and_finds_its_old_map():
     assert any(r["event"] == "silent" and r["agent"] == "bob" for r in first.records)
 
 
+def test_who_was_away_is_told_what_was_missed():
+    both = town()
+    both.walk(12)
+    peer, before = both.peer("ann"), len(both.event(ev.CorrectionApplied, "ann"))
+    agent = both.agents.pop(peer)  # its network is down
+    both.run(3500)
+    both.walk(12, ["bob"])
+    both.agents[peer] = agent
+    both.run(4000)
+    assert any(r["event"] == "back" and r["agent"] == "ann" for r in both.records)
+    assert len(both.event(ev.CorrectionApplied, "ann")) == before + 1
+
+
 # ---------------------------------------------------------------- the protocol, message by message
 
 
