@@ -1,12 +1,15 @@
-PYTHON ?= python3.11
+# Python 3.11 or newer: python3.11 where there is one that starts, else python3.
+PYTHON ?= $(shell python3.11 -c "" 2>/dev/null && echo python3.11 || echo python3)
 BIN := .venv/bin
+PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
 .PHONY: install demo test lint type bench slow freeze
 
 install: .venv/installed
 .venv/installed: setup.cfg pyproject.toml
+	@$(PYTHON) -c "import sys; v = sys.version_info; v >= (3, 11) or sys.exit('SHARE needs Python 3.11 or newer; $(PYTHON) is %d.%d. Name another: make PYTHON=/path/to/python3.11' % v[:2])"
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[dev]'
+	$(PIP) -e '.[dev]'
 	touch $@
 
 demo: install
@@ -14,7 +17,7 @@ demo: install
 test: install
 	$(BIN)/pytest
 slow: install
-	$(BIN)/pytest -m slow
+	$(BIN)/pytest -m slow || test $$? -eq 5  # 5: none selected
 lint: install
 	$(BIN)/ruff check && $(BIN)/ruff format --check && $(BIN)/lint-imports
 type: install
@@ -22,5 +25,5 @@ type: install
 bench: install
 	$(BIN)/python tools/bench.py
 freeze: install
-	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[freeze]'
-	$(BIN)/pyinstaller --noconfirm --log-level WARN tools/share.spec
+	$(PIP) -e '.[freeze]'
+	$(BIN)/pyinstaller --noconfirm --log-level ERROR tools/share.spec

@@ -1,0 +1,9 @@
+"""Where the frozen program begins."""
+
+from multiprocessing import freeze_support
+
+freeze_support()  # a spawned worker does its work in here and goes no further
+
+from share.cli.main import main  # noqa: E402
+
+main()
