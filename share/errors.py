@@ -23,6 +23,10 @@ class DataError(ShareError):
     """A recording is damaged or does not fit its calibration."""
 
 
+class MisfitError(DataError):
+    """Not one image but the recording as a whole does not fit its calibration: reading on is no use."""
+
+
 class WireError(ShareError):
     """Bytes from a peer that are not a valid message. Counted by the receiver, never fatal."""
 

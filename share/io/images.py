@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.core.sequencer import Bundle
-from share.errors import DataError
+from share.errors import DataError, MisfitError
 from share.geometry.camera import Camera
 from share.types import F32, U8, Frame
 
@@ -124,9 +124,9 @@ def encode_png(image: U8) -> bytes:
 
 
 def check_size(image: NDArray[Any], width: int, height: int, where: str) -> NDArray[Any]:
-    """`image` if it is as large as the calibration says, else DataError."""
+    """`image` if it is as large as the calibration says, else MisfitError."""
     if image.shape != (height, width):
-        raise DataError(
+        raise MisfitError(
             f"{where}: is {image.shape[1]}x{image.shape[0]}, but the calibration is for {width}x{height}; "
             "give the calibration of this recording with --calib"
         )

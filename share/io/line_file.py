@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO
@@ -14,15 +15,16 @@ class LineFile:
     """Every line is in the system's hands when `write` returns, so a crash loses none.
 
     After the first line that cannot be written (disk full, quota), `say` is told once and nothing
-    more is tried: what is there stays readable, with at most its last line cut.
+    more is tried: what is there stays, in whole lines.
     """
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
         self.path, self._say = path, say
         self._file: IO[str] | None = None
+        self._whole_bytes = 0
         self._failure = ""
         try:
-            self._file = path.open("w", buffering=1)
+            self._file = path.open("w", buffering=1, encoding="utf-8")
         except OSError as error:
             self._fail(error)
 
@@ -32,6 +34,7 @@ class LineFile:
             return
         try:
             self._file.write(line + "\n")
+            self._whole_bytes += len(line.encode()) + 1
         except OSError as error:
             self._fail(error)
 
@@ -51,4 +54,6 @@ class LineFile:
             with contextlib.suppress(OSError):  # what it still holds cannot be written either
                 self._file.close()
             self._file = None
+            with contextlib.suppress(OSError):  # a device has no end to cut off
+                os.truncate(self.path, self._whole_bytes)
         self._say(f"{self.path}: cannot be written: {self._failure}; the run goes on without it")

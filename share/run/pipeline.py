@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 from share.config import Config
 from share.core.sequencer import SequencerCounters, sequence, streams_of
-from share.errors import DataError, UsageError
+from share.errors import DataError, MisfitError, UsageError
 from share.estimator.visual import VisualTracker
 from share.io.images import load
 from share.io.source import Source
@@ -23,6 +23,8 @@ def frames_of(
 ) -> Iterator[Frame]:
     """Decoded frames in order. A damaged image raises DataError, or goes to `on_bad` and is left out.
 
+    Images of another size than the calibration's always raise: all of them will be.
+
     `spent` is told the CPU time of each frame's decoding on this thread.
     """
     streams = streams_of(source.rig)
@@ -32,7 +34,7 @@ def frames_of(
         try:
             frame = load(bundle)
         except DataError as error:
-            if on_bad is None:
+            if on_bad is None or isinstance(error, MisfitError):
                 raise
             on_bad(error)
             continue

@@ -1,0 +1,607 @@
+"""What a person meets when something is wrong: one clear line, the right exit code, nothing half-written.
+
+Commands run for real: within this process where that is the same, as processes where signals, sockets
+or two of them at a time matter. Exit code 2: what was typed or pointed at; 1: damaged data or a failure.
+"""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from recordings import make_euroc, make_tum
+
+from share.cli.main import main
+from share.emulate.session import make_session
+
+SHARE = [sys.executable, "-m", "share"]
+NOBODY = "tcp://127.0.0.1:1"  # a port that nothing listens on
+FRAMES = 20
+CAMCHAIN = """
+cam0: {camera_model: pinhole, intrinsics: [385, 385, 319.5, 239.5], resolution: [640, 480]}
+cam1: {camera_model: pinhole, intrinsics: [385, 385, 319.5, 239.5], resolution: [640, 480],
+       T_cn_cnm1: [[1, 0, 0, -0.05], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
+"""
+
+
+class Done(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def share(capsys) -> Callable[..., Done]:
+    """`share ARGUMENTS` within this process."""
+
+    def run(*arguments: object) -> Done:
+        with pytest.raises(SystemExit) as end:
+            main([str(argument) for argument in arguments])
+        assert isinstance(end.value.code, int)
+        return Done(end.value.code, *capsys.readouterr())
+
+    return run
+
+
+def complaint(done: Done, code: int) -> str:
+    """The one line that a command that failed with `code` has said."""
+    assert done.code == code, done.err
+    assert done.out == ""
+    assert done.err.startswith("share: ")
+    assert done.err.count("\n") == 1, done.err
+    return done.err
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@contextmanager
+def untouched(folder: Path) -> Iterator[None]:
+    """Every file below `folder` is the same afterwards, and there is no new one."""
+    before = tree(folder)
+    yield
+    assert tree(folder) == before
+
+
+def as_track(source: Path, out: Path) -> list[object]:
+    return ["track", source, "--out", out / "T.tum", "--report", out / "R.json"]
+
+
+def as_agent(source: Path, out: Path, edge: str = NOBODY, name: str = "ann") -> list[object]:
+    return ["agent", source, "--name", name, "--kind", "ar", "--edge", edge, "--out", out]
+
+
+both = pytest.mark.parametrize("command", [as_track, as_agent])
+
+# ------------------------------------------------------------------ recordings
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    """A session of real pictures, one second long."""
+    return make_session(tmp_path_factory.mktemp("made") / "room", FRAMES / 20, seed=3, workers=2)
+
+
+@pytest.fixture(scope="module")
+def stereo(room, tmp_path_factory) -> Path:
+    """ar1 of it as an EuRoC folder."""
+    folder = tmp_path_factory.mktemp("made") / "stereo"
+    convert = [*SHARE, "dataset", "convert", f"{room}/ar1", "--format", "euroc", "--out", str(folder)]
+    subprocess.run(convert, check=True, stdout=subprocess.DEVNULL)
+    return folder
+
+
+@pytest.fixture
+def damaged(stereo, tmp_path) -> Path:
+    """The same with one image cut short, in the middle."""
+    folder = shutil.copytree(stereo, tmp_path / "stereo")
+    image = sorted((folder / "mav0" / "cam1" / "data").iterdir())[FRAMES // 2]
+    image.write_bytes(image.read_bytes()[:-5000])
+    return folder
+
+
+def longer(stereo: Path, to: Path, frames: int, step_s: float) -> Path:
+    """The same images, there and back again, `frames` of them at `step_s`."""
+    folder = shutil.copytree(stereo, to)
+    for listing in folder.glob("mav0/cam*/data.csv"):
+        lines = [line for line in listing.read_text().splitlines() if not line.startswith("#")]
+        names = [line.split(",")[1] for line in lines]
+        names += names[-2:0:-1]
+        stamps = (10**18 + round(i * step_s * 1e9) for i in range(frames))
+        listing.write_text("".join(f"{t},{names[i % len(names)]}\n" for i, t in enumerate(stamps)))
+    return folder
+
+
+# ------------------------------------------------------------------ the source
+
+
+def edit(path: Path, old: str, new: str, count: int = -1) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, count))
+
+
+def cut(path: Path, left: int = 3) -> None:
+    """The file ends in the middle of a line."""
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[:left]) + lines[left][: len(lines[left]) // 3])
+
+
+CAM0, IMU0 = Path("mav0/cam0"), Path("mav0/imu0")
+EUROC_DAMAGE = {
+    "gone": (2, "no such file or folder", shutil.rmtree),
+    "empty": (2, "none of the recordings", lambda r: shutil.rmtree(r / "mav0")),
+    "no cameras": (2, "cam0/sensor.yaml: no such file", lambda r: shutil.rmtree(r / CAM0)),
+    "no list": (1, "data.csv: no such file", lambda r: (r / CAM0 / "data.csv").unlink()),
+    "empty list": (1, "data.csv: has no data", lambda r: (r / CAM0 / "data.csv").write_text("#t,name\n")),
+    "list cut": (1, "data.csv, line 4: 1 of 2 columns", lambda r: cut(r / CAM0 / "data.csv")),
+    "binary list": (1, "is not a text file", lambda r: (r / CAM0 / "data.csv").write_bytes(b"\xff\xfe\0")),
+    "NaN stamp": (
+        1,
+        "data.csv, line 3: stamp 'NaN' is not a whole number",
+        lambda r: edit(r / CAM0 / "data.csv", "\n1403715273312142976,", "\nNaN,"),
+    ),
+    "images gone": (1, "6 of 6 images are missing", lambda r: shutil.rmtree(r / CAM0 / "data")),
+    "imu cut": (1, "imu0/data.csv, line 4: 3 of 7 columns", lambda r: cut(r / IMU0 / "data.csv")),
+    "imu NaN stamp": (1, "line 2: stamp 'nan'", lambda r: edit(r / IMU0 / "data.csv", "14", "nan,14", 1)),
+    "imu NaN": (
+        1,
+        "line 2: 'nan' is not finite",
+        lambda r: (r / IMU0 / "data.csv").write_text("#t,w,w,w,a,a,a\n5,0,0,nan,0,0,0\n"),
+    ),
+    "no extrinsics": (
+        2,
+        "cam0/sensor.yaml: key 'T_BS' is missing",
+        lambda r: edit(r / CAM0 / "sensor.yaml", "T_BS:", "T_unknown:"),
+    ),
+    "no YAML": (2, "not valid YAML", lambda r: (r / CAM0 / "sensor.yaml").write_text("a: [1")),
+    "fisheye": (
+        2,
+        "distortion_model 'equidistant' is not supported; supported: radtan",
+        lambda r: edit(r / CAM0 / "sensor.yaml", "radial-tangential", "equidistant"),
+    ),
+    "mono": (2, "stereo or depth is needed", lambda r: shutil.rmtree(r / "mav0/cam1")),
+}
+
+
+@both
+@pytest.mark.parametrize("damage", EUROC_DAMAGE)
+def test_euroc_folder(damage, command, share, tmp_path):
+    code, said, do = EUROC_DAMAGE[damage]
+    recording = make_euroc(tmp_path / "walk")
+    do(recording)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "T.tum").write_text("an older run\n")
+    (tmp_path / "out" / "odom.tum").write_text("an older run\n")
+    with untouched(tmp_path):
+        assert said in complaint(share(*command(recording, tmp_path / "out")), code)
+
+
+TUM_DAMAGE = {
+    "no depth list": (1, "depth.txt: no such file", lambda r: (r / "depth.txt").unlink()),
+    "list cut": (1, "rgb.txt, line 4: 1 of 2 columns", lambda r: cut(r / "rgb.txt")),
+    "NaN stamp": (1, "stamp 'NaN' is not a time", lambda r: edit(r / "rgb.txt", "10.033333", "NaN")),
+    "no calibration": (2, "give the calibration with --calib", lambda r: (r / "camera.yaml").unlink()),
+    "no depth scale": (
+        2,
+        "camera.yaml: key 'depth_scale' is missing",
+        lambda r: edit(r / "camera.yaml", "depth_scale", "scale"),
+    ),
+    "no depth extrinsics": (
+        2,
+        "camera.yaml: key 'T_depth_cam0' is missing",
+        lambda r: edit(r / "camera.yaml", "T_depth_cam0", "T"),
+    ),
+}
+
+
+@both
+@pytest.mark.parametrize("damage", TUM_DAMAGE)
+def test_tum_folder(damage, command, share, tmp_path):
+    code, said, do = TUM_DAMAGE[damage]
+    recording = make_tum(tmp_path / "kitchen")
+    do(recording)
+    with untouched(tmp_path):
+        assert said in complaint(share(*command(recording, tmp_path / "out")), code)
+
+
+def test_a_truth_that_is_cut_short(share, tmp_path):
+    recording = make_tum(tmp_path / "kitchen")
+    cut(recording / "groundtruth.txt")
+    with untouched(tmp_path):
+        said = complaint(share(*as_track(recording, tmp_path / "out")), 1)
+    assert "groundtruth.txt, line 4: 2 of 8 columns; the line is cut short" in said
+
+
+@both
+def test_an_mcap_that_is_cut_short(command, room, share, tmp_path):
+    recording = tmp_path / "cut.mcap"
+    recording.write_bytes((room / "ar1.mcap").read_bytes()[:-3000])
+    with untouched(tmp_path):
+        said = complaint(share(*command(recording, tmp_path / "out")), 1)
+    assert f"`share dataset recover {recording}" in said
+
+
+@both
+def test_names_that_are_no_recording(command, room, share, tmp_path):
+    note = tmp_path / "note.txt"
+    note.write_text("hello")
+    for source, said in (
+        (note, "none of the recordings that SHARE reads"),
+        (room, f"is a session; name one of its agents: {room}/ar1, {room}/ar2, {room}/robot"),
+        (room / "bob", "has no agent 'bob'; it has ar1, ar2, robot"),
+        ("realsense", "live cameras come with `share capture`"),
+    ):
+        assert said in complaint(share(*command(source, tmp_path / "out")), 2)
+    assert os.listdir(tmp_path) == ["note.txt"]
+
+
+@both
+def test_frames_beyond_the_end(command, room, share, tmp_path):
+    said = complaint(share(*command(room / "ar1", tmp_path / "out"), "--frames", "20:"), 2)
+    assert "--frames 20: selects nothing; it has 20 frames" in said
+
+
+# ------------------------------------------------------------------ calibration and configuration
+
+CALIBRATIONS = {
+    "missing": (None, "no such file or folder"),
+    "no YAML": ("cam0: [", "not valid YAML"),
+    "a list": ("- 1", "expected keys and values, found list"),
+    "empty": ("", "expected keys and values, found nothing"),
+    "no extrinsics": (CAMCHAIN.replace("T_cn_cnm1", "T_unknown"), "has no extrinsics to cam0; add T_cn_cnm1"),
+    "not rigid": (CAMCHAIN.replace("[0, 0, 1, 0]", "[0, 0, 2, 0]"), "T_cn_cnm1: is not a rigid transform"),
+    "NaN": (CAMCHAIN.replace("319.5", ".nan"), "intrinsics: has values that are not finite"),
+    "negative focal length": (CAMCHAIN.replace("[385", "[-385"), "cam0"),
+    "three intrinsics": (CAMCHAIN.replace(", 239.5", ""), "intrinsics: expected 4 numbers, found 3"),
+    "one camera": (CAMCHAIN[: CAMCHAIN.index("cam1")], "stereo or depth is needed"),
+    "another sensor": (CAMCHAIN.replace("cam1", "depth").replace("T_cn_cnm1", "T_depth_cam0"), "has depth"),
+}
+
+
+@both
+@pytest.mark.parametrize("case", CALIBRATIONS)
+def test_calibration(case, command, stereo, share, tmp_path):
+    text, said = CALIBRATIONS[case]
+    calib = tmp_path / "camchain.yaml"
+    if text is not None:
+        calib.write_text(text)
+    with untouched(tmp_path):
+        done = share(*command(stereo, tmp_path / "out"), "--calib", calib)
+    notes = [line for line in done.err.splitlines(keepends=True) if "is not used" in line]
+    assert said in complaint(done._replace(err=done.err.replace("".join(notes), "")), 2)
+
+
+def test_calibration_folder_without_a_camchain(stereo, share, tmp_path):
+    said = complaint(share("track", stereo, "--calib", tmp_path), 2)
+    assert "has no kalibr_imucam_chain.yaml" in said
+
+
+def test_images_of_another_size(stereo, share, tmp_path):
+    calib = tmp_path / "camchain.yaml"
+    calib.write_text(CAMCHAIN.replace("640, 480", "752, 480"))
+    with untouched(tmp_path):
+        said = complaint(share(*as_track(stereo, tmp_path / "out"), "--calib", calib), 1)
+    assert "is 640x480, but the calibration is for 752x480; give the calibration of this recording" in said
+    assert said.split()[1].startswith(f"{stereo}/mav0/cam0/data/")  # it names the image
+    assert said == complaint(share(*as_agent(stereo, tmp_path / "out2"), "--calib", calib), 1)
+
+
+CONFIGS = {
+    "missing": (None, "config.yaml: cannot read the configuration: No such file"),
+    "no YAML": ("tracker: {", "config.yaml: not valid YAML"),
+    "a list": ("- tracker", "config.yaml: expected a mapping of settings, found list"),
+    "unknown section": ("traker: {}", "config.yaml: unknown key 'traker'; did you mean 'tracker'?"),
+    "unknown key": ("tracker: {cornrs: 9}", "tracker: unknown key 'cornrs'; did you mean 'corners'?"),
+    "far from any": ("tracker: {zzz: 9}", "tracker: unknown key 'zzz'; known: corners, "),
+    "wrong type": ("tracker: {corners: many}", "tracker: corners: expected int, found 'many'"),
+    "a number": ("tracker: 5", "tracker: expected a mapping of settings, found int"),
+    "out of range": ("link: {window: 0}", "link: window: 0 must be positive"),
+    "not finite": ("link: {ping_s: .nan}", "link: ping_s"),
+}
+
+
+@pytest.mark.parametrize("command", [as_track, as_agent, lambda source, out: ["edge", "--out", out]])
+@pytest.mark.parametrize("case", CONFIGS)
+def test_configuration(case, command, share, tmp_path):
+    text, said = CONFIGS[case]
+    path = tmp_path / "config.yaml"
+    if text is not None:
+        path.write_text(text)
+    with untouched(tmp_path):
+        assert said in complaint(share(*command("nowhere", tmp_path / "out"), "--config", path), 2)
+
+
+# ------------------------------------------------------------------ where results go
+
+EDGE = ["edge", "--bind", "tcp://127.0.0.1:0", "--out"]
+
+
+def test_out_that_cannot_be_written(room, share, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "file").write_text("old")
+    (tmp_path / "taken" / "odom.tum").mkdir(parents=True)
+    (tmp_path / "taken" / "events.jsonl").mkdir()
+    source, below, proc = room / "ar1", tmp_path / "file" / "x", "/proc/share-x"
+    with untouched(tmp_path):
+        for arguments, said in (
+            (["track", source, "--out", tmp_path], "is a folder; give the name of a file"),
+            (["track", source, "--report", tmp_path], "is a folder; give the name of a file"),
+            (["track", source, "--out", below], "is not a folder, or lies below a file"),
+            (["track", source, "--out", f"{proc}/T.tum"], "cannot be written to: No such file"),
+            (["track", source, "--out", below.parent, "--report", below.parent], "is --out too"),
+            (["track", room / "ar1.mcap", "--out", room / "ar1.mcap"], "is the source itself"),
+            (as_agent(source, tmp_path / "file"), "is not a folder, or lies below a file"),
+            (as_agent(source, below), "is not a folder, or lies below a file"),
+            (as_agent(source, Path(proc)), "cannot be written to: No such file"),
+            (as_agent(source, tmp_path / "taken"), "odom.tum: is a folder"),
+            ([*EDGE, below], "is not a folder, or lies below a file"),
+            ([*EDGE, proc], "cannot be written to: No such file"),
+            ([*EDGE, tmp_path / "taken"], "events.jsonl: is a folder"),
+            (["demo", "--out", below], "is not a folder, or lies below a file"),
+            (["demo", "--out", proc], "cannot be written to: No such file"),
+        ):
+            assert said in complaint(share(*arguments), 2)
+
+
+def test_out_names_are_paths_like_any_other(room, share, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert share("track", room / "ar1", "--out", "./new//T.tum", "--report", "new/../R.json").code == 0
+    assert len((tmp_path / "new" / "T.tum").read_text().splitlines()) == FRAMES
+    assert json.loads((tmp_path / "R.json").read_text())["tracked"] == FRAMES
+    (tmp_path / "link").symlink_to("new/T.tum")
+    (tmp_path / "new" / "T.tum").write_text("old")
+    assert share("track", room / "ar1", "--out", "link", "--frames", ":5").code == 0
+    assert (tmp_path / "link").is_symlink()
+    assert len((tmp_path / "new" / "T.tum").read_text().splitlines()) == 5
+
+
+@pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="needs /dev/full")
+def test_out_may_be_a_device_and_stays_one(room, share):
+    assert share("track", room / "ar1", "--out", "/dev/null", "--frames", ":5").code == 0
+    assert Path("/dev/null").is_char_device()
+    done = share("track", room / "ar1", "--out", "/dev/full", "--frames", ":5")
+    assert complaint(done, 1) == "share: /dev/full: cannot be written: No space left on device\n"
+
+
+# ------------------------------------------------------------------ tracking
+
+
+def test_the_same_bytes_twice(room, share, tmp_path):
+    for agent in ("ar1", "robot"):
+        first, second = tmp_path / f"{agent}.1", tmp_path / f"{agent}.2"
+        assert share("track", room / agent, "--out", first).code == 0
+        again = [*SHARE, "track", room / agent, "--out", second]
+        subprocess.run(list(map(str, again)), check=True, stdout=subprocess.DEVNULL)
+        assert first.read_bytes() == second.read_bytes()
+        assert len(first.read_text().splitlines()) == FRAMES
+
+
+def test_track_of_a_damaged_image(damaged, share, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "T.tum").write_text("an older run\n")
+    with untouched(tmp_path):
+        said = complaint(share(*as_track(damaged, tmp_path / "out")), 1)
+    assert f"{damaged}/mav0/cam1/data/" in said
+    assert "the image is cut short or damaged" in said
+
+
+def test_track_of_what_cannot_be_tracked(share, tmp_path):
+    """Images of noise, too small to hold features."""
+    recording = make_tum(tmp_path / "kitchen")
+    with untouched(tmp_path):
+        said = complaint(share(*as_track(recording, tmp_path / "out")), 1)
+    assert "kitchen: none of its 5 frames could be tracked" in said
+
+
+def test_streams_that_are_not_used_are_named(stereo, share, tmp_path):
+    recording = shutil.copytree(stereo, tmp_path / "stereo")
+    (recording / "mav0" / "imu0").mkdir()
+    (tmp_path / "camchain.yaml").write_text(CAMCHAIN)
+    done = share("track", recording, "--calib", tmp_path / "camchain.yaml")
+    assert done.code == 0
+    assert done.err == "share: stereo: imu0 is not used: the calibration does not have it\n"
+
+
+def test_ctrl_c_on_track(stereo, tmp_path):
+    recording = longer(stereo, tmp_path / "long", 20_000, 0.05)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "T.tum").write_text("an older run\n")
+    with untouched(tmp_path), start(*as_track(recording, tmp_path / "out")) as process:
+        time.sleep(1.5)
+        assert end(process) == Done(130, "", "share: interrupted\n")
+
+
+# ------------------------------------------------------------------ agents and edges, alive
+
+
+@contextmanager
+def start(*arguments: object, limit: str = "true") -> Iterator[subprocess.Popen]:
+    """`share ARGUMENTS` as a process, after the shell command `limit`."""
+    command = ["bash", "-c", f'{limit}; exec "$@"', "-", *SHARE, *map(str, arguments)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, **pipes) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def end(process: subprocess.Popen, ask: bool = True, said: str = "") -> Done:
+    """Wait for its end, after Ctrl-C if `ask`. said: what has been read of its stderr."""
+    if ask:
+        process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=20)
+    return Done(process.returncode, out, said + err)
+
+
+@contextmanager
+def edge(out: Path) -> Iterator[tuple[subprocess.Popen, str]]:
+    """An edge that listens, and its address."""
+    with start(*EDGE, out) as process:
+        line = process.stderr.readline()
+        assert line.startswith("listening on tcp://127.0.0.1:")
+        yield process, line.split()[2].rstrip(",")
+
+
+def wait_for(what: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 15
+    while not what():
+        assert time.monotonic() < deadline, "did not happen in time"
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        *("", "localhost", "tcp://", "127.0.0.1:5555", "tcp://127.0.0.1", "tcp://127.0.0.1:port"),
+        *("tcp://h:65536", "udp://127.0.0.1:5555", "tcp://a b:1", "tcp://::1:5555", "tcp://h:1:2"),
+    ],
+)
+def test_addresses_that_are_none(address, room, share, tmp_path):
+    expected = f"'{address}' is not an address; expected tcp://HOST:PORT, such as tcp://127.0.0.1:5555"
+    with untouched(tmp_path):
+        assert expected in complaint(share(*as_agent(room / "ar1", tmp_path / "out", address)), 2)
+        assert expected in complaint(share("edge", "--bind", address, "--out", tmp_path / "out"), 2)
+
+
+def test_addresses_that_cannot_be_used(room, share, tmp_path):
+    def agent_at(address: str) -> Done:
+        return share(*as_agent(room / "ar1", tmp_path / "out", address))
+
+    with untouched(tmp_path):
+        assert "is not an address" in complaint(agent_at("tcp://127.0.0.1:0"), 2)
+        assert "'-' cannot be the name of a machine" in complaint(agent_at("tcp://-:5555"), 2)
+        for host in ("0.0.0.0", "192.0.2.1", "[::]", "some.host"):
+            done = share("edge", "--bind", f"tcp://{host}:5555", "--out", tmp_path / "out")
+            assert "without keys; bind tcp://127.0.0.1:5555" in complaint(done, 2)
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "../x", ".hidden", "a b", "x" * 65])
+def test_names_that_no_file_could_have(name, room, share, tmp_path):
+    done = share(*as_agent(room / "ar1", tmp_path / "out", name=name))
+    assert f"--name '{name}': use 1 to 64 letters" in complaint(done, 2)
+    assert os.listdir(tmp_path) == []
+
+
+def test_an_edge_that_never_answers(room, share, tmp_path):
+    """Tracking is what `share track` makes of it, to the last digit; everything is written."""
+    config = tmp_path / "quick.yaml"
+    config.write_text("link: {silent_s: 0.4}\nagent: {finish_s: 0.2}")
+    done = share(*as_agent(room / "ar1", tmp_path / "out"), "--config", config)
+    assert done.code == 1
+    assert f"{FRAMES} of {FRAMES} frames tracked" in done.out
+    assert done.err.splitlines() == [
+        "share agent: no edge answers yet; tracking goes on alone",
+        f"share: no edge ever answered at {NOBODY}; is `share edge` running there?",
+    ]
+    assert sorted(os.listdir(tmp_path / "out")) == ["latency.csv", "map.tum", "odom.tum", "report.json"]
+    assert (tmp_path / "out" / "map.tum").read_bytes() == b""
+    assert share("track", room / "ar1", "--out", tmp_path / "T.tum").code == 0
+    assert (tmp_path / "out" / "odom.tum").read_bytes() == (tmp_path / "T.tum").read_bytes()
+
+
+def test_an_agent_leaves_a_damaged_image_out(damaged, share, tmp_path):
+    with edge(tmp_path / "edge") as (server, address):
+        done = share(*as_agent(damaged, tmp_path / "out", address))
+        assert end(server).code == 0
+    assert done.code == 0
+    left_out = [line for line in done.err.splitlines() if "left out" in line]
+    assert len(left_out) == 1
+    assert left_out[0].startswith(f"share agent: a frame is left out: {damaged}/mav0/cam1/data/")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert (report["damaged_images"], report["frames"], report["tracked"]) == (1, FRAMES - 1, FRAMES - 1)
+
+
+def test_two_of_one_name_and_two_in_one_folder(stereo, room, share, tmp_path):
+    """Both newcomers are refused; the first agent goes on, and Ctrl-C ends it and the edge in good order."""
+    slow = longer(stereo, tmp_path / "slow", 600, 0.05)
+    first, report = tmp_path / "first", tmp_path / "first" / "report.json"
+    with (
+        edge(tmp_path / "edge") as (server, address),
+        start(*as_agent(slow, first, address)) as agent,
+    ):
+        said = agent.stderr.readline()
+        assert said == "share agent: connected to the edge\n"
+        refused = complaint(share(*as_agent(room / "ar2", tmp_path / "second", address)), 2)
+        assert "the edge refuses 'ann': the name 'ann' is in use by another agent" in refused
+        assert "choose another with --name" in refused
+        assert os.listdir(tmp_path / "second") == []
+        refused = complaint(share(*as_agent(room / "ar2", first, address, name="bob")), 2)
+        assert f"{first}: another run is writing there; give another --out" in refused
+        assert "another run is writing there" in complaint(share(*EDGE, tmp_path / "edge"), 2)
+        done, served = end(agent, said=said), end(server)
+    assert (done.code, done.err) == (0, said)
+    poses = (first / "odom.tum").read_text().splitlines()
+    assert 0 < len(poses) == json.loads(report.read_text())["tracked"] < 600
+    assert sorted(os.listdir(first)) == ["latency.csv", "map.tum", "odom.tum", "report.json"]
+    assert served.code == 0
+    assert sorted(os.listdir(tmp_path / "edge")) == ["edge.json", "events.jsonl"]
+    assert set(json.loads((tmp_path / "edge" / "edge.json").read_text())["agents"]) == {"ann"}
+    events = [json.loads(line) for line in (tmp_path / "edge" / "events.jsonl").read_text().splitlines()]
+    assert [e["reason"] for e in events if e["event"] == "refused"][:1] == [refused_reason()]
+
+
+def refused_reason() -> str:
+    return "the name 'ann' is in use by another agent; choose another with --name"
+
+
+def test_a_port_in_use(share, tmp_path):
+    old = tmp_path / "old"
+    old.mkdir()
+    (old / "events.jsonl").write_text("an older run\n")
+    with edge(tmp_path / "edge") as (_, address), untouched(old):
+        done = share("edge", "--bind", address, "--out", old)
+    assert complaint(done, 1) == (
+        f"share: {address}: the port is in use; stop the other edge or choose another port\n"
+    )
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_an_edge_whose_disk_is_full_serves_on(room, share, tmp_path):
+    out = tmp_path / "edge"
+    out.mkdir()
+    (out / "events.jsonl").symlink_to("/dev/full")
+    with edge(out) as (server, address):
+        assert share(*as_agent(room / "ar1", tmp_path / "out", address)).code == 0
+        done = end(server)
+    assert done.code == 1
+    assert done.err.count("No space left on device; the run goes on without it") == 1
+    reason = f"share: {out}/events.jsonl: is not complete: No space left on device"
+    assert done.err.splitlines()[-1] == reason
+    ann = json.loads((out / "edge.json").read_text())["agents"]["ann"]
+    assert (ann["poses"] > 0, ann["keyframes"] > 0) == (True, True)
+
+
+def test_an_agent_whose_disk_is_full_tracks_on(room, tmp_path):
+    """A limit on file size stands for the disk: 1 kB is full after a few poses."""
+    with edge(tmp_path / "edge") as (server, address):
+        with start(*as_agent(room / "ar1", tmp_path / "out", address), limit="ulimit -f 1") as agent:
+            done = end(agent, ask=False)
+        assert end(server).code == 0
+    assert done.code == 1
+    odom, in_map = (tmp_path / "out" / f"{name}.tum.partial" for name in ("odom", "map"))
+    assert done.err.splitlines() == [
+        "share agent: connected to the edge",
+        *(
+            f"share agent: {file}: cannot be written: File too large; the run goes on without it"
+            for file in (odom, in_map)
+        ),
+        f"share: {odom}: is not complete: File too large",
+    ]
+    assert sorted(os.listdir(tmp_path / "out")) == [in_map.name, odom.name]
+    lines = odom.read_text().splitlines()
+    assert len(lines) > 5
+    assert {len(line.split()) for line in lines} == {8}
+    assert odom.read_text().endswith("\n")
+    ann = json.loads((tmp_path / "edge" / "edge.json").read_text())["agents"]["ann"]
+    assert ann["poses"] > FRAMES / 2
