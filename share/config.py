@@ -50,6 +50,7 @@ class TrackerConfig:
     reobserve_m: float = 1.0  # which of them: no further away than this,
     reobserve_rad: float = 0.5  # and turned by no more than this
     reobserve_px: float = 3.0  # px; and are taken up again if found so near to where they should be
+    relocalise_hosts: int = 8  # keyframes of the local map that a LOST frame is compared with
     new_stretch_s: float = 3.0  # LOST this long: odometry begins anew
     max_speed_m_s: float = 5.0  # a pose that implies more is not believed
     max_turn_rad_s: float = 12.0  # the same, for turning

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 @options.frames
 @click.option("--out", metavar="DIR", help="Write odom.tum, map.tum, latency.csv and report.json here.")
 @options.config
+@options.verbose
 @options.as_json
 def agent(
     source: str,
@@ -35,6 +36,7 @@ def agent(
     frames: slice | None,
     out: str | None,
     config_file: str | None,
+    verbose: bool,
     as_json: bool,
 ) -> None:
     """Track one agent at sensor rate, send keyframes to an edge, and take its corrections.
@@ -61,7 +63,9 @@ def agent(
     hello = Hello(options.agent_name(name), AgentKind(kind), run_id, rig.cam0.focal, rig.T_body_cam0)
     live = _LiveLine(opened.images_count)
     folder = None if out is None else Path(out)
-    run = AgentRun(opened, hello, settings, lambda: connect(address, run_id), folder, live.say, live.show)
+    run = AgentRun(
+        opened, hello, settings, lambda: connect(address, run_id), folder, live.say, live.show, verbose
+    )
     with on_stop(run.stop):
         run.go()
     live.end()

@@ -68,3 +68,9 @@ def say_notes(source: Source) -> None:
     """What a person should know of a recording, such as streams that are not used: a line each on stderr."""
     for note in source.notes:
         click.echo(f"share: {source.name}: {note}", err=True)
+
+
+def say_counters(counters: dict[str, int]) -> None:
+    """What the sequencer met, on stderr: one line, without what never happened."""
+    met = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counters.items() if count)
+    click.echo(f"sequencer: {met or 'nothing'}", err=True)

@@ -20,6 +20,7 @@ from share.errors import DataError, UsageError
 @click.option("--out", metavar="T.tum", help="Write the causal poses of the body in odom here.")
 @click.option("--report", "report_file", metavar="R.json", help="Write the report here.")
 @options.config
+@options.verbose
 @options.as_json
 def track(
     source: str,
@@ -28,6 +29,7 @@ def track(
     out: str | None,
     report_file: str | None,
     config_file: str | None,
+    verbose: bool,
     as_json: bool,
 ) -> None:
     """Track one agent over a recording, without an edge, as fast as it goes.
@@ -57,12 +59,14 @@ def track(
             f"{opened.name}: none of its {run.report['frames']} frames could be tracked; are they dark, "
             "blurred or bare, or is the calibration another camera's?"
         )
-    ate = accuracy(run, truth)
+    ate = accuracy(run, truth) if run.report["stretches"] == 1 else None
     report = {**run.report, "ate_m": ate.rmse if ate else None}
     texts = {"--out": format_tum(run.trajectory), "--report": json.dumps(report, indent=2) + "\n"}
     for option, path in wanted.items():
         atomic_write(path, texts[option])
     click.echo(json.dumps(report) if as_json else _summary(report, ate))
+    if verbose:
+        options.say_counters(report["sequencer"])
 
 
 def _targets(named: dict[str, str | None], source: str) -> dict[str, Path]:
@@ -86,6 +90,10 @@ def _summary(report: dict[str, Any], ate: Any) -> str:
         f"{report['cpu_ms_per_frame']:.1f} ms CPU a frame, "
         f"and {report['decode_ms_per_frame']:.1f} ms to decode it",
     ]
+    if report["stretches"] > 1:
+        lines.append(
+            f"odometry broke: {report['stretches']} stretches, whose poses do not compare with each other"
+        )
     if ate:
         lines.append(
             f"ATE {100 * ate.rmse:.2f} cm rms, {100 * ate.max:.2f} cm at most "

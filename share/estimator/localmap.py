@@ -81,13 +81,13 @@ class LocalMap:
         return rows[inside], px[inside].astype(np.float32)
 
     def hosts_near(self, T_odom_cam: F64, max_m: float, max_rad: float) -> list[int]:
-        """Keyframes seen from about here, nearest first."""
+        """Keyframes seen from about here, nearest first; one metre weighs as much as one radian."""
         numbers = np.array(sorted(self.keyframes), np.int64)
         if len(numbers) == 0:
             return []
         distance, angle = self._apart(T_odom_cam, numbers)
         near = (distance < max_m) & (angle < max_rad)
-        cost = distance / max_m + angle / max_rad
+        cost = distance + angle
         return [int(n) for n in numbers[near][np.argsort(cost[near], kind="stable")]]
 
     def _apart(self, T_odom_cam: F64, numbers: I64) -> tuple[F64, F64]:
@@ -97,7 +97,7 @@ class LocalMap:
         return distance, np.arccos(np.clip((trace - 1) / 2, -1, 1))
 
     def _most_redundant(self) -> int:
-        """The older keyframe of the closest pair; one metre weighs as much as one radian."""
+        """The older keyframe of the closest pair."""
         numbers = np.array(sorted(self.keyframes), np.int64)
         nearest = np.full(len(numbers), np.inf)
         for i in range(len(numbers) - 1):  # the newest is never dropped

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import poselib
 from numpy.typing import NDArray
 
 from share.geometry import se3
@@ -25,8 +26,6 @@ def consensus(points: F64, uv: F64, focal: float, threshold_px: float, seed: int
 
     points: (N, 3) m, world. uv: (N, 2) normalised. focal turns them into px for the threshold.
     """
-    import poselib
-
     if len(points) < 4:
         return None
     camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}

@@ -1,47 +1,50 @@
-"""Finding oneself again in one's own local map, with no idea of where one is."""
+"""Finding oneself again among keyframes one has been at."""
 
 from __future__ import annotations
 
-import cv2
+from collections.abc import Sequence
+
 import numpy as np
 
 from share.config import TrackerConfig
-from share.estimator.localmap import LocalMap
-from share.estimator.pose import consensus, refine
+from share.estimator.localmap import LocalKeyframe
+from share.estimator.pose import PoseEstimate, consensus, refine
 from share.geometry import se3
 from share.geometry.camera import Rig
-from share.types import F64, Frame
+from share.place.matching import match
+from share.types import F64, U8, Frame
 from share.vision.view import orb
 
 MAX_HAMMING = 64  # of 256 bits
-RATIO = 0.8  # Lowe's: the best match must be this much nearer than the second
+RATIO = 0.8  # the best match must be so much nearer than the second (Lowe 2004)
 
 
-def find(local_map: LocalMap, frame: Frame, rig: Rig, config: TrackerConfig, seed: int) -> F64 | None:
-    """T_odom_cam (4, 4) of the frame by matching its ORB features with every keyframe, or None."""
+def find(
+    keyframes: Sequence[LocalKeyframe], frame: Frame, rig: Rig, config: TrackerConfig, seed: int
+) -> F64 | None:
+    """T_odom_cam (4, 4) of the frame by its ORB features, from the keyframe that most of them agree with.
+
+    Twice as many inliers are asked for as tracking needs: nothing else vouches for the answer.
+    """
     px, descriptors = orb(frame.image0, config.view_features)
     uv = rig.cam0.normalise(px.astype(np.float64))
-    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
-    best, best_inliers = None, 2 * config.min_inliers - 1
-    for keyframe in reversed(local_map.keyframes.values()):
-        view = keyframe.view
-        if view is None:
-            continue
-        known = np.flatnonzero(~np.isnan(view.points[:, 0]))
-        pairs = matcher.knnMatch(descriptors, view.descriptors[known], k=2) if len(px) else ()
-        good = [m for m, *n in pairs if n and m.distance < min(MAX_HAMMING, RATIO * n[0].distance)]
-        points = (
-            se3.transform(
-                keyframe.T_odom_cam, view.points[known[[m.trainIdx for m in good]]].astype(np.float64)
-            )
-            if good
-            else np.zeros((0, 3))
-        )
-        seen = uv[[m.queryIdx for m in good]] if good else np.zeros((0, 2))
-        first = consensus(points, seen, rig.cam0.focal, config.ransac_px, seed)
-        if first is None or first.inliers.sum() <= best_inliers:
-            continue
-        sigma = np.full(len(points), config.noise_px)
-        best_inliers = int(first.inliers.sum())
-        best = refine(first.T, points, seen, rig.cam0.focal, sigma, config.gate_sigma).T
-    return None if best is None else se3.inverse(best)
+    found = (_against(keyframe, uv, descriptors, rig.cam0.focal, config, seed) for keyframe in keyframes)
+    best = max((f for f in found if f is not None), key=lambda f: f.inliers.sum(), default=None)
+    if best is None or best.inliers.sum() < 2 * config.min_inliers:
+        return None
+    return se3.inverse(best.T)
+
+
+def _against(
+    keyframe: LocalKeyframe, uv: F64, descriptors: U8, focal: float, config: TrackerConfig, seed: int
+) -> PoseEstimate | None:
+    if keyframe.view is None:
+        return None
+    known = np.flatnonzero(~np.isnan(keyframe.view.points[:, 0]))
+    pairs = match(descriptors, keyframe.view.descriptors[known], MAX_HAMMING, RATIO)
+    points = keyframe.view.points[known[pairs[:, 1]]].astype(np.float64)
+    points, seen = se3.transform(keyframe.T_odom_cam, points), uv[pairs[:, 0]]
+    first = consensus(points, seen, focal, config.ransac_px, seed)
+    if first is None:
+        return None
+    return refine(first.T, points, seen, focal, np.full(len(points), config.noise_px), config.gate_sigma)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from share.config import TrackerConfig
 from share.estimator import gravity, relocalise
-from share.estimator.localmap import LocalMap
+from share.estimator.localmap import LocalKeyframe, LocalMap
 from share.estimator.pose import PoseEstimate, consensus, refine
 from share.geometry import se3
 from share.geometry.camera import Rig
@@ -81,6 +81,7 @@ class VisualTracker:
         self._T_odom_keyframe = np.eye(4)
         self._new_stretch = True  # of the last keyframe
         self._lost_since_ns: int | None = None
+        self._places_tried = 0
 
     def track(self, frame: Frame) -> TrackResult:
         """The pose of this frame, causal. Frames must come with rising stamps."""
@@ -109,11 +110,12 @@ class VisualTracker:
 
     def _follow(self, frame: Frame, T_last: F64) -> TrackResult:
         dt = (frame.stamp_ns - self._stamp_ns) * 1e-9
-        T_predicted = T_last @ se3.exp(self._velocity * dt)
+        # Over a gap the last velocity says nothing.
+        T_predicted = T_last if frame.gap_ns else T_last @ se3.exp(self._velocity * dt)
         tracks = self._find(frame.image0, T_predicted)
         estimate, tracks = self._pose(tracks)
         if estimate is None or not self._plausible(T_last, estimate, dt):
-            self._lost_since_ns, self._velocity = frame.stamp_ns, np.zeros(6)
+            self._lost_since_ns, self._velocity, self._places_tried = frame.stamp_ns, np.zeros(6), 0
             return TrackResult(TrackState.LOST, None)
         T_odom_cam = se3.inverse(estimate.T)
         self._velocity = se3.log(se3.inverse(T_last) @ T_odom_cam) / dt
@@ -248,7 +250,7 @@ class VisualTracker:
         """Find ourselves in the local map; after a while, begin a new stretch where we were lost."""
         assert self._lost_since_ns is not None
         config = self._config
-        found = relocalise.find(self._map, frame, self._rig, config, self._seed)
+        found = relocalise.find(self._next_places(), frame, self._rig, config, self._seed)
         waited_s = (frame.stamp_ns - self._lost_since_ns) * 1e-9
         if found is not None:
             self._T_odom_cam, self._tracks = found, _NO_TRACKS
@@ -262,6 +264,15 @@ class VisualTracker:
             return TrackResult(TrackState.LOST, None)
         self._lost_since_ns = None
         return TrackResult(TrackState.WEAK, self._T_odom_body(), True, len(self._tracks.ids), found is None)
+
+    def _next_places(self) -> list[LocalKeyframe]:
+        """Some of the local map's keyframes, nearest to where we were first, others at the next frame:
+        looking at all of them would make a live camera's frames late."""
+        assert self._T_odom_cam is not None
+        hosts = self._map.hosts_near(self._T_odom_cam, np.inf, np.inf)
+        first = self._places_tried % max(len(hosts), 1)
+        self._places_tried += self._config.relocalise_hosts
+        return [self._map.keyframes[n] for n in hosts[first : first + self._config.relocalise_hosts]]
 
     def _T_odom_body(self) -> F64:
         assert self._T_odom_cam is not None

@@ -40,6 +40,7 @@ class RunLog:
     _rows: list[FrameRow] = field(default_factory=list)
     cpu_s: float = 0.0  # process CPU time of the tracking pipeline
     decode_s: float = 0.0  # CPU time of image decoding
+    stretches: int = 0  # of unbroken odometry; poses of different ones do not compare
     _by_stamp: dict[int, FrameRow] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -80,6 +81,7 @@ class RunLog:
             "keyframes": sum(r.keyframe for r in rows),
             "sent": sent,
             "lost_s": _lost_s(rows),
+            "stretches": self.stretches,
             "track_ms": parts.track_ms.report(),
             "corrected_ms": parts.corrected_ms.report(),
             "latency_ms": parts.latency_ms.report(),

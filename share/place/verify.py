@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import poselib
 
 from share.config import PlaceConfig
 from share.geometry import se3
@@ -132,8 +133,6 @@ def _both_ways(y_q: F64, y_c: F64, focal_q: float, focal_c: float, config: Place
 
 def _absolute_pose(source: F64, target: F64, focal: float, whose: str, config: PlaceConfig, seed: int) -> F64:
     """T_target_source from 3D points of the source seen by the target (LO-RANSAC + P3P, poselib)."""
-    import poselib
-
     known = np.isfinite(source[:, 2])
     _need(int(known.sum()), config.min_direction_inliers, f"matches with the {whose} depth")
     y = source[known]

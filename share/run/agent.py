@@ -72,9 +72,10 @@ class AgentRun:
         out: Path | None,
         say: Callable[[str], None],
         show: Callable[[Status], None] = lambda status: None,
+        verbose: bool = False,
     ) -> None:
         self._source, self._settings = source, settings
-        self._say, self._show = say, show
+        self._say, self._show, self._verbose = say, show, verbose
         self._machine = Agent(hello, settings)
         self._tracker = tracker_for(source, settings)
         self._files, self._log = AgentFiles(out, say), RunLog()
@@ -182,6 +183,7 @@ class AgentRun:
             new_stretch=result.new_stretch,
         )
         self._post(tracked)  # the pose goes out before others are served
+        self._log.stretches += result.new_stretch
         if result.keyframe:
             self._post(ev.KeyframeMade(tracked, self._tracker.keyframe(frame)))
         self._log.cpu_s += time.thread_time() - cpu
@@ -219,6 +221,8 @@ class AgentRun:
             case ev.CorrectionApplied():
                 if effect.stamp_ns is not None and effect.corrected_ms is not None:
                     self._log.mark_corrected(effect.stamp_ns, effect.corrected_ms)
+                if self._verbose:
+                    self._say(_correction(effect))
             case ev.Say():
                 self._say(effect.text)
             case ev.Fail():
@@ -241,3 +245,9 @@ class AgentRun:
             "version": __version__,
             "config": config.to_mapping(self._settings),
         }
+
+
+def _correction(effect: ev.CorrectionApplied) -> str:
+    after = "" if effect.corrected_ms is None else f", {effect.corrected_ms:.0f} ms after its frame"
+    answers = "" if effect.keyframe is None else f", answers keyframe {effect.keyframe}{after}"
+    return f"correction {effect.revision} of map {effect.map_id}{answers}"
