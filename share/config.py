@@ -6,6 +6,7 @@ configuration is written beside the results of every run.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import types as _types
@@ -16,6 +17,7 @@ from typing import Any, TypeVar
 from share.errors import ConfigError
 
 T = TypeVar("T")
+_MOST = 1e9  # no setting means anything beyond; NaN and infinity are refused with it
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,9 @@ class SequencerConfig:
     reorder_ms: float = 0.0  # disorder within one stream that is put right; delays frames by as much
     gap_factor: float = 2.5  # a step longer than this many frame intervals is a gap
     max_jump_s: float = 10.0  # a longer step needs three witnesses to be believed, backward never is
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "imu_silent_ms", "gap_factor", "max_jump_s")
 
 
 @dataclass(frozen=True)
@@ -49,11 +54,15 @@ class TrackerConfig:
     reobserve_hosts: int = 6  # earlier keyframes whose points are looked for again
     reobserve_m: float = 1.0  # which of them: no further away than this,
     reobserve_rad: float = 0.5  # and turned by no more than this
-    reobserve_px: float = 3.0  # px; and are taken up again if found so near to where they should be
+    reobserve_px: float = 3.0  # and are taken up again if found so near to where they should be
     relocalise_hosts: int = 8  # keyframes of the local map that a LOST frame is compared with
     new_stretch_s: float = 3.0  # LOST this long: odometry begins anew
     max_speed_m_s: float = 5.0  # a pose that implies more is not believed
     max_turn_rad_s: float = 12.0  # the same, for turning
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "corners", "spacing_px", "view_features", "noise_px", "ransac_px")
+        _require_positive(self, "gate_sigma", "min_inliers", "max_keyframes")
 
 
 @dataclass(frozen=True)
@@ -230,7 +239,12 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     accepted = typing.get_args(hint) if isinstance(hint, _types.UnionType) else (hint,)
     if value is None and type(None) in accepted:
         return None
-    if float in accepted and isinstance(value, int) and not isinstance(value, bool):
+    if float in accepted and isinstance(value, str):  # PyYAML reads 1e-3 as text
+        with contextlib.suppress(ValueError):
+            value = float(value)
+    if type(value) in (int, float) and not 0 <= value <= _MOST:
+        raise ConfigError(f"{where}: expected a number from 0 to {_MOST:g}, found {value}")
+    if float in accepted and type(value) is int:
         return float(value)
     for kind in accepted:
         if isinstance(kind, type) and type(value) is kind:

@@ -306,7 +306,14 @@ CONFIGS = {
     "wrong type": ("tracker: {corners: many}", "tracker: corners: expected int, found 'many'"),
     "a number": ("tracker: 5", "tracker: expected a mapping of settings, found int"),
     "out of range": ("link: {window: 0}", "link: window: 0 must be positive"),
-    "not finite": ("link: {ping_s: .nan}", "link: ping_s"),
+    "zero": ("tracker: {corners: 0}", "tracker: corners: 0 must be positive"),
+    "negative": (
+        "tracker: {spacing_px: -1}",
+        "tracker: spacing_px: expected a number from 0 to 1e+09, found -1",
+    ),
+    "huge": ("tracker: {corners: 1" + 400 * "0" + "}", "tracker: corners: expected a number from 0 to 1e+09"),
+    "not a number": ("link: {ping_s: .nan}", "link: ping_s: expected a number from 0 to 1e+09, found nan"),
+    "infinite": ("sequencer: {sync_tolerance_ms: .inf}", "from 0 to 1e+09, found inf"),
 }
 
 
@@ -319,6 +326,13 @@ def test_configuration(case, command, share, tmp_path):
         path.write_text(text)
     with untouched(tmp_path):
         assert said in complaint(share(*command("nowhere", tmp_path / "out"), "--config", path), 2)
+
+
+def test_numbers_are_read_as_people_write_them(room, share, tmp_path):
+    (tmp_path / "config.yaml").write_text("graph: {relative_tolerance: 1e-5}\ntracker: {noise_px: 2}\n")
+    done = share("track", room / "ar1", "--config", tmp_path / "config.yaml", "--frames", ":3", "--json")
+    used = json.loads(done.out)["config"]
+    assert (done.code, used["graph"]["relative_tolerance"], used["tracker"]["noise_px"]) == (0, 1e-5, 2.0)
 
 
 # ------------------------------------------------------------------ where results go
