@@ -91,6 +91,12 @@ class PlaceConfig:
     floor_deg: float = 0.1  # added to what the residuals say: what inliers do not average away
     floor_m: float = 0.005  # the same, for the position
 
+    def __post_init__(self) -> None:
+        _require_positive(self, "candidates", "tables", "hash_bits", "ransac_px", "ransac_iterations")
+        _require_positive(self, "sigma_px", "inlier_chi2", "agree_depth_ratio")
+        if self.hash_bits > 24:
+            raise ValueError(f"hash_bits: {self.hash_bits} must be at most 24")
+
 
 @dataclass(frozen=True)
 class AgentConfig:
@@ -151,6 +157,9 @@ class GraphConfig:
     max_iterations: int = 100  # of Levenberg-Marquardt
     relative_tolerance: float = 1e-6  # of the cost, between two iterations
     anchor_sigma: float = 1e-4  # rad and m; holds the gauge, removed again after solving
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "cauchy", "max_iterations", "relative_tolerance", "anchor_sigma")
 
 
 @dataclass(frozen=True)

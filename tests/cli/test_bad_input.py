@@ -309,9 +309,10 @@ CONFIGS = {
     "zero": ("tracker: {corners: 0}", "tracker: corners: 0 must be positive"),
     "negative": (
         "tracker: {spacing_px: -1}",
-        "tracker: spacing_px: expected a number from 0 to 1e+09, found -1",
+        "spacing_px: expected a number from 0 to 1e+09, found -1",
     ),
     "huge": ("tracker: {corners: 1" + 400 * "0" + "}", "tracker: corners: expected a number from 0 to 1e+09"),
+    "too many bits": ("place: {hash_bits: 30}", "place: hash_bits: 30 must be at most 24"),
     "not a number": ("link: {ping_s: .nan}", "link: ping_s: expected a number from 0 to 1e+09, found nan"),
     "infinite": ("sequencer: {sync_tolerance_ms: .inf}", "from 0 to 1e+09, found inf"),
 }
