@@ -199,7 +199,12 @@ nested = st.recursive(
 )
 
 
-@given(
+def _message(code: int, scalars: object, table: list, frames: list[bytes]) -> list[bytes]:
+    return [header(1, min(max(code, -(2**63)), 2**64 - 1), scalars, table), *frames]
+
+
+wrong_content = st.builds(
+    _message,
     st.sampled_from(sorted(codec._BY_CODE)) | st.integers(),
     nested,
     st.lists(
@@ -209,12 +214,12 @@ nested = st.recursive(
     ),
     st.lists(st.binary(max_size=160), max_size=7),
 )
+
+
+@given(wrong_content)
 @settings(max_examples=1500, deadline=None)
-def test_well_formed_headers_with_wrong_content(
-    code: int, scalars: object, table: list, frames: list
-) -> None:
-    code = min(max(code, -(2**63)), 2**64 - 1)
-    refused([header(1, code, scalars, table), *frames])
+def test_well_formed_headers_with_wrong_content(frames: list[bytes]) -> None:
+    refused(frames)
 
 
 def mutate(rng: np.random.Generator, frames: list[bytes], others: list[list[bytes]]) -> list[bytes]:
@@ -251,6 +256,12 @@ def mutate(rng: np.random.Generator, frames: list[bytes], others: list[list[byte
     return frames
 
 
+def one_injured(seed: int) -> list[bytes]:
+    rng = np.random.default_rng(seed)
+    valid = [copied(codec.encode(message)) for message in EXAMPLES]
+    return mutate(rng, valid[rng.integers(len(valid))], valid)
+
+
 def injured(seed: int, cases: int) -> Counter[bool]:
     """How many of so many injured messages are refused; the others hit where any value is a value."""
     rng = np.random.default_rng(seed)
@@ -260,6 +271,13 @@ def injured(seed: int, cases: int) -> Counter[bool]:
 
 def test_a_hundred_thousand_injured_messages() -> None:
     assert injured(seed=3, cases=100_000)[True] > 80_000
+
+
+@pytest.mark.slow
+@given(wrong_content | st.lists(st.binary(max_size=200), max_size=8) | st.integers(0, 2**63).map(one_injured))
+@settings(max_examples=100_000, deadline=None, database=None)
+def test_a_hundred_thousand_cases_of_hypothesis(frames: list[bytes]) -> None:
+    refused(frames)
 
 
 def test_injured_messages_leave_nothing_behind() -> None:
