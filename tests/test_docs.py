@@ -1,0 +1,108 @@
+"""What the documentation says of commands, settings and files is so."""
+
+from __future__ import annotations
+
+import re
+import runpy
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+
+from share.cli.main import cli
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *ROOT.glob("*/README.md")])
+TOOL: dict[str, Any] = runpy.run_path(str(ROOT / "tools" / "config_table.py"))
+COMMANDS = (ROOT / "docs" / "commands.md").read_text()
+
+
+def commands(group: click.Group, name: str = "share") -> dict[str, click.Command]:
+    """All that do something, by their full name."""
+    out = {}
+    for word in group.list_commands(click.Context(group)):
+        command = group.get_command(click.Context(group), word)
+        assert command is not None
+        full = f"{name} {word}"
+        out |= commands(command, full) if isinstance(command, click.Group) else {full: command}
+    return out
+
+
+def documented() -> dict[str, str]:
+    """The sections of docs/commands.md that are about one command, by its full name."""
+    parts = re.split(r"^## `(share [a-z ]+)`\n", COMMANDS, flags=re.MULTILINE)[1:]
+    return dict(zip(parts[::2], parts[1::2], strict=True))
+
+
+def options(command: click.Command) -> set[str]:
+    return {max(p.opts, key=len) for p in command.params if isinstance(p, click.Option)}
+
+
+def anchors(page: Path) -> set[str]:
+    """As GitHub makes them of headings."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
+
+
+def test_configuration_page_is_up_to_date() -> None:
+    _head, marker, table = TOOL["PAGE"].read_text().partition(TOOL["MARKER"])
+    assert marker, f"no line {TOOL['MARKER']!r}"
+    made = TOOL["page"](TOOL["sections"](TOOL["SOURCE"].read_text()))
+    assert table.strip() == made.strip(), "run `python tools/config_table.py --write`"
+
+
+def test_every_setting_says_what_it_is() -> None:
+    found = TOOL["sections"](TOOL["SOURCE"].read_text())
+    assert [f"{s.name}.{row.name}" for s in found for row in s.settings if not row.meaning] == []
+    assert [s.name for s in found if not s.about] == []
+
+
+def test_table_has_every_key_and_its_default() -> None:
+    from share.config import Config, to_mapping
+
+    found = TOOL["sections"](TOOL["SOURCE"].read_text())
+    told = {s.name: {row.name: row.default.strip("'") for row in s.settings} for s in found}
+    assert told == {s: {k: str(v) for k, v in keys.items()} for s, keys in to_mapping(Config()).items()}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    prose = re.sub(r"(?m)^ {4}.*$|`[^`]*`", "", page.read_text())
+    targets = re.findall(r"\]\(([^)\s]+)\)", prose) + re.findall(r'(?:src|srcset|href)="([^"]+)"', prose)
+    for target in targets:
+        if re.match(r"https?://", target):
+            continue
+        name, _, anchor = target.partition("#")
+        file = (page.parent / name).resolve() if name else page
+        assert file.exists(), f"{page.name}: {target}"
+        assert not anchor or anchor in anchors(file), f"{page.name}: {target}"
+
+
+def test_every_page_of_docs_can_be_reached_from_the_readme() -> None:
+    text = (ROOT / "README.md").read_text()
+    assert [p.name for p in (ROOT / "docs").glob("*.md") if f"docs/{p.name}" not in text] == []
+
+
+def test_commands_page_has_every_command_and_no_other() -> None:
+    assert set(documented()) == set(commands(cli))
+
+
+@pytest.mark.parametrize("name", sorted(commands(cli)))
+def test_commands_page_has_every_option_and_no_other(name: str) -> None:
+    rows = re.findall(r"^\| `[^|]*?(--[a-z]+)", documented()[name], flags=re.MULTILINE)
+    assert set(rows) == options(commands(cli)[name])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_examples_use_options_that_exist(page: Path) -> None:
+    """Every indented line that begins with a command."""
+    known = commands(cli)
+    text = page.read_text().replace("\\\n", " ")
+    for line in re.findall(r"^ {4}(?:\$ )?(share .+)$", text, flags=re.MULTILINE):
+        line = re.split(r"\s{2,}#|\s&", line)[0]
+        name = max((n for n in known if f"{line} ".startswith(f"{n} ")), key=len, default=None)
+        assert name or re.match(r"share (--|[a-z]+ --help)", line), f"{page.name}: {line}"
+        if name:
+            wrong = set(re.findall(r"(?<= )--[a-z]+", line)) - options(known[name]) - {"--help"}
+            assert not wrong, f"{page.name}: {line}"
