@@ -79,5 +79,5 @@ def test_unknown_and_missing_agents(session):
     (session / "rob.mcap").unlink()
     with pytest.raises(UsageError, match=r"rob\.mcap: no such file, although"):
         open_source(f"{session}/rob")
-    with pytest.raises(ShareError, match="none of the recordings"):
+    with pytest.raises(ShareError, match="is a session; name one of its agents"):
         open_source(str(session))
