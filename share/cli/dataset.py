@@ -34,9 +34,10 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
     Example:  share dataset info rec/kitchen
               share dataset info session/ann --json
     """
+    from share.io.describe import describe
     from share.io.source import open_source
 
-    description = open_source(source, calib, frames).describe()
+    description = describe(open_source(source, calib, frames))
     click.echo(json.dumps(description) if as_json else _text(description))
 
 
@@ -93,7 +94,7 @@ def recover(broken: str, out: str, as_json: bool) -> None:
     \b
     Example:  share dataset recover walk.mcap.part --out walk.mcap
     """
-    from share.io.recover import recover as run
+    from share.io.mcap.recover import recover as run
 
     path, target = Path(broken), Path(out)
     if not path.is_file():

@@ -17,7 +17,7 @@ from share.emulate.sensor import Sensor
 from share.geometry.se3 import inverse
 from share.io.files import atomic_write
 from share.io.images import EncodedImage
-from share.io.recorder import Recorder
+from share.io.mcap.recorder import Recorder
 from share.io.trajectory import Trajectory, format_tum
 from share.types import F64, U8
 

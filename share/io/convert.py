@@ -13,10 +13,10 @@ from share.core.measurement import CAM0, CAM1, IMU, LazyImage, Measurement
 from share.errors import UsageError
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise
-from share.io import ros_rig
 from share.io.files import atomic_write, check_writable, writable_dir, writing
 from share.io.images import EncodedImage, encode_png, image_format
-from share.io.recorder import Recorder
+from share.io.mcap import rig as ros_rig
+from share.io.mcap.recorder import Recorder
 from share.io.recording import Source
 from share.io.trajectory import Trajectory, format_tum
 from share.types import F64

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,12 +47,6 @@ class Source(ABC):
         steps = np.diff(self.stamps()[CAM0])
         steps = steps[steps > 0]
         return float(1e9 / np.median(steps)) if len(steps) else 0.0
-
-    def describe(self) -> dict[str, Any]:
-        """Plain data for `share dataset info`."""
-        from share.io.describe import describe
-
-        return describe(self)
 
 
 class Span(NamedTuple):

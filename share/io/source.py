@@ -25,7 +25,7 @@ class Reader(NamedTuple):
 
 
 def _open_mcap(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
-    from share.io.ros_mcap import open_mcap  # rosbags and mcap only where they are needed
+    from share.io.mcap.reader import open_mcap  # rosbags and mcap only where they are needed
 
     return open_mcap(path, calibration, frames)
 

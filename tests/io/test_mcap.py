@@ -15,11 +15,12 @@ from share.core.measurement import Measurement
 from share.errors import ConfigError, DataError, UsageError
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
-from share.io import ros_rig
-from share.io import ros_types as ros
 from share.io.convert import to_euroc, to_mcap
+from share.io.describe import describe
 from share.io.images import ArrayImage
-from share.io.recorder import Recorder
+from share.io.mcap import rig as ros_rig
+from share.io.mcap import types as ros
+from share.io.mcap.recorder import Recorder
 from share.io.source import open_source
 
 
@@ -61,7 +62,7 @@ def test_a_recording_comes_back_bit_for_bit(folder, tmp_path):
     assert_same_rig(source.rig, back.rig)
     np.testing.assert_allclose(back.truth().T, source.truth().T, atol=1e-8)
     assert sorted(os.listdir(out.parent)) == ["walk.mcap", "walk.truth.tum"]
-    assert back.describe()["streams"] == source.describe()["streams"]
+    assert describe(back)["streams"] == describe(source)["streams"]
     part = slice(2, 4)
     assert_same(frames(open_source(str(folder), frames=part)), frames(open_source(str(out), frames=part)))
 

@@ -12,8 +12,8 @@ from recordings import STEP_NS, make_tum
 
 from share.errors import DataError, UsageError
 from share.io.convert import to_mcap
-from share.io.recorder import Recorder
-from share.io.recover import recover
+from share.io.mcap.recorder import Recorder
+from share.io.mcap.recover import recover
 from share.io.source import open_source
 
 
@@ -80,7 +80,7 @@ def test_sigkill_leaves_a_file_that_can_be_recovered(tmp_path):
     out = tmp_path / "walk.mcap"
     code = (
         "import sys, time; sys.path[:0] = sys.argv[2:]\n"
-        "from pathlib import Path; from live import RIG, live; from share.io.recorder import Recorder\n"
+        "from pathlib import Path; from live import RIG, live; from share.io.mcap.recorder import Recorder\n"
         "with Recorder(Path(sys.argv[1]), RIG) as recorder:\n"
         "    for m in live(10**6):\n"
         "        recorder.write(m)\n"

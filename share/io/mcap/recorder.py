@@ -1,8 +1,8 @@
 """Recordings as MCAP with ROS 2 messages: Foxglove, rosbags and ROS 2 open them as they are.
 
-Topics are those of `share.io.ros_types.TOPICS`. The file grows under a temporary name (`.part`) in
+Topics are those of `share.io.mcap.types.TOPICS`. The file grows under a temporary name (`.part`) in
 chunks of at most 256 kB (or one image), and gets its name when it is closed in good order. What a
-crash leaves in the `.part`, `share.io.recover` brings back.
+crash leaves in the `.part`, `share.io.mcap.recover` brings back.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ import numpy as np
 from share.core.measurement import DEPTH, IMU, Measurement
 from share.errors import DataError, UsageError
 from share.geometry.camera import Rig
-from share.io import ros_images, ros_rig
-from share.io import ros_types as ros
 from share.io.files import check_writable, sync_folder, writing
 from share.io.images import EncodedImage, encode_jpeg
+from share.io.mcap import images as ros_images
+from share.io.mcap import rig as ros_rig
+from share.io.mcap import types as ros
 from share.types import F64
 
 CHUNK_BYTES = 256 * 1024

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from share.errors import DataError
 from share.geometry.camera import Camera
-from share.io import ros_types as ros
 from share.io.images import EncodedImage, check_size, depth_metres, image_format
+from share.io.mcap import types as ros
 from share.types import F32
 
 MILLIMETRES = 1000.0  # 16UC1 depth is in mm, 32FC1 in m: ROS REP 118

@@ -13,7 +13,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 from share.errors import DataError, UsageError
 from share.io.files import check_writable, sync_folder, writing
-from share.io.mcap_file import MAGIC, damage
+from share.io.mcap.file import MAGIC, damage
 
 
 class Recovered(NamedTuple):

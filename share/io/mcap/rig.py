@@ -17,7 +17,7 @@ from share.core.measurement import CAM0, CAM1, DEPTH, IMU
 from share.errors import ConfigError, DataError
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.io import ros_types as ros
+from share.io.mcap import types as ros
 from share.types import F64
 
 BODY = "body"

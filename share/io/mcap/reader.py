@@ -18,10 +18,11 @@ from share.core.measurement import CAM0, CAM1, DEPTH, IMU, STREAMS, Measurement
 from share.errors import ConfigError, DataError
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
-from share.io import ros_images, ros_rig
-from share.io import ros_types as ros
 from share.io.calibration import Calibration
-from share.io.mcap_file import McapFile, damage
+from share.io.mcap import images as ros_images
+from share.io.mcap import rig as ros_rig
+from share.io.mcap import types as ros
+from share.io.mcap.file import McapFile, damage
 from share.io.recording import Source, Span, span_of
 from share.io.trajectory import Trajectory, read_tum
 from share.types import F64, I64
