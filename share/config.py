@@ -70,6 +70,7 @@ class PlaceConfig:
     """When two views are taken for the same place."""
 
     candidates: int = 8  # keyframes verified per query, best first
+    enough: int = 3  # verified ones after which the rest is left alone
     tables: int = 8  # hash tables of the index
     hash_bits: int = 16  # descriptor bits that make a word in each of them
     index_seed: int = 1  # which bits
@@ -92,7 +93,9 @@ class PlaceConfig:
     floor_m: float = 0.005  # the same, for the position
 
     def __post_init__(self) -> None:
-        _require_positive(self, "candidates", "tables", "hash_bits", "ransac_px", "ransac_iterations")
+        _require_positive(
+            self, "candidates", "enough", "tables", "hash_bits", "ransac_px", "ransac_iterations"
+        )
         _require_positive(self, "sigma_px", "inlier_chi2", "agree_depth_ratio")
         if self.hash_bits > 24:
             raise ValueError(f"hash_bits: {self.hash_bits} must be at most 24")

@@ -47,7 +47,7 @@ class Query:
 
 @dataclass(frozen=True, eq=False)
 class Verify:
-    """Are they the same place?"""
+    """Are they the same place? Best candidates first; enough of them that are make the rest needless."""
 
     number: int
     sight: Sight
@@ -56,7 +56,12 @@ class Verify:
     kind: str = "verify"
 
     def run(self) -> dict[int, Verified | Refusal]:
-        return {n: verify(self.sight, sight, self.config) for n, sight in self.candidates.items()}
+        outcomes: dict[int, Verified | Refusal] = {}
+        for number, sight in self.candidates.items():
+            outcomes[number] = verify(self.sight, sight, self.config)
+            if sum(isinstance(outcome, Verified) for outcome in outcomes.values()) >= self.config.enough:
+                break
+        return outcomes
 
 
 @dataclass(frozen=True, eq=False)
