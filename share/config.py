@@ -180,6 +180,9 @@ class MergeConfig:
     drop_chi2: float = 1000.0  # a solved graph at odds with a loop by more than this drops it
 
 
+POLICIES = ("covins-g",)  # every keyframe is sent, every verified loop is merged
+
+
 @dataclass(frozen=True)
 class EdgeConfig:
     """How the edge serves its agents."""
@@ -188,6 +191,10 @@ class EdgeConfig:
     silent_s: float = 3.0  # nothing heard of an agent for this long: it is taken as gone
     name_hold_s: float = 3.0  # a name stays taken so long after its agent was last heard
     max_agents: int = 64  # present at a time; more are refused
+
+    def __post_init__(self) -> None:
+        if self.policy not in POLICIES:
+            raise ValueError(f"policy: '{self.policy}' is not known; known: {', '.join(POLICIES)}")
 
 
 @dataclass(frozen=True)

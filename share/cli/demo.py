@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli.progress import progress
+from share.config import POLICIES
 
 if TYPE_CHECKING:
     from share.metrics.ate import Ate
@@ -29,7 +30,7 @@ class _Seconds(click.FloatRange):
 
 @click.command()
 @click.option("--seconds", type=_Seconds(2, 600), default=20, show_default=True)
-@click.option("--policy", type=click.Choice(["covins-g"]), default="covins-g", show_default=True)
+@click.option("--policy", type=click.Choice(POLICIES), default=POLICIES[0], show_default=True)
 @click.option("--out", metavar="DIR", default="share-demo", show_default=True, help="Everything it leaves.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Which room.")
 def demo(seconds: float, policy: str, out: str, seed: int) -> None:

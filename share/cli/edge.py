@@ -10,23 +10,22 @@ from typing import Any
 import click
 
 from share.cli import options
+from share.config import POLICIES
 
 
 @click.command()
 @click.option("--bind", default="tcp://127.0.0.1:5555", show_default=True, metavar="tcp://H:P")
 @click.option(
     "--policy",
-    type=click.Choice(["covins-g"]),
-    default="covins-g",
-    show_default=True,
-    help="How agents are scheduled. covins-g: every keyframe is sent, every verified loop is merged.",
+    type=click.Choice(POLICIES),
+    help="How agents are scheduled. By default covins-g: every keyframe is sent, every loop merged.",
 )
 @click.option("--out", metavar="DIR", help="Write events.jsonl and edge.json here.")
 @options.config
 @options.verbose
 @options.as_json
 def edge(
-    bind: str, policy: str, out: str | None, config_file: str | None, verbose: bool, as_json: bool
+    bind: str, policy: str | None, out: str | None, config_file: str | None, verbose: bool, as_json: bool
 ) -> None:
     """Join the maps of all agents and send corrections back. Ctrl-C ends it.
 
@@ -45,18 +44,19 @@ def edge(
     from share.run.stop import on_stop
 
     parse_address(bind, bind=True)
-    settings = replace(settings, edge=replace(settings.edge, policy=policy))
+    if policy is not None:
+        settings = replace(settings, edge=replace(settings.edge, policy=policy))
     folder = None if out is None else Path(out)
     with closing(bind_link(bind)) as link:
         run = EdgeRun(settings, secrets.randbits(63), link, folder, lambda e: _tell(e, verbose))
         with on_stop(run.stop):
-            click.echo(f"listening on {link.endpoint}, policy {policy}", err=True)
+            click.echo(f"listening on {link.endpoint}, policy {settings.edge.policy}", err=True)
             report = run.go()
     click.echo(json.dumps(report) if as_json else _summary(report))
 
 
 _NEWS = {"joined the edge", "left", "back", "silent", "refused"}
-_NEWS |= {"maps joined", "merge taken out", "not written"}
+_NEWS |= {"maps joined", "job failed", "not written"}
 
 
 def _tell(event: dict[str, Any], verbose: bool) -> None:

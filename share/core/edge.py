@@ -12,7 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from share.config import Config
+from share import __version__
+from share.config import Config, to_mapping
 from share.core.inorder import InOrder
 from share.core.mapper import Finding, Job, Mapper
 from share.errors import WireError
@@ -241,24 +242,29 @@ class Edge:
         self._effects.append(Record({"t_s": t_s, "event": what, "agent": agent, "reason": reason, **fields}))
 
     def report(self) -> dict[str, Any]:
-        """edge.json: per agent and in all."""
-        agents = {
-            peer.hello.name: {
-                "kind": str(peer.hello.kind),
-                "run_id": peer.hello.run_id,
-                "state": str(peer.state),
-                "gone": peer.gone,
-                **{name: peer.counts[name] for name in _COUNTS},
-                **self._mapper.report_of(peer.key),
-            }
-            for peer in self._peers.values()
-        }
+        """edge.json: per agent and in all. An agent's earlier runs stand under their run's own key."""
+        newest = {peer.hello.name: peer for peer in self._peers.values()}
         return {
             "session": self._session,
             "policy": self._config.edge.policy,
-            "agents": agents,
+            "agents": {
+                peer.hello.name if newest[peer.hello.name] is peer else peer.key: self._report_of(peer)
+                for peer in self._peers.values()
+            },
             "strangers": dict(self._strangers),
             **self._mapper.report(),
+            "version": __version__,
+            "config": to_mapping(self._config),
+        }
+
+    def _report_of(self, peer: _Peer) -> dict[str, Any]:
+        return {
+            "kind": str(peer.hello.kind),
+            "run_id": peer.hello.run_id,
+            "state": str(peer.state),
+            "gone": peer.gone,
+            **{name: peer.counts[name] for name in _COUNTS},
+            **self._mapper.report_of(peer.key),
         }
 
 

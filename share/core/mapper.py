@@ -185,6 +185,7 @@ class Mapper:
                 "tried": sum(a.loops_tried for a in accounts),
                 "accepted": sum(a.loops_accepted for a in accounts),
                 "waiting": len(self._atlas.pending),
+                "in_map": len(self._atlas.loops),
             },
             "merges": {"requested": merges, "skipped": 0, "done": merges},
             "maps": {map_id: len(keys) for map_id, keys in self._atlas.maps().items()},

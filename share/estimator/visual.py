@@ -80,6 +80,7 @@ class VisualTracker:
         self._keyframe_tracks = 0
         self._T_odom_keyframe = np.eye(4)
         self._new_stretch = True  # of the last keyframe
+        self._to_anchor = False  # the last frame is to become a keyframe of the local map
         self._lost_since_ns: int | None = None
         self._places_tried = 0
 
@@ -95,10 +96,12 @@ class VisualTracker:
         return result
 
     def keyframe(self, frame: Frame) -> Candidate:
-        """What the frame just tracked shows to others; call it where `track` said keyframe.
+        """Make the frame just tracked a keyframe; call it where `track` said so. What it shows to others.
 
         Apart from `track`, because a headset should have its pose before this is computed.
         """
+        if self._to_anchor:
+            self._anchor(frame)
         view = make_view(frame, self._rig, self._config.view_features)
         self._map.set_view(view)
         T_odom_body = self._T_odom_body()
@@ -124,7 +127,7 @@ class VisualTracker:
         wanted = self._wants_keyframe(frame, T_odom_cam)
         if wanted:
             self._reobserve(frame)
-            self._anchor(frame)
+            self._to_anchor = True
         count = len(self._tracks.ids)
         state = TrackState.OK if count >= self._config.weak_inliers else TrackState.WEAK
         return TrackResult(state, self._T_odom_body(), wanted, count)
@@ -184,6 +187,7 @@ class VisualTracker:
         self._add_corners(frame, host)
         self._keyframe_ns, self._keyframe_tracks = frame.stamp_ns, len(self._tracks.ids)
         self._T_odom_keyframe, self._new_stretch = self._T_odom_cam, new_stretch
+        self._to_anchor = False
 
     def _reobserve(self, frame: Frame) -> None:
         """Take up points of earlier keyframes that lie where they should.

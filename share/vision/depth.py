@@ -22,6 +22,8 @@ def from_depth_camera(depth: F32, rig: Rig, uv: F64) -> F64:
     onto the point asked for; several guesses find it behind a near edge too.
     """
     assert rig.depth is not None and rig.T_depth_cam0 is not None
+    if len(uv) == 0:
+        return np.zeros(0)
     T_cam0_depth = se3.inverse(rig.T_depth_cam0)
     clean = _without_edges(depth)
     rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)

@@ -125,6 +125,11 @@ def test_a_restarted_agent_is_a_new_run_and_finds_its_old_map():
     report = first.edge.report()
     assert len(report["maps"]) == 1
     assert any(r["event"] == "silent" and r["agent"] == "bob" for r in first.records)
+    assert {name: a["keyframes"] for name, a in report["agents"].items()} == {
+        "ann": 32,
+        "bob-0016": 16,
+        "bob": 16,
+    }
 
 
 def test_who_was_away_is_told_what_was_missed():

@@ -106,6 +106,19 @@ def test_no_depth_in_mid_air():
     assert z[[1, 3]] == pytest.approx([1.0, 3.0])
 
 
+def test_nothing_to_see_is_no_error():
+    """No point at all: a blank wall, or every corner taken."""
+    none, px = np.zeros((0, 2)), np.zeros((0, 2), np.float32)
+    image, far = np.full((480, 640), 128, np.uint8), np.full((480, 640), 3.0, np.float32)
+    rgbd = Rig(CAMERA, np.eye(4), depth=CAMERA, T_depth_cam0=np.eye(4))
+    stereo = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
+    assert depth.from_depth_camera(far, rgbd, none).shape == (0,)
+    assert depth.from_stereo(image, image, stereo, px, none).shape == (0,)
+    assert klt.follow(image, image, px, px)[0].shape == (0, 2)
+    for frame, rig in ((Frame(0, 0, image, depth=far), rgbd), (Frame(0, 0, image, image), stereo)):
+        assert len(make_view(frame, rig)) == 0
+
+
 def test_a_view_is_spread_and_has_depth(scene):
     left, _, right, _, _ = scene
     rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
