@@ -1,8 +1,9 @@
 """A keyframe's way through the edge's map: place query -> verify -> believe? -> solve -> correct.
 
 Each slow step is a frozen job that somebody else runs, one at a time; the mapper decides what comes
-next. A solution that is due goes before new queries, since somebody waits for its correction. Under
-load, keyframes are still stored but no longer looked up (policy `skip_oldest_query`).
+next. A solution that is due goes first, since somebody waits for its correction; but where keyframes
+queue, one solution serves several of them. Where they queue still, the oldest are stored but no longer
+looked up (policy `skip_oldest_query`).
 """
 
 from __future__ import annotations
@@ -23,8 +24,6 @@ from share.place.index import Candidate, PlaceIndex
 from share.place.verify import Refusal, Sight, Verified, verify
 from share.types import Correction, Keyframe
 from share.wire.messages import Hello
-
-MAX_WAITING = 30  # keyframes that wait for their query; about 5 s of three busy agents
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +114,7 @@ class Mapper:
         self._sights: list[Sight] = []
         self._waiting: deque[int] = deque()
         self._unlooked: deque[int] = deque()
+        self._since_solution = 0  # keyframes looked up
         self._verify: Verify | None = None
         self._accounts: dict[str, _Account] = {}
         self._ms: dict[str, list[float]] = {"place": [], "verify": [], "solve": []}
@@ -127,7 +127,7 @@ class Mapper:
         self._waiting.append(len(self._keys))
         self._keys.append(Key(agent, keyframe.id))
         self._sights.append(Sight(keyframe.view, hello.focal, hello.T_body_cam0, keyframe.up))
-        if len(self._waiting) > MAX_WAITING:
+        if len(self._waiting) > self.config.edge.max_waiting:
             self._unlooked.append(self._waiting.popleft())
             account.queries_skipped += 1
         if keyframe.reference >= 0:
@@ -139,14 +139,19 @@ class Mapper:
 
     def next_job(self) -> Job | None:
         """What to work on now; None if there is nothing to do."""
-        if due := self._atlas.due():
-            return Solve(self._atlas.snapshot(due[0]), self.config.graph)
         if self._verify is not None:
             job, self._verify = self._verify, None
             return job
+        due = self._atlas.due()
+        if due and (not self._waiting or self._since_solution >= self.config.edge.solve_every):
+            self._since_solution = 0
+            return Solve(self._atlas.snapshot(due[0]), self.config.graph)
         if self._unlooked:
             return self._query(self._unlooked.popleft(), look=False)
-        return self._query(self._waiting.popleft(), look=True) if self._waiting else None
+        if self._waiting:
+            self._since_solution += 1
+            return self._query(self._waiting.popleft(), look=True)
+        return None
 
     def done(self, job: Job, result: Any, ms: float) -> list[Finding]:
         """What follows from a job's result; an exception as the result costs that job only."""

@@ -12,7 +12,6 @@ from edge_sim import MS, Person, Town, walls
 from share.config import Config
 from share.core import edge as ed
 from share.core import events as ev
-from share.core.mapper import MAX_WAITING
 from share.geometry import se3
 from share.types import AgentKind
 from share.wire import messages as m
@@ -235,4 +234,4 @@ def test_under_load_keyframes_are_kept_but_not_looked_up():
     assert [a["keyframes"] for a in report["agents"].values()] == [40, 40]
     assert skipped > 0
     assert skipped + report["place_ms"]["n"] <= 80
-    assert 80 - skipped - report["place_ms"]["n"] <= MAX_WAITING + 2
+    assert 80 - skipped - report["place_ms"]["n"] <= slow.config.edge.max_waiting + 2
