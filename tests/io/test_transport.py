@@ -7,12 +7,14 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
+from pathlib import Path
 from typing import Any
 
 import pytest
 import zmq
 
 from share.errors import TransportError, UsageError
+from share.io.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate
 from share.io.transport import LINGER_MS, QUEUE_MESSAGES, AgentLink, EdgeLink, bind, connect, parse_address
 from share.io.transport.memory import MemoryNetwork
 from share.wire.codec import MAX_FRAME_BYTES, encode
@@ -22,23 +24,32 @@ from share.wire.messages import Bye, Ping, peer_id
 class Net:
     """Opens links of one kind and closes them all at the end."""
 
-    def __init__(self, kind: str, stack: ExitStack) -> None:
+    def __init__(self, kind: str, stack: ExitStack, folder: Path) -> None:
         self.kind, self._stack, self._memory = kind, stack, MemoryNetwork()
+        self._edge_keys, self._agent_keys = keys_in(folder) if kind == "curve" else (None, None)
 
     def edge(self, at: str | None = None) -> EdgeLink:
-        if self.kind == "zmq":
-            return self._stack.enter_context(closing(bind(at or "tcp://127.0.0.1:0")))
-        return self._stack.enter_context(closing(self._memory.bind(at or "edge")))
+        if self.kind == "memory":
+            return self._stack.enter_context(closing(self._memory.bind(at or "edge")))
+        return self._stack.enter_context(closing(bind(at or "tcp://127.0.0.1:0", self._edge_keys)))
 
     def agent(self, at: str, run_id: int = 1) -> AgentLink:
-        link = connect(at, run_id) if self.kind == "zmq" else self._memory.connect(at, run_id)
-        return self._stack.enter_context(closing(link))
+        if self.kind == "memory":
+            return self._stack.enter_context(closing(self._memory.connect(at, run_id)))
+        return self._stack.enter_context(closing(connect(at, run_id, self._agent_keys)))
 
 
-@pytest.fixture(params=["zmq", "memory"])
-def net(request: pytest.FixtureRequest) -> Iterator[Net]:
+def keys_in(folder: Path) -> tuple[EdgeKeys, AgentKeys]:
+    """Of an edge and of an agent that it lets in."""
+    edge, ann = generate(folder / "edge", "edge"), generate(folder / "ann", "ann")
+    authorize(folder / "edge", "ann", ann.public)
+    return EdgeKeys(edge, allow_list(folder / "edge")), AgentKeys(ann, edge.public)
+
+
+@pytest.fixture(params=["zmq", "curve", "memory"])
+def net(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Net]:
     with ExitStack() as stack:
-        yield Net(request.param, stack)
+        yield Net(request.param, stack, tmp_path)
 
 
 def eventually(what: Callable[[], Any], within_s: float = 5.0) -> Any:
@@ -212,8 +223,10 @@ def test_addresses() -> None:
 
 
 def test_only_loopback_without_keys() -> None:
-    with pytest.raises(UsageError, match=r"0\.0\.0\.0.*without keys"):
+    with pytest.raises(UsageError, match=r"0\.0\.0\.0.*without keys.*`share keys generate`"):
         bind("tcp://0.0.0.0:0")
+    with pytest.raises(UsageError, match=r"192\.0\.2\.1.*without keys"):
+        connect("tcp://192.0.2.1:5555", 1)
 
 
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1"])

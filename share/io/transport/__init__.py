@@ -15,6 +15,7 @@ from ipaddress import ip_address
 from typing import Protocol
 
 from share.errors import UsageError
+from share.io.keys import AgentKeys, EdgeKeys
 from share.wire.codec import Bytes
 
 QUEUE_MESSAGES = 128  # a queue in either direction; poses at 30 Hz fill it in 4 s
@@ -30,6 +31,10 @@ class AgentLink(Protocol):
 
     def receive(self, timeout_ms: int) -> list[bytes] | None:
         """The next message; None after `timeout_ms`, or at once if woken."""
+        ...
+
+    def trouble(self) -> str | None:
+        """Why the edge did not let us in when last tried, and what to do; None if it did or is silent."""
         ...
 
     def wake(self) -> None:
@@ -55,6 +60,10 @@ class EdgeLink(Protocol):
 
     def receive(self, timeout_ms: int) -> tuple[bytes, list[bytes]] | None:
         """The next message and who sent it; None after `timeout_ms`, or at once if woken."""
+        ...
+
+    def refusals(self) -> list[str]:
+        """Who was not let in since the last call, and what to do: a line each, the same for the same."""
         ...
 
     def wake(self) -> None:
@@ -99,15 +108,25 @@ def parse_address(text: str, bind: bool = False) -> Address:
     return Address("127.0.0.1" if host == "localhost" else host, int(match[3]))
 
 
-def connect(address: str, run_id: int) -> AgentLink:
+def check_keys(target: Address, keys: AgentKeys | EdgeKeys | None) -> Address:
+    """`target`, if it may be used with these keys: without any, only this machine. Else UsageError."""
+    if keys is None and not target.local:
+        raise UsageError(
+            f"{target}: other machines are not spoken to without keys; make them with `share keys generate` "
+            "(docs/deployment-keys.md), or use tcp://127.0.0.1"
+        )
+    return target
+
+
+def connect(address: str, run_id: int, keys: AgentKeys | None = None) -> AgentLink:
     """A link to the edge at `address`, whether or not it is there yet. Raises UsageError."""
     from share.io.transport.zeromq import ZmqAgentLink
 
-    return ZmqAgentLink(address, run_id)
+    return ZmqAgentLink(address, run_id, keys)
 
 
-def bind(address: str) -> EdgeLink:
+def bind(address: str, keys: EdgeKeys | None = None) -> EdgeLink:
     """A link that agents connect to. Raises UsageError, or TransportError if the port is in use."""
     from share.io.transport.zeromq import ZmqEdgeLink
 
-    return ZmqEdgeLink(address)
+    return ZmqEdgeLink(address, keys)

@@ -96,6 +96,9 @@ class MemoryAgentLink:
     def receive(self, timeout_ms: int) -> list[bytes] | None:
         return self.inbox.get(timeout_ms)
 
+    def trouble(self) -> str | None:
+        return None
+
     def wake(self) -> None:
         self.inbox.wake()
 
@@ -117,6 +120,9 @@ class MemoryEdgeLink:
 
     def receive(self, timeout_ms: int) -> tuple[bytes, list[bytes]] | None:
         return self.inbox.get(timeout_ms)
+
+    def refusals(self) -> list[str]:
+        return []
 
     def wake(self) -> None:
         self.inbox.wake()

@@ -1,19 +1,28 @@
-"""The links over ZeroMQ: DEALER at the agent, ROUTER at the edge (RFC 28/REQREP, ZMTP 3.1)."""
+"""The links over ZeroMQ: DEALER at the agent, ROUTER at the edge (RFC 28/REQREP, ZMTP 3.1).
+
+With keys, CURVE (RFC 26) encrypts and proves who is who; the edge's doorkeeper has the last word.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import socket
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
 
 import zmq
 
 from share.errors import TransportError, UsageError
-from share.io.transport import LINGER_MS, QUEUE_MESSAGES, Address, parse_address
+from share.io.keys import AgentKeys, EdgeKeys
+from share.io.transport import LINGER_MS, QUEUE_MESSAGES, Address, check_keys, parse_address
+from share.io.transport.handshake import Handshakes, Outcome
+from share.io.transport.zap import Doorkeeper
 from share.wire.codec import MAX_ARRAYS, MAX_FRAME_BYTES, Bytes
 from share.wire.messages import PEER_BYTES, peer_id
 
 _MAX_PARTS = 2 + MAX_ARRAYS  # peer, header, arrays; parts beyond are read and thrown away
+_REDIAL_S = 1.0  # after a handshake that failed; libzmq itself gives up after most of them
 _COMMON: dict[int, int] = {
     zmq.LINGER: LINGER_MS,
     zmq.SNDHWM: QUEUE_MESSAGES,
@@ -24,6 +33,8 @@ _COMMON: dict[int, int] = {
     zmq.HEARTBEAT_TIMEOUT: 2000,
     zmq.HEARTBEAT_TTL: 2000,
 }
+# With CURVE libzmq measures the sealed frame: name and nonce 16, authenticator 16, flags 1 byte more.
+_SEALED: dict[int, int] = {zmq.MAXMSGSIZE: MAX_FRAME_BYTES + 33}
 _DEALER: dict[int, int] = {
     zmq.IMMEDIATE: 1,  # nothing queues for an edge that is not there
     zmq.RECONNECT_IVL: 100,
@@ -43,8 +54,9 @@ class _Socket:
     """A socket with its own context, non-blocking, that another thread can wake."""
 
     def __init__(self, kind: int, options: dict[int, int], target: Address) -> None:
-        self._context = zmq.Context()
-        self.socket: zmq.Socket[bytes] = self._context.socket(kind)
+        self.context = zmq.Context()
+        self.socket: zmq.Socket[bytes] = self.context.socket(kind)
+        self._handshakes = Handshakes(self.socket)
         for option, value in (_COMMON | options).items():
             self.socket.setsockopt(option, value)
         self.socket.setsockopt(zmq.IPV6, ":" in target.host)
@@ -90,31 +102,52 @@ class _Socket:
         except OSError:  # full: it is awake already; closed: nobody sleeps
             return
 
-    def close(self) -> None:
-        self.socket.close()
-        self._context.term()
+    def handshakes(self) -> Iterator[Outcome]:
+        """Those that ended since the last look."""
+        while (outcome := self._handshakes.next()) is not None:
+            yield outcome
+
+    def close(self, linger_ms: int = LINGER_MS) -> None:
+        if self.socket.closed:
+            return
+        self._handshakes.close()
+        self.socket.close(linger_ms)
+        self.context.term()
         self._wake_reader.close()
         self._wake_writer.close()
 
 
 class ZmqAgentLink:
-    """`AgentLink` to tcp://HOST:PORT. Raises UsageError if that is not an address."""
+    """`AgentLink` to tcp://HOST:PORT. Raises UsageError if that is not an address, or one of another
+    machine and there are no keys."""
 
-    def __init__(self, address: str, run_id: int) -> None:
-        target = parse_address(address)
-        self._link = _Socket(zmq.DEALER, _DEALER, target)
+    def __init__(self, address: str, run_id: int, keys: AgentKeys | None = None) -> None:
+        self._target = check_keys(parse_address(address), keys)
+        self._keys = keys
+        self._trouble: str | None = None
+        self._redial_s: float | None = None  # when
+        self._link = _Socket(zmq.DEALER, _DEALER | (_SEALED if keys else {}), self._target)
         self._link.socket.setsockopt(zmq.ROUTING_ID, peer_id(run_id))
+        if keys is not None:
+            self._link.socket.setsockopt(zmq.CURVE_PUBLICKEY, keys.own.public.encode())
+            self._link.socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret.encode())
+            self._link.socket.setsockopt(zmq.CURVE_SERVERKEY, keys.edge.encode())
         try:
-            self._link.socket.connect(str(target))
+            self._link.socket.connect(str(self._target))
         except zmq.ZMQError:
             self._link.close()
-            raise UsageError(f"{target}: '{target.host}' cannot be the name of a machine") from None
+            host = self._target.host
+            raise UsageError(f"{self._target}: '{host}' cannot be the name of a machine") from None
 
     def send(self, frames: Sequence[Bytes]) -> bool:
         return self._link.send(frames)
 
     def receive(self, timeout_ms: int) -> list[bytes] | None:
+        self._keep_connected()
         return self._link.receive(timeout_ms)
+
+    def trouble(self) -> str | None:
+        return self._trouble
 
     def wake(self) -> None:
         self._link.wake()
@@ -122,42 +155,90 @@ class ZmqAgentLink:
     def close(self) -> None:
         self._link.close()
 
+    def _keep_connected(self) -> None:
+        for outcome in self._link.handshakes():
+            joined = outcome is Outcome.JOINED
+            self._trouble = None if joined else self._reason(outcome)
+            self._redial_s = None if joined else time.monotonic() + _REDIAL_S
+        if self._redial_s is not None and time.monotonic() >= self._redial_s:
+            self._redial_s = None
+            with contextlib.suppress(zmq.ZMQError):  # libzmq has forgotten it already
+                self._link.socket.disconnect(str(self._target))
+            self._link.socket.connect(str(self._target))
+
+    def _reason(self, outcome: Outcome) -> str:
+        if self._keys is None:
+            return "the edge there wants keys; give --server-key, its public key"
+        if outcome is Outcome.UNKNOWN_KEY:
+            own = self._keys.own
+            return f"the edge does not know this key; there: share keys authorize {own.name} '{own.public}'"
+        return "whatever answers there has another key than --server-key says, or none"
+
 
 class ZmqEdgeLink:
     """`EdgeLink` on tcp://HOST:PORT. Raises UsageError if that is no address, or one that others can
-    reach, and TransportError if it cannot be bound."""
+    reach and there are no keys, and TransportError if it cannot be bound.
 
-    def __init__(self, address: str) -> None:
-        target = parse_address(address, bind=True)
-        if not target.local:
-            raise UsageError(
-                f"{target}: only this machine may be served without keys; bind tcp://127.0.0.1:{target.port}"
-            )
-        self._link = _Socket(zmq.ROUTER, _ROUTER, target)
-        try:
-            self._link.socket.bind(str(target))
-        except zmq.ZMQError as error:
-            self._link.close()
-            raise _bind_error(target, error) from None
-        bound = self._link.socket.get_string(zmq.LAST_ENDPOINT).rstrip("\0")
+    When someone who was let in is authorized no longer, all connections are closed: the others are
+    back within about a second, as after a break of the network.
+    """
+
+    def __init__(self, address: str, keys: EdgeKeys | None = None) -> None:
+        self._target = check_keys(parse_address(address, bind=True), keys)
+        self._keys = keys
         self.strangers = 0  # messages dropped because their sender is no agent
-        self.endpoint = str(Address(target.host, parse_address(bound).port))
+        self._open()
+
+    @property
+    def endpoint(self) -> str:
+        return str(self._target)
 
     def send(self, peer: bytes, frames: Sequence[Bytes]) -> bool:
         return self._link.send([peer, *frames])
 
     def receive(self, timeout_ms: int) -> tuple[bytes, list[bytes]] | None:
+        if self._door is not None and self._door.revoked():
+            self._reopen()
         parts = self._link.receive(timeout_ms)
         if parts and len(parts[0]) != PEER_BYTES:  # libzmq still takes most bytes for ZMTP 1.0
             self.strangers += 1
             return None
         return (parts[0], parts[1:]) if parts else None
 
+    def refusals(self) -> list[str]:
+        failed = [o for o in self._link.handshakes() if o in (Outcome.NO_KEYS, Outcome.BROKEN_OFF)]
+        if self._door is None:
+            return ["an agent with keys; this edge uses none: start it with --keys" for _ in failed]
+        lines = ["one without keys, or with the key of another edge: see its --server-key" for _ in failed]
+        return lines + self._door.refusals()
+
     def wake(self) -> None:
         self._link.wake()
 
     def close(self) -> None:
-        self._link.close()
+        self._close(LINGER_MS)
+
+    def _open(self) -> None:
+        self._link = _Socket(zmq.ROUTER, _ROUTER | (_SEALED if self._keys else {}), self._target)
+        socket = self._link.socket
+        self._door = None if self._keys is None else Doorkeeper(self._link.context, socket, self._keys)
+        try:
+            socket.bind(str(self._target))
+        except zmq.ZMQError as error:
+            self.close()
+            raise _bind_error(self._target, error) from None
+        bound = parse_address(socket.get_string(zmq.LAST_ENDPOINT).rstrip("\0"))
+        self._target = Address(self._target.host, bound.port)
+
+    def _reopen(self) -> None:
+        self._close(linger_ms=0)
+        self._open()
+        self.wake()  # in case someone has just woken the old socket
+
+    def _close(self, linger_ms: int) -> None:
+        self._link.close(linger_ms)
+        if self._door is not None:
+            self._door.join()
 
 
 def _bind_error(target: Address, error: zmq.ZMQError) -> TransportError:

@@ -1,0 +1,267 @@
+"""Who may talk to whom: CurveZMQ key pairs and the list of agents that an edge lets in, as text files.
+
+A folder holds one machine's pair, `NAME.public` and `NAME.secret`, and at an edge `authorized`. All are
+made of lines `share-public-key NAME KEY`, so the list is public keys one after the other. KEY is a
+32-byte Curve25519 key in Z85 (RFC 26 CurveZMQ, RFC 32 Z85): 40 characters, none of them a quote.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import socket
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from share.errors import UsageError
+from share.io.files import atomic_write, writing
+
+_NAME = r"[A-Za-z0-9_][\w.-]{0,63}"
+_Z85 = r"[0-9a-zA-Z.:+=^!/*?&<>()\[\]{}@%$#-]{40}"
+_LINE = re.compile(rf"share-(public|secret)-key ({_NAME}) ({_Z85})")
+
+
+@dataclass(frozen=True)
+class KeyPair:
+    """Of one machine. Keys are Z85 text."""
+
+    name: str
+    public: str
+    secret: str = field(repr=False)
+
+
+@dataclass(frozen=True)
+class AgentKeys:
+    """What an agent needs: its own pair and the public key of its edge."""
+
+    own: KeyPair
+    edge: str
+
+
+@dataclass(frozen=True)
+class EdgeKeys:
+    """What an edge needs: its own pair and who may connect."""
+
+    own: KeyPair
+    allowed: AllowList
+
+
+class AllowList:
+    """Agents by public key. It follows its file: whoever looks sees what the file says now.
+
+    No file: nobody. May be looked at from several threads.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._read: tuple[tuple[int, ...], dict[str, str]] = (), {}
+
+    def names(self) -> dict[str, str]:
+        """Name by public key. Raises UsageError if the file cannot be read or has another form."""
+        try:
+            status = self.path.stat()
+        except FileNotFoundError:
+            return {}
+        except OSError as error:
+            raise UsageError(f"{self.path}: cannot be read: {error.strerror}") from None
+        state = (status.st_mtime_ns, status.st_ino, status.st_size)
+        if state != self._read[0]:
+            self._read = state, self._parsed()
+        return self._read[1]
+
+    def admits(self, public: str) -> bool:
+        """Whether that key may connect. Nobody may while the file cannot be read."""
+        try:
+            return public in self.names()
+        except UsageError:
+            return False
+
+    def _parsed(self) -> dict[str, str]:
+        names: dict[str, str] = {}
+        for number, line in enumerate(_text(self.path).splitlines(), 1):
+            if line.strip() and not line.startswith("#"):
+                name, key = _public(line, f"{self.path}, line {number}")
+                names[key] = name
+        return names
+
+
+def default_folder() -> Path:
+    """$XDG_CONFIG_HOME/share/keys, or ~/.config/share/keys."""
+    base = os.environ.get("XDG_CONFIG_HOME", "")
+    return (Path(base) if os.path.isabs(base) else Path.home() / ".config") / "share" / "keys"
+
+
+def generate(folder: Path, name: str | None = None) -> KeyPair:
+    """A new pair in `folder`, named after this machine unless `name` is given. Raises UsageError, also
+    if there is a pair already: it is never replaced."""
+    import zmq
+
+    name = _checked(name or re.sub(r"[^A-Za-z0-9_-]", "-", socket.gethostname()).strip("-")[:64] or "share")
+    _make(folder)
+    with _locked(folder):
+        if old := _secrets(folder):
+            raise UsageError(f"{old[0]}: there is a key pair already; give another folder with --keys")
+        public, secret = b"-", b""
+        while not public[:1].isalnum():  # or a shell command could take the key for an option
+            public, secret = zmq.curve_keypair()
+        pair = KeyPair(name, public.decode(), secret.decode())
+        _write_secret(folder / f"{name}.secret", f"share-secret-key {name} {pair.secret}\n")
+        atomic_write(folder / f"{name}.public", _line(name, pair.public))
+    return pair
+
+
+def load(folder: Path) -> KeyPair:
+    """The pair in `folder`. Raises UsageError if there is none or not just one, or others can read it."""
+    import zmq
+
+    found = _secrets(folder)
+    if not found:
+        raise UsageError(f"{folder}: has no key pair; make one with `share keys generate`")
+    if len(found) > 1:
+        raise UsageError(f"{folder}: has {len(found)} key pairs; keep one in each folder")
+    path = found[0]
+    if path.stat().st_mode & 0o077:
+        raise UsageError(f"{path}: others can read this secret; `chmod 600 {path}`, or make a new pair")
+    match = _LINE.fullmatch(_text(path).strip())
+    if not match or match[1] != "secret" or not _is_key(match[3]):
+        raise UsageError(f"{path}: is not a secret key of SHARE; make a new pair with `share keys generate`")
+    return KeyPair(match[2], zmq.curve_public(match[3].encode()).decode(), match[3])
+
+
+def public_key(given: str) -> str:
+    """The key in the file `given`, or `given` itself, if it is one. Raises UsageError."""
+    if re.fullmatch(_Z85, given) and _is_key(given):
+        return given
+    if given.startswith("share-"):
+        return _public(given, "what was given")[1]
+    path = Path(given)
+    if not path.is_file():
+        raise UsageError(f"'{given}': neither a file nor a public key (40 characters, in single quotes)")
+    return _public(_text(path).strip(), given)[1]
+
+
+def allow_list(folder: Path) -> AllowList:
+    return AllowList(folder / "authorized")
+
+
+def authorize(folder: Path, name: str, public: str) -> None:
+    """Let the agent machine `name` in. Raises UsageError if the name or the key is taken."""
+    name = _checked(name)
+    _make(folder)
+    with _locked(folder):
+        names = dict(allow_list(folder).names())
+        if names.get(public, name) != name:
+            raise UsageError(f"'{name}': this key is authorized already, as '{names[public]}'")
+        if name in names.values() and public not in names:
+            raise UsageError(f"'{name}' has another key; `share keys revoke {name}` takes that away first")
+        _save(folder, names | {public: name})
+
+
+def revoke(folder: Path, name: str) -> None:
+    """Let it in no more. Raises UsageError if there is none of that name."""
+    names = allow_list(folder).names()
+    if name not in names.values():
+        raise UsageError(f"'{name}' is not authorized; there is {', '.join(names.values()) or 'nobody'}")
+    with _locked(folder):
+        names = allow_list(folder).names()
+        _save(folder, {key: other for key, other in names.items() if other != name})
+
+
+def agent_keys(folder: Path | None, edge: str) -> AgentKeys:
+    """folder: of the agent's own pair, None for the default one; edge: see `public_key`."""
+    return AgentKeys(load(folder or default_folder()), public_key(edge))
+
+
+def edge_keys(folder: Path | None) -> EdgeKeys:
+    """The keys in `folder`, None for the default one. Raises UsageError, also for a damaged list."""
+    folder = folder or default_folder()
+    keys = EdgeKeys(load(folder), allow_list(folder))
+    keys.allowed.names()
+    return keys
+
+
+# ---------------------------------------------------------------- files
+
+
+def _public(line: str, where: str) -> tuple[str, str]:
+    """Name and key of a line. Raises UsageError."""
+    match = _LINE.fullmatch(line.strip())
+    if match and match[1] == "secret":
+        raise UsageError(f"{where}: is a secret key, which stays on its machine; give the public one")
+    if not match or not _is_key(match[3]):
+        raise UsageError(f"{where}: is not `share-public-key NAME KEY`")
+    return match[2], match[3]
+
+
+def _line(name: str, public: str) -> str:
+    return f"share-public-key {name} {public}\n"
+
+
+def _is_key(text: str) -> bool:
+    """Whether 40 characters of Z85 are 32 bytes: five can say more than four bytes hold."""
+    from zmq.utils import z85
+
+    try:
+        return len(z85.decode(text)) == 32
+    except struct.error:
+        return False
+
+
+def _checked(name: str) -> str:
+    if not re.fullmatch(_NAME, name):
+        raise UsageError(f"'{name}': a name has 1 to 64 letters, digits, '_', '-' or '.'")
+    return name
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text("ascii")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not a text file"
+        raise UsageError(f"{path}: cannot be read: {reason}") from None
+
+
+def _secrets(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.secret"))
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be made: {error.strerror}; give another --keys") from None
+
+
+def _save(folder: Path, names: dict[str, str]) -> None:
+    lines = (_line(name, public) for public, name in sorted(names.items(), key=lambda item: item[1]))
+    atomic_write(folder / "authorized", "".join(lines))
+
+
+def _write_secret(path: Path, text: str) -> None:
+    """Nobody else can read it at any moment, and it replaces nothing."""
+    with writing(path):
+        handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
+        try:
+            with os.fdopen(handle, "w") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError:
+            path.unlink()
+            raise
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """One writer at a time, or one's revocation could be undone by another's addition."""
+    import fcntl
+
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)

@@ -1,0 +1,66 @@
+"""The door of an edge with keys: ZAP (RFC 27) within the context of the edge's socket."""
+
+from __future__ import annotations
+
+from collections import deque
+from threading import Thread
+
+import zmq
+from zmq.utils import z85
+
+from share.io.keys import EdgeKeys
+
+_ENDPOINT = "inproc://zeromq.zap.01"
+_DOMAIN = b"share"
+
+
+class Doorkeeper:
+    """Makes `socket` a CURVE server and answers for each handshake whether that key may come in.
+
+    A thread of its own, so that agents connect also while the edge is busy. It ends by itself when the
+    context is terminated; `join` then. Must be made before the socket is bound.
+    """
+
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], socket: zmq.Socket[bytes], keys: EdgeKeys):
+        self._refusals: deque[str] = deque(maxlen=128)
+        self._allowed = keys.allowed
+        self._inside: set[str] = set()  # keys let in so far
+        socket.setsockopt(zmq.CURVE_SERVER, 1)
+        socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret.encode())
+        socket.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN)
+        socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without it nobody at the door lets everyone in
+        self._requests = context.socket(zmq.REP)
+        self._requests.bind(_ENDPOINT)
+        self._thread = Thread(target=self._serve, name="doorkeeper", daemon=True)
+        self._thread.start()
+
+    def revoked(self) -> bool:
+        """Whether someone who was let in may not be here any more."""
+        return not all(self._allowed.admits(key) for key in tuple(self._inside))
+
+    def refusals(self) -> list[str]:
+        """A line for each since the last call."""
+        return [self._refusals.popleft() for _ in range(len(self._refusals))]
+
+    def join(self) -> None:
+        self._thread.join()
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                self._requests.send_multipart(self._answer(self._requests.recv_multipart()))
+            except zmq.ContextTerminated:
+                self._requests.close()
+                return
+
+    def _answer(self, request: list[bytes]) -> list[bytes]:
+        version, number, _domain, address, _identity, _mechanism, credentials = request
+        key = z85.encode(credentials).decode()
+        if self._allowed.admits(key):
+            self._inside.add(key)  # a revocation since then is seen by the next `revoked`
+            return [version, number, b"200", b"", key.encode(), b""]
+        self._refusals.append(
+            f"the key '{key}' ({address.decode()}) is not authorized; "
+            f"to let it in: share keys authorize NAME '{key}'"
+        )
+        return [version, number, b"400", b"not authorized", b"", b""]

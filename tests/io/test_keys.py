@@ -1,0 +1,342 @@
+"""Keys as files, and who gets in over CURVE."""
+
+from __future__ import annotations
+
+import os
+import stat
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import pytest
+import zmq
+from zmq.utils import z85
+
+from share.errors import ShareError, UsageError
+from share.io import keys
+from share.io.keys import AgentKeys, AllowList, EdgeKeys, KeyPair
+from share.io.transport import AgentLink, EdgeLink, bind, connect
+from share.wire.messages import peer_id
+
+
+def text(*paths: Path) -> str:
+    return "".join(path.read_text() for path in paths)
+
+
+# ---------------------------------------------------------------- files
+
+
+def test_a_pair_is_read_as_it_was_made(tmp_path: Path) -> None:
+    pair = keys.generate(tmp_path / "new" / "keys", "edge")
+    assert keys.load(tmp_path / "new" / "keys") == pair
+    assert zmq.curve_public(pair.secret.encode()).decode() == pair.public
+    assert text(tmp_path / "new/keys/edge.public") == f"share-public-key edge {pair.public}\n"
+    assert pair.secret not in repr(pair)
+    assert pair.secret not in text(tmp_path / "new/keys/edge.public")
+
+
+def test_only_the_owner_can_read_the_secret(tmp_path: Path) -> None:
+    old = os.umask(0)
+    try:
+        keys.generate(tmp_path / "keys", "edge")
+    finally:
+        os.umask(old)
+    assert stat.S_IMODE((tmp_path / "keys" / "edge.secret").stat().st_mode) == 0o600
+    assert stat.S_IMODE((tmp_path / "keys").stat().st_mode) == 0o700
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o660])
+def test_a_secret_that_others_can_read_is_refused(mode: int, tmp_path: Path) -> None:
+    keys.generate(tmp_path, "edge")
+    (tmp_path / "edge.secret").chmod(mode)
+    with pytest.raises(UsageError, match=r"edge\.secret: others can read this secret; `chmod 600 "):
+        keys.load(tmp_path)
+
+
+def test_a_pair_is_never_replaced(tmp_path: Path) -> None:
+    pair = keys.generate(tmp_path, "edge")
+    with pytest.raises(UsageError, match="there is a key pair already"):
+        keys.generate(tmp_path, "other")
+    assert keys.load(tmp_path) == pair
+    assert sorted(os.listdir(tmp_path)) == ["edge.public", "edge.secret"]
+
+
+def test_no_public_key_looks_like_an_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = [(b"-" + b"0" * 39, b"1" * 40), (b"<" + b"0" * 39, b"2" * 40), zmq.curve_keypair()]
+    drawn[2] = next(pair for pair in iter(zmq.curve_keypair, None) if pair[0][:1].isalnum())
+    expected = drawn[2][0].decode()
+    monkeypatch.setattr(zmq, "curve_keypair", lambda: drawn.pop(0))
+    assert keys.generate(tmp_path, "edge").public == expected
+
+
+def test_named_after_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("socket.gethostname", lambda: "-lab pc.local")
+    assert keys.generate(tmp_path).name == "lab-pc-local"
+
+
+@pytest.mark.parametrize("name", ["", "a b", "../x", ".x", "-x", "x" * 65])
+def test_names(name: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="a name has 1 to 64 letters"):
+        keys.authorize(tmp_path, name, "0" * 40)
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda d: (d / "edge.secret").unlink(), "has no key pair; make one with `share keys generate`"),
+        (lambda d: (d / "edge.secret").write_text("gone"), "edge.secret: is not a secret key of SHARE"),
+        (lambda d: (d / "edge.secret").write_text(text(d / "edge.public")), "is not a secret key of SHARE"),
+        (
+            lambda d: (d / "edge.secret").write_bytes(b"\xff\0"),
+            "edge.secret: cannot be read: not a text file",
+        ),
+        (lambda d: (d / "ann.secret").write_text(text(d / "edge.secret")), "has 2 key pairs"),
+    ],
+)
+def test_a_folder_that_cannot_be_used(damage, said: str, tmp_path: Path) -> None:
+    keys.generate(tmp_path, "edge")
+    damage(tmp_path)
+    with pytest.raises(UsageError, match=said):
+        keys.load(tmp_path)
+
+
+def test_default_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    assert keys.default_folder() == tmp_path / "share" / "keys"
+    monkeypatch.setenv("XDG_CONFIG_HOME", "relative")  # the specification: ignore it then
+    assert keys.default_folder() == Path.home() / ".config" / "share" / "keys"
+
+
+def test_a_public_key_is_given_as_text_line_or_file(tmp_path: Path) -> None:
+    pair = keys.generate(tmp_path, "ann")
+    line = text(tmp_path / "ann.public")
+    given = (pair.public, line.strip(), str(tmp_path / "ann.public"))
+    assert [keys.public_key(one) for one in given] == [pair.public] * 3
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("nowhere", "neither a file nor a public key"),
+        ("#" * 40, "neither a file nor a public key"),  # five of them are more than 32 bits
+        ("0" * 39, "neither a file nor a public key"),
+        ("share-public-key ann short", "is not `share-public-key NAME KEY`"),
+        ("{}/ann.secret", "is a secret key, which stays on its machine; give the public one"),
+    ],
+)
+def test_what_is_no_public_key(given: str, said: str, tmp_path: Path) -> None:
+    keys.generate(tmp_path, "ann")
+    with pytest.raises(UsageError, match=said):
+        keys.public_key(given.format(tmp_path))
+
+
+# ---------------------------------------------------------------- the list
+
+
+def key(number: int) -> str:
+    return z85.encode(bytes([number]) * 32).decode()
+
+
+def test_authorize_and_revoke(tmp_path: Path) -> None:
+    allowed = keys.allow_list(tmp_path)
+    assert allowed.names() == {}
+    keys.authorize(tmp_path, "bob", key(2))
+    keys.authorize(tmp_path, "ann", key(1))
+    keys.authorize(tmp_path, "ann", key(1))  # again: nothing new
+    assert allowed.names() == {key(1): "ann", key(2): "bob"}
+    assert text(allowed.path) == f"share-public-key ann {key(1)}\nshare-public-key bob {key(2)}\n"
+    keys.revoke(tmp_path, "ann")
+    assert [allowed.admits(key(n)) for n in (1, 2)] == [False, True]
+    with pytest.raises(UsageError, match="'ann' is not authorized; there is bob"):
+        keys.revoke(tmp_path, "ann")
+
+
+def test_one_name_one_key(tmp_path: Path) -> None:
+    keys.authorize(tmp_path, "ann", key(1))
+    with pytest.raises(UsageError, match="'ann' has another key; `share keys revoke ann`"):
+        keys.authorize(tmp_path, "ann", key(2))
+    with pytest.raises(UsageError, match="'bob': this key is authorized already, as 'ann'"):
+        keys.authorize(tmp_path, "bob", key(1))
+    assert keys.allow_list(tmp_path).names() == {key(1): "ann"}
+
+
+def test_a_list_made_of_public_key_files(tmp_path: Path) -> None:
+    pairs = [keys.generate(tmp_path / name, name) for name in ("ann", "bob")]
+    path = tmp_path / "authorized"
+    path.write_text("# ours\n\n" + text(*(tmp_path / p.name / f"{p.name}.public" for p in pairs)))
+    assert AllowList(path).names() == {pair.public: pair.name for pair in pairs}
+
+
+def test_a_damaged_list_lets_nobody_in_and_says_where(tmp_path: Path) -> None:
+    keys.generate(tmp_path, "edge")
+    keys.authorize(tmp_path, "ann", key(1))
+    allowed = keys.allow_list(tmp_path)
+    assert allowed.admits(key(1))
+    allowed.path.write_text(text(allowed.path) + "bob\n")
+    assert not allowed.admits(key(1))
+    with pytest.raises(UsageError, match="authorized, line 2: is not `share-public-key NAME KEY`"):
+        keys.edge_keys(tmp_path)
+
+
+# ---------------------------------------------------------------- the door
+
+
+class House:
+    """An edge with keys that lets `ann` in, and links to it."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self.folder, self._stack = folder / "edge", stack
+        self.pair = keys.generate(self.folder, "edge")
+        self.ann = self.pair_of("ann")
+        keys.authorize(self.folder, "ann", self.ann.public)
+        self.edge: EdgeLink = stack.enter_context(
+            closing(bind("tcp://127.0.0.1:0", EdgeKeys(self.pair, keys.allow_list(self.folder))))
+        )
+
+    def pair_of(self, name: str) -> KeyPair:
+        return keys.generate(self.folder.parent / name, name)
+
+    def agent(self, run_id: int, own: KeyPair | None, server: str | None = None) -> AgentLink:
+        with_keys = None if own is None else AgentKeys(own, server or self.pair.public)
+        return self._stack.enter_context(closing(connect(self.edge.endpoint, run_id, with_keys)))
+
+    def refusals(self, agent: AgentLink) -> list[str]:
+        """What the edge says of an agent that gets nothing, and the agent nothing either."""
+        lines: list[str] = []
+        end = time.monotonic() + 3
+        while not (lines and agent.trouble()):
+            assert time.monotonic() < end, (lines, agent.trouble())
+            assert not agent.send([b"in?"])
+            assert agent.receive(5) is None
+            assert self.edge.receive(5) is None
+            lines += self.edge.refusals()
+        return lines
+
+    def greets(self, agent: AgentLink, run_id: int, within_s: float = 4) -> None:
+        """A message there and back."""
+        end = time.monotonic() + within_s
+        while True:
+            assert time.monotonic() < end, "did not get in"
+            agent.send([b"hello"])
+            if (heard := self.edge.receive(10)) is not None and heard[0] == peer_id(run_id):
+                self.edge.send(peer_id(run_id), [b"welcome"])
+            if agent.receive(10) == [b"welcome"]:
+                return
+
+
+@pytest.fixture
+def house(tmp_path: Path) -> Iterator[House]:
+    with ExitStack() as stack:
+        yield House(tmp_path, stack)
+
+
+def test_who_is_listed_gets_in(house: House) -> None:
+    agent = house.agent(1, house.ann)
+    house.greets(agent, 1)
+    assert agent.trouble() is None
+    assert house.edge.refusals() == []
+
+
+def test_who_is_not_listed_does_not_until_listed(house: House) -> None:
+    bob = house.pair_of("bob")
+    agent = house.agent(2, bob)
+    said = house.refusals(agent)[0]
+    assert said.endswith(f"is not authorized; to let it in: share keys authorize NAME '{bob.public}'")
+    assert "(127.0.0.1)" in said
+    assert agent.trouble() == (
+        f"the edge does not know this key; there: share keys authorize bob '{bob.public}'"
+    )
+    keys.authorize(house.folder, "bob", bob.public)
+    house.greets(agent, 2)
+    assert agent.trouble() is None
+
+
+def test_the_key_of_another_edge(house: House) -> None:
+    agent = house.agent(3, house.ann, server=house.pair_of("other").public)
+    assert "with the key of another edge" in house.refusals(agent)[0]
+    assert "has another key than --server-key says" in str(agent.trouble())
+
+
+def test_an_agent_without_keys(house: House) -> None:
+    agent = house.agent(4, None)
+    assert "one without keys" in house.refusals(agent)[0]
+    assert "wants keys; give --server-key" in str(agent.trouble())
+    house.greets(house.agent(1, house.ann), 1)  # the edge goes on
+
+
+def test_an_edge_without_keys(house: House) -> None:
+    house.edge.close()
+    with closing(bind(house.edge.endpoint)) as plain:
+        house.edge = plain
+        agent = house.agent(5, house.ann)
+        assert "uses none: start it with --keys" in house.refusals(agent)[0]
+        assert "or none" in str(agent.trouble())
+        plain.close()
+    with closing(bind(plain.endpoint, EdgeKeys(house.pair, keys.allow_list(house.folder)))) as house.edge:
+        house.greets(agent, 5)  # as soon as the right edge is there
+
+
+def test_a_revoked_key_is_thrown_out_and_the_others_are_back(house: House) -> None:
+    bob = house.pair_of("bob")
+    keys.authorize(house.folder, "bob", bob.public)
+    ann, bad = house.agent(1, house.ann), house.agent(2, bob)
+    house.greets(ann, 1)
+    house.greets(bad, 2)
+    keys.revoke(house.folder, "bob")
+    assert bad.send([b"too late"])
+    assert house.edge.receive(50) is None
+    assert not house.edge.send(peer_id(2), [b"for bob"])
+    assert "does not know this key" in str(house.refusals(bad) and bad.trouble())
+    house.greets(ann, 1)
+
+
+def test_a_change_that_revokes_nobody_here_breaks_no_connection(house: House) -> None:
+    agent = house.agent(1, house.ann)
+    house.greets(agent, 1)
+    keys.authorize(house.folder, "bob", key(9))
+    keys.revoke(house.folder, "bob")
+    assert house.edge.receive(0) is None
+    assert house.edge.send(peer_id(1), [b"still here"])
+    assert agent.receive(2000) == [b"still here"]
+
+
+def test_a_stranger_with_a_free_hand_stays_outside(house: House) -> None:
+    """Anonymous CURVE, as anyone could who knows only the edge's public key; many at a time."""
+    context = zmq.Context()
+    sockets = []
+    for _ in range(20):
+        rogue = context.socket(zmq.DEALER)
+        public, secret = zmq.curve_keypair()
+        rogue.curve_publickey, rogue.curve_secretkey = public, secret
+        rogue.curve_serverkey = house.pair.public.encode()
+        rogue.linger = 0
+        rogue.connect(house.edge.endpoint)
+        rogue.send(b"let me in")
+        sockets.append(rogue)
+    house.greets(house.agent(1, house.ann), 1)
+    end = time.monotonic() + 3
+    count = 0
+    while count < 20 and time.monotonic() < end:
+        assert house.edge.receive(10) is None
+        count += len(house.edge.refusals())
+    for rogue in sockets:
+        rogue.close()
+    context.term()
+    assert count == 20
+
+
+def test_close_frees_the_address_and_the_thread(house: House) -> None:
+    import threading
+
+    agent = house.agent(1, house.ann)
+    house.greets(agent, 1)
+    start = time.monotonic()
+    house.edge.close()
+    house.edge.close()
+    assert time.monotonic() - start < 1
+    assert [t for t in threading.enumerate() if t.name == "doorkeeper"] == []
+    with pytest.raises(ShareError, match="in use"), closing(bind(house.edge.endpoint)) as other:
+        bind(other.endpoint, EdgeKeys(house.pair, keys.allow_list(house.folder)))
+    assert [t for t in threading.enumerate() if t.name == "doorkeeper"] == []
