@@ -259,12 +259,14 @@ class VisualTracker:
         if found is not None:
             self._T_odom_cam, self._tracks = found, _NO_TRACKS
             self._reobserve(frame)
-        elif waited_s >= config.new_stretch_s:
-            self._map, self._tracks = LocalMap(config.max_keyframes), _NO_TRACKS
-        else:
+        elif waited_s < config.new_stretch_s:
             return TrackResult(TrackState.LOST, None)
+        old_map = self._map
+        if found is None:
+            self._map, self._tracks = LocalMap(config.max_keyframes), _NO_TRACKS
         self._anchor(frame, new_stretch=found is None)
         if len(self._tracks.ids) < config.min_inliers:
+            self._map = old_map  # nothing to see here either: keep what may be found again
             return TrackResult(TrackState.LOST, None)
         self._lost_since_ns = None
         return TrackResult(TrackState.WEAK, self._T_odom_body(), True, len(self._tracks.ids), found is None)

@@ -94,6 +94,16 @@ def test_lost_in_the_dark_and_found_again_in_the_same_frame(walk):
     assert not any(c.new_stretch for c in candidates[1:])
 
 
+def test_a_long_darkness_does_not_cost_the_map(walk):
+    """Longer than it takes to begin anew, but there was nothing to begin with."""
+    images, _ = walk
+    dark = (np.zeros((480, 640), np.uint8),) * 2
+    results, candidates = run([*images[:40], *[dark] * 20, *images[45:55]], TrackerConfig(new_stretch_s=0.3))
+    assert [r.state for r in results[40:60]] == [TrackState.LOST] * 20
+    assert all(r.state.has_pose for r in results[60:])
+    assert not any(c.new_stretch for c in candidates[1:])
+
+
 def test_carried_away_while_blind_begins_a_new_stretch(walk):
     images, _ = walk
     elsewhere = Renderer(make_room(77), CAMERA)
