@@ -88,9 +88,9 @@ def test_an_edge_that_is_killed_and_started_again(kitchen, tracked, tmp_path):
     }
     for agent in agents.values():
         agent.wait_for("connected to the edge")
-    time.sleep(3)
+    time.sleep(2)
     edge.kill()
-    time.sleep(1)
+    time.sleep(0.5)
     edge, _ = start_edge(tmp_path, address)
     for agent in agents.values():
         agent.wait_for("the edge has restarted")
