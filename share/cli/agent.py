@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import secrets
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from share.cli import options
-from share.errors import ShareError
+from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
+    from share.io.keys import AgentKeys
     from share.run.agent import AgentRun, Status
 
 
@@ -21,6 +23,12 @@ if TYPE_CHECKING:
 @click.option("--name", required=True, help="What this agent is called; unique at its edge.")
 @click.option("--kind", type=click.Choice(["ar", "robot"]), required=True, help="Who is served.")
 @click.option("--edge", "address", metavar="tcp://H:P", required=True, help="Where the edge listens.")
+@options.keys
+@click.option(
+    "--server-key",
+    metavar="FILE|KEY",
+    help="Public key of the edge; needed for an edge on another machine. Turns on encryption.",
+)
 @options.calib
 @options.frames
 @click.option("--out", metavar="DIR", help="Write odom.tum, map.tum, latency.csv and report.json here.")
@@ -32,6 +40,8 @@ def agent(
     name: str,
     kind: str,
     address: str,
+    keys: str | None,
+    server_key: str | None,
     calib: str | None,
     frames: slice | None,
     out: str | None,
@@ -49,13 +59,14 @@ def agent(
     """
     settings = options.load_config(config_file)
     from share.io.source import open_source
-    from share.io.transport import connect, parse_address
+    from share.io.transport import check_keys, connect, parse_address
     from share.run.agent import AgentRun
     from share.run.stop import on_stop
     from share.types import AgentKind
     from share.wire.messages import Hello
 
-    parse_address(address)
+    with_keys = _keys(keys, server_key)
+    check_keys(parse_address(address), with_keys)
     opened = open_source(source, calib, frames)
     options.say_notes(opened)
     run_id = secrets.randbits(63)
@@ -63,9 +74,8 @@ def agent(
     hello = Hello(options.agent_name(name), AgentKind(kind), run_id, rig.cam0.focal, rig.T_body_cam0)
     live = _LiveLine(opened.images_count)
     folder = None if out is None else Path(out)
-    run = AgentRun(
-        opened, hello, settings, lambda: connect(address, run_id), folder, live.say, live.show, verbose
-    )
+    link = partial(connect, address, run_id, with_keys)
+    run = AgentRun(opened, hello, settings, link, folder, live.say, live.show, verbose)
     with on_stop(run.stop):
         run.go()
     live.end()
@@ -76,7 +86,21 @@ def agent(
     else:
         click.echo(_summary(run))
     if not run.report["protocol"]["edge_sessions"]:
-        raise ShareError(f"no edge ever answered at {address}; is `share edge` running there?")
+        raise ShareError(f"no edge ever answered at {address}; {run.trouble or _NOBODY}")
+
+
+_NOBODY = "is `share edge` running there?"
+
+
+def _keys(folder: str | None, server_key: str | None) -> AgentKeys | None:
+    """None without --server-key. Raises UsageError."""
+    from share.io.keys import agent_keys
+
+    if server_key is None:
+        if folder is not None:
+            raise UsageError("--keys: goes with --server-key, the public key of the edge")
+        return None
+    return agent_keys(None if folder is None else Path(folder), server_key)
 
 
 class _LiveLine:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import secrets
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from share.cli import options
 from share.config import POLICIES
+
+if TYPE_CHECKING:
+    from share.io.keys import EdgeKeys
 
 
 @click.command()
@@ -20,16 +23,24 @@ from share.config import POLICIES
     type=click.Choice(POLICIES),
     help="How agents are scheduled. By default covins-g: every keyframe is sent, every loop merged.",
 )
+@options.keys
 @click.option("--out", metavar="DIR", help="Write events.jsonl and edge.json here.")
 @options.config
 @options.verbose
 @options.as_json
 def edge(
-    bind: str, policy: str | None, out: str | None, config_file: str | None, verbose: bool, as_json: bool
+    bind: str,
+    policy: str | None,
+    keys: str | None,
+    out: str | None,
+    config_file: str | None,
+    verbose: bool,
+    as_json: bool,
 ) -> None:
     """Join the maps of all agents and send corrections back. Ctrl-C ends it.
 
     Says when agents come and go and when maps are joined; with -v, every decision and its reason.
+    To be reached from other machines it needs keys: see `share keys --help`.
 
     \b
     Example:  share edge --bind tcp://127.0.0.1:5555 --out out/edge
@@ -43,20 +54,36 @@ def edge(
     from share.run.edge import EdgeRun
     from share.run.stop import on_stop
 
-    parse_address(bind, bind=True)
+    with_keys = _keys(keys, parse_address(bind, bind=True).local)
     if policy is not None:
         settings = replace(settings, edge=replace(settings.edge, policy=policy))
     folder = None if out is None else Path(out)
-    with closing(bind_link(bind)) as link:
+    with closing(bind_link(bind, with_keys)) as link:
         run = EdgeRun(settings, secrets.randbits(63), link, folder, lambda e: _tell(e, verbose))
         with on_stop(run.stop):
             click.echo(f"listening on {link.endpoint}, policy {settings.edge.policy}", err=True)
+            _say_keys(with_keys)
             report = run.go()
     click.echo(json.dumps(report) if as_json else _summary(report))
 
 
+def _keys(folder: str | None, local: bool) -> EdgeKeys | None:
+    """Those of --keys; for a network, else of the default folder. Raises UsageError."""
+    from share.io.keys import edge_keys
+
+    if folder is None and local:
+        return None
+    return edge_keys(None if folder is None else Path(folder))
+
+
+def _say_keys(keys: EdgeKeys | None) -> None:
+    if keys is not None:
+        names = ", ".join(sorted(keys.allowed.names().values()))
+        click.echo(f"public key '{keys.own.public}'; authorized: {names or 'nobody yet'}", err=True)
+
+
 _NEWS = {"joined the edge", "left", "back", "silent", "refused"}
-_NEWS |= {"maps joined", "job failed", "not written"}
+_NEWS |= {"not let in", "maps joined", "job failed", "not written"}
 
 
 def _tell(event: dict[str, Any], verbose: bool) -> None:

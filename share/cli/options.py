@@ -22,6 +22,9 @@ calib = click.option(
 )
 config = click.option("--config", "config_file", metavar="FILE", help="YAML file of settings.")
 verbose = click.option("-v", "--verbose", is_flag=True, help="Say more.")
+keys = click.option(
+    "--keys", metavar="DIR", help="Folder of this machine's keys (default: ~/.config/share/keys)."
+)
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
 
 

@@ -119,7 +119,8 @@ def load(folder: Path) -> KeyPair:
 
     found = _secrets(folder)
     if not found:
-        raise UsageError(f"{folder}: has no key pair; make one with `share keys generate`")
+        where = "" if folder == default_folder() else f" --keys {folder}"
+        raise UsageError(f"{folder}: has no key pair; make one with `share keys generate{where}`")
     if len(found) > 1:
         raise UsageError(f"{folder}: has {len(found)} key pairs; keep one in each folder")
     path = found[0]

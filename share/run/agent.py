@@ -85,6 +85,7 @@ class AgentRun:
         self._damaged = 0
         self._ended = False
         self.report: dict[str, Any] = {}
+        self.trouble: str | None = None  # why the edge does not let this agent in
 
     def stop(self) -> None:
         """End early, in good order: no more frames, but what was sent is still waited for."""
@@ -197,11 +198,18 @@ class AgentRun:
     def _loop(self) -> None:
         while not self._ended:
             frames = self._link.receive(TICK_MS)
+            self._say_trouble()
             if frames is not None:
                 self._handle(ev.Received(frames))
             while not self._shared.inbox.empty():
                 self._handle(self._shared.inbox.get())
             self._handle(ev.Tick())
+
+    def _say_trouble(self) -> None:
+        if (trouble := self._link.trouble()) != self.trouble:
+            self.trouble = trouble
+            if trouble is not None:
+                self._say(f"not let in: {trouble}")
 
     def _handle(self, event: ev.AgentEvent) -> None:
         for effect in self._machine.handle(event, time.monotonic_ns()):

@@ -6,6 +6,7 @@ import json
 import os
 import queue
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from share.io.transport import EdgeLink
 from share.run.worker import Worker
 
 TICK_MS = 50
+REFUSALS_SAID = 64  # strangers at the door; more are only counted
 
 
 class EdgeRun:
@@ -44,6 +46,8 @@ class EdgeRun:
             self._claim = claim(out)
             self._events = LineFile(out / "events.jsonl", self._complain)
         self._stopping = False
+        self._began_ns = time.monotonic_ns()
+        self._refused: Counter[str] = Counter()  # handshakes, by what was said of them
 
     def stop(self) -> None:
         """From any thread or a signal handler."""
@@ -58,7 +62,7 @@ class EdgeRun:
         finally:
             self._worker.close()
             self._link.close()
-            report = self._machine.report()
+            report = {**self._machine.report(), "refused_handshakes": self._refused.total()}
             self._finish(report)
         return report
 
@@ -77,6 +81,8 @@ class EdgeRun:
         message = self._link.receive(TICK_MS)
         if message is not None:
             self._handle(Received(*message))
+        for line in self._link.refusals():
+            self._refuse(line)
         while not self._inbox.empty():
             self._handle(self._inbox.get())
         self._handle(Tick())
@@ -92,9 +98,20 @@ class EdgeRun:
             case Work():
                 self._worker.give(effect.job)
             case Record():
-                if self._events is not None:
-                    self._events.write(json.dumps(effect.fields))
-                self._tell(effect.fields)
+                self._record(effect.fields)
+
+    def _record(self, fields: dict[str, Any]) -> None:
+        if self._events is not None:
+            self._events.write(json.dumps(fields))
+        self._tell(fields)
+
+    def _refuse(self, line: str) -> None:
+        """Counts a handshake that was refused; says each kind once, for a bounded number of kinds."""
+        line = line if line in self._refused or len(self._refused) < REFUSALS_SAID else "and others"
+        self._refused[line] += 1
+        if self._refused[line] == 1:
+            t_s = round((time.monotonic_ns() - self._began_ns) * 1e-9, 6)
+            self._record({"t_s": t_s, "event": "not let in", "agent": None, "reason": line})
 
     def _done(self, done: Done) -> None:
         self._inbox.put(done)

@@ -1,0 +1,103 @@
+"""`share keys`: who may connect to an edge from another machine."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from share.cli import options
+
+
+@click.group()
+def keys() -> None:
+    """Make keys, and say which agents an edge lets in.
+
+    \b
+    Both machines:  share keys generate
+    The edge:       share keys authorize ann 'PUBLIC KEY OF ANN'
+                    share edge --bind tcp://0.0.0.0:5555
+    The agent:      share agent REC --name ann --kind ar --edge tcp://H:5555 --server-key 'KEY OF THE EDGE'
+    """
+
+
+@keys.command(short_help="Make this machine's key pair.")
+@click.option("--name", help="What it is called; the name of this machine by default.")
+@options.keys
+def generate(name: str | None, keys: str | None) -> None:
+    """Make this machine's key pair, once, and print the public key.
+
+    NAME.public may go anywhere; NAME.secret stays where it is. A pair that is there is never replaced.
+
+    \b
+    Example:  share keys generate
+    """
+    from share.io.keys import generate as make
+
+    folder = _folder(keys)
+    pair = make(folder, name)
+    click.echo(f"{folder / pair.name}.public: give this key to the other machine:", err=True)
+    click.echo(pair.public)
+
+
+@keys.command(short_help="Let an agent in.")
+@click.argument("name")
+@click.argument("public_key", metavar="KEY|FILE")
+@options.keys
+def authorize(name: str, public_key: str, keys: str | None) -> None:
+    """Let an agent in, by the public key of its machine: the text in single quotes, or NAME.public.
+
+    An edge that is running lets it in at its next attempt, within about a second.
+
+    \b
+    Example:  share keys authorize ann ann.public
+    """
+    from share.io import keys as store
+
+    store.authorize(_folder(keys), name, store.public_key(public_key))
+
+
+@keys.command(short_help="Let an agent in no more.")
+@click.argument("name")
+@options.keys
+def revoke(name: str, keys: str | None) -> None:
+    """Let an agent in no more. An edge that is running throws it out at once.
+
+    \b
+    Example:  share keys revoke ann
+    """
+    from share.io.keys import revoke as drop
+
+    drop(_folder(keys), name)
+
+
+@keys.command("list", short_help="Print this machine's public key and who is let in.")
+@options.keys
+@options.as_json
+def show(keys: str | None, as_json: bool) -> None:
+    """Print this machine's public key and who is let in.
+
+    \b
+    Example:  share keys list
+    """
+    from share.io.keys import edge_keys
+
+    folder = _folder(keys)
+    found = edge_keys(folder)
+    names = sorted((name, key) for key, name in found.allowed.names().items())
+    own: dict[str, Any] = {"name": found.own.name, "public_key": found.own.public}
+    if as_json:
+        listed = [{"name": name, "public_key": key} for name, key in names]
+        click.echo(json.dumps({"folder": str(folder), "own": own, "authorized": listed}))
+        return
+    click.echo(f"{found.own.public}  {found.own.name} (this machine)")
+    for name, key in names:
+        click.echo(f"{key}  {name}")
+
+
+def _folder(given: str | None) -> Path:
+    from share.io.keys import default_folder
+
+    return default_folder() if given is None else Path(given)
