@@ -1,4 +1,4 @@
-"""What the wire costs: encode and decode times, sizes, and round trips over loopback and in memory.
+"""What the wire costs: encode and decode times, sizes, round trips over loopback (plain, CURVE) and in memory.
 
     python tools/bench_wire.py [--rounds N]
 
@@ -13,12 +13,15 @@ import threading
 from collections.abc import Callable
 from contextlib import closing
 from functools import partial
+from pathlib import Path
 from statistics import median
+from tempfile import TemporaryDirectory
 from time import perf_counter_ns, sleep
 from typing import Any
 
 import numpy as np
 
+from share.io.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate
 from share.io.transport import AgentLink, EdgeLink, bind, connect
 from share.io.transport.memory import MemoryNetwork
 from share.types import Keyframe, TrackState, View
@@ -43,6 +46,13 @@ def timed_us(call: Callable[[], Any], rounds: int) -> float:
         call()
         times.append(perf_counter_ns() - start)
     return round(median(times) / 1e3, 1)
+
+
+def keys(folder: Path) -> tuple[EdgeKeys, AgentKeys]:
+    """Of an edge and of an agent that it lets in."""
+    edge, agent = generate(folder / "edge", "edge"), generate(folder / "agent", "agent")
+    authorize(folder / "edge", "agent", agent.public)
+    return EdgeKeys(edge, allow_list(folder / "edge")), AgentKeys(agent, edge.public)
 
 
 def echo(edge: EdgeLink, stop: threading.Event) -> None:
@@ -87,6 +97,13 @@ def main() -> None:
         }
     with closing(bind("tcp://127.0.0.1:0")) as edge, closing(connect(edge.endpoint, 1)) as agent:
         result["round_trip_zmq"] = round_trips(edge, agent, rounds)
+    with TemporaryDirectory() as folder:
+        edge_keys, agent_keys = keys(Path(folder))
+        with (
+            closing(bind("tcp://127.0.0.1:0", edge_keys)) as edge,
+            closing(connect(edge.endpoint, 1, agent_keys)) as agent,
+        ):
+            result["round_trip_curve"] = round_trips(edge, agent, rounds)
     network = MemoryNetwork()
     with closing(network.bind("edge")) as edge, closing(network.connect("edge", 1)) as agent:
         result["round_trip_memory"] = round_trips(edge, agent, rounds)

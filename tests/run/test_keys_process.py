@@ -1,0 +1,122 @@
+"""An edge that others can reach, and agents that come with keys or without, as processes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from children import SHARE, Child, start_agent
+
+from share.emulate.session import make_session
+
+FRAMES = 20
+
+
+def keys(folder: Path, *arguments: str) -> str:
+    command = [*SHARE, "keys", *arguments, "--keys", str(folder)]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_session(tmp_path_factory.mktemp("made") / "room", FRAMES / 20, seed=3, workers=2) / "ar1"
+
+
+class Server:
+    """The machine of an edge; nobody is authorized at first."""
+
+    def __init__(self, folder: Path) -> None:
+        self.keys, self.out = folder / "server-keys", folder / "edge"
+        self.public = keys(self.keys, "generate", "--name", "edge")
+        where = ("--bind", "tcp://0.0.0.0:0", "--keys", str(self.keys), "--out", str(self.out))
+        self.edge = Child(folder / "edge.log", "edge", *where)
+        port = self.edge.wait_for(r"listening on tcp://0\.0\.0\.0:(\d+),")[1]
+        self.address = f"tcp://127.0.0.1:{port}"
+
+    def events(self) -> list[dict[str, object]]:
+        return [json.loads(line) for line in (self.out / "events.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    server = Server(tmp_path)
+    yield server
+    server.edge.kill()
+
+
+def test_an_agent_with_keys_gets_in_and_others_do_not(
+    server: Server, recording: Path, tmp_path: Path
+) -> None:
+    public = keys(tmp_path / "ann-keys", "generate", "--name", "ann")
+    keys(server.keys, "authorize", "ann", public)
+    keys(tmp_path / "eve-keys", "generate", "--name", "eve")
+    server_file = tmp_path / "copied.public"
+    server_file.write_bytes((server.keys / "edge.public").read_bytes())
+    children = {
+        "ann": ("--keys", str(tmp_path / "ann-keys"), "--server-key", str(server_file)),
+        "eve": ("--keys", str(tmp_path / "eve-keys"), "--server-key", server.public),
+        "bob": (),
+    }
+    started = {
+        name: start_agent(tmp_path, name, recording, server.address, *more) for name, more in children.items()
+    }
+    codes = {name: child.wait(60) for name, child in started.items()}
+    assert codes == {"ann": 0, "eve": 1, "bob": 1}
+    assert "connected to the edge" in started["ann"].said
+    assert (
+        "not let in: the edge does not know this key; there: share keys authorize eve '"
+        in started["eve"].said
+    )
+    assert "not let in: the edge there wants keys; give --server-key" in started["bob"].said
+    assert server.edge.interrupt() == 0
+    report = json.loads((server.out / "edge.json").read_text())
+    assert list(report["agents"]) == ["ann"]
+    assert report["agents"]["ann"]["keyframes"] > 0
+    assert report["refused_handshakes"] >= 2
+    reasons = [str(event["reason"]) for event in server.events() if event["event"] == "not let in"]
+    assert len(reasons) == 2  # each kind once
+    assert any("share keys authorize NAME" in reason for reason in reasons)
+    for name in ("eve", "bob"):
+        outcome = json.loads((tmp_path / name / "report.json").read_text())
+        assert (outcome["corrections"], outcome["bytes_down"]) == (0, 0)
+        assert outcome["tracked"] == FRAMES  # odometry goes on alone
+
+
+def test_one_line_each(tmp_path: Path) -> None:
+    for arguments, said in (
+        (
+            ("edge", "--bind", "tcp://0.0.0.0:0", "--keys", str(tmp_path)),
+            "make one with `share keys generate",
+        ),
+        (
+            ("agent", "x", "--name", "a", "--kind", "ar", "--edge", "tcp://192.0.2.1:5555"),
+            "other machines are not spoken to without keys; make them with `share keys generate`",
+        ),
+        (
+            ("agent", "x", "--name", "a", "--kind", "ar", "--edge", "tcp://127.0.0.1:1", "--keys", "k"),
+            "--keys: goes with --server-key",
+        ),
+        (("keys", "authorize", "ann", "nothing", "--keys", str(tmp_path)), "neither a file nor a public key"),
+        (("keys", "revoke", "ann", "--keys", str(tmp_path)), "'ann' is not authorized; there is nobody"),
+    ):
+        done = subprocess.run([*SHARE, *arguments], capture_output=True, text=True)
+        assert (done.returncode, done.stderr.count("\n"), done.stdout) == (2, 1, "")
+        assert said in done.stderr
+
+
+def test_keys_by_command(tmp_path: Path) -> None:
+    own = keys(tmp_path, "generate", "--name", "edge")
+    other = keys(tmp_path / "ann", "generate", "--name", "ann")
+    keys(tmp_path, "authorize", "headset", str(tmp_path / "ann" / "ann.public"))
+    listed = json.loads(keys(tmp_path, "list", "--json"))
+    assert listed == {
+        "folder": str(tmp_path),
+        "own": {"name": "edge", "public_key": own},
+        "authorized": [{"name": "headset", "public_key": other}],
+    }
+    assert keys(tmp_path, "list").splitlines() == [f"{own}  edge (this machine)", f"{other}  headset"]
+    keys(tmp_path, "revoke", "headset")
+    assert json.loads(keys(tmp_path, "list", "--json"))["authorized"] == []
