@@ -90,7 +90,7 @@ def test_commands_page_has_every_command_and_no_other() -> None:
 
 @pytest.mark.parametrize("name", sorted(commands(cli)))
 def test_commands_page_has_every_option_and_no_other(name: str) -> None:
-    rows = re.findall(r"^\| `[^|]*?(--[a-z]+)", documented()[name], flags=re.MULTILINE)
+    rows = re.findall(r"^\| `[^|]*?(--[a-z-]+)", documented()[name], flags=re.MULTILINE)
     assert set(rows) == options(commands(cli)[name])
 
 
@@ -104,5 +104,5 @@ def test_examples_use_options_that_exist(page: Path) -> None:
         name = max((n for n in known if f"{line} ".startswith(f"{n} ")), key=len, default=None)
         assert name or re.match(r"share (--|[a-z]+ --help)", line), f"{page.name}: {line}"
         if name:
-            wrong = set(re.findall(r"(?<= )--[a-z]+", line)) - options(known[name]) - {"--help"}
+            wrong = set(re.findall(r"(?<= )--[a-z-]+", line)) - options(known[name]) - {"--help"}
             assert not wrong, f"{page.name}: {line}"

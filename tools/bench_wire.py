@@ -1,4 +1,4 @@
-"""What the wire costs: encode and decode times, sizes, round trips over loopback (plain, CURVE) and in memory.
+"""What the wire costs: encode and decode, sizes, round trips over loopback (plain and CURVE) and in memory.
 
     python tools/bench_wire.py [--rounds N]
 

@@ -17,9 +17,12 @@ def keys() -> None:
 
     \b
     Both machines:  share keys generate
-    The edge:       share keys authorize ann 'PUBLIC KEY OF ANN'
+    At the edge:    share keys authorize ann 'PUBLIC KEY OF ANN'
                     share edge --bind tcp://0.0.0.0:5555
-    The agent:      share agent REC --name ann --kind ar --edge tcp://H:5555 --server-key 'KEY OF THE EDGE'
+    At the agent:   add --server-key 'PUBLIC KEY OF THE EDGE' to `share agent`
+
+    \b
+    Example:  share keys generate
     """
 
 

@@ -85,7 +85,7 @@ def test_names(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (lambda d: (d / "edge.secret").unlink(), "has no key pair; make one with `share keys generate --keys "),
+        (lambda d: (d / "edge.secret").unlink(), "has no key pair; make one with `share keys generate --"),
         (lambda d: (d / "edge.secret").write_text("gone"), "edge.secret: is not a secret key of SHARE"),
         (lambda d: (d / "edge.secret").write_text(text(d / "edge.public")), "is not a secret key of SHARE"),
         (
