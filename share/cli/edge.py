@@ -68,10 +68,10 @@ def edge(
 
 
 def _keys(folder: str | None, local: bool) -> EdgeKeys | None:
-    """Those of --keys; for a network, else of the default folder. Raises UsageError."""
-    from share.io.keys import edge_keys
+    """Those of --keys; for a network, else of the default folder, if there are any. Raises UsageError."""
+    from share.io.keys import default_folder, edge_keys, has_pair
 
-    if folder is None and local:
+    if folder is None and (local or not has_pair(default_folder())):
         return None
     return edge_keys(None if folder is None else Path(folder))
 

@@ -113,6 +113,10 @@ def generate(folder: Path, name: str | None = None) -> KeyPair:
     return pair
 
 
+def has_pair(folder: Path) -> bool:
+    return bool(_secrets(folder))
+
+
 def load(folder: Path) -> KeyPair:
     """The pair in `folder`. Raises UsageError if there is none or not just one, or others can read it."""
     import zmq

@@ -232,6 +232,11 @@ def house(tmp_path: Path) -> Iterator[House]:
         yield House(tmp_path, stack)
 
 
+def test_a_host_that_cannot_be(house: House) -> None:
+    with pytest.raises(UsageError, match="'-' cannot be the name of a machine"):
+        connect("tcp://-:5555", 1, AgentKeys(house.ann, house.pair.public))
+
+
 def test_who_is_listed_gets_in(house: House) -> None:
     agent = house.agent(1, house.ann)
     house.greets(agent, 1)
