@@ -9,7 +9,7 @@ looked for again, by the patch that was seen first.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,6 +92,8 @@ class VisualTracker:
             result = self._recover(frame)
         else:
             result = self._follow(frame, self._T_odom_cam)
+        if self._rig.imu and not len(frame.imu) and result.state is TrackState.OK:
+            result = replace(result, state=TrackState.VISION_ONLY)  # the IMU is silent: let it be seen
         self._image, self._stamp_ns = frame.image0, frame.stamp_ns
         return result
 

@@ -167,8 +167,23 @@ def test_without_gravity_in_the_accelerometer_up_stays_unknown(walk):
     rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0, imu=noise)
     results, candidates = run(walk[0][:15], rig=rig)  # the IMU says nothing at all
     assert [r.state for r in results[:9]] == [TrackState.INITIALISING] * 9
-    assert results[9].state is TrackState.OK
+    assert results[9].state is TrackState.VISION_ONLY
     assert (candidates[0].up == 0).all()
+
+
+def test_an_imu_that_falls_silent_is_seen_and_ends_nothing(walk):
+    noise = ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, 200.0)
+    rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0, imu=noise)
+    imu = ImuBatch(np.arange(30), np.zeros((30, 3)), np.tile((0.0, -9.81, 0.0), (30, 1)))
+    tracker, states = VisualTracker(rig, TrackerConfig()), []
+    for i, images in enumerate(walk[0][:12]):
+        frame = Frame(stamp(i), i, *images, imu=ImuBatch.empty() if 4 <= i < 8 else imu)
+        result = tracker.track(frame)
+        states.append(result.state)
+        if result.keyframe:
+            tracker.keyframe(frame)
+    ok, alone = [TrackState.OK] * 4, [TrackState.VISION_ONLY] * 4
+    assert states == [*ok, *alone, *ok]
 
 
 def test_level_looks_ahead_and_survives_looking_down():
