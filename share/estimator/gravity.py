@@ -8,34 +8,54 @@ from share.geometry.se3 import compose
 from share.types import F64, ImuBatch
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
+LEAST, NEWEST = 20, 60  # samples by which rest is judged
+KEPT = 200  # samples that a guess in motion is averaged over
+SIZE_TOLERANCE = 0.03  # of gravity; an accelerometer's bias is below 0.02
+MAX_SHAKE = 0.6  # m/s^2, standard deviation: a headset worn by somebody who stands, motors idling
+MAX_TURN = 0.15  # rad/s
 
 
 class AtRest:
-    """Mean specific force over the first samples; believed if its size is gravity's."""
+    """The mean specific force is up, if the body turns little, shakes little, and its size is gravity's.
 
-    def __init__(self, samples: int = 20, tolerance: float = 0.05, patience: int = 10) -> None:
-        self._samples, self._tolerance, self._patience = samples, tolerance, patience
-        self._sum = np.zeros(3)
-        self._count = 0
+    A body that starts in motion measures its own acceleration too: 1 m/s^2 tilts "up" by 6 degrees.
+    """
+
+    def __init__(self, patience: int = 10) -> None:
+        self._patience = patience
+        self._imu = np.zeros((0, 6))  # gyro, accel of the newest samples
         self._frames = 0
 
     @property
     def gave_up(self) -> bool:
-        """The IMU stayed silent, or its mean is not gravity: begin without knowing up."""
+        """The IMU stayed silent, or the body was never at rest: begin without knowing up."""
         return self._frames >= self._patience
 
     def add(self, imu: ImuBatch) -> F64 | None:
         """Unit vector up in the body frame (3,) once it is known, else None."""
-        self._sum += imu.accel.sum(axis=0)
-        self._count += len(imu)
+        self._imu = np.concatenate([self._imu, np.hstack([imu.gyro, imu.accel])])[-KEPT:]
         self._frames += 1
-        if self._count < self._samples:
-            return None
-        mean = self._sum / self._count
-        size = float(np.linalg.norm(mean))
-        if abs(size - STANDARD_GRAVITY) > self._tolerance * STANDARD_GRAVITY:
-            return None
-        return mean / size
+        newest = self._imu[-NEWEST:]
+        return _direction(newest) if len(newest) >= LEAST and _at_rest(newest) else None
+
+    def guess(self) -> F64 | None:
+        """The direction of the mean specific force, at rest or not; None with too few samples."""
+        return _direction(self._imu) if len(self._imu) >= LEAST else None
+
+
+def _at_rest(imu: F64) -> bool:
+    size = np.linalg.norm(imu[:, 3:].mean(axis=0))
+    shake = np.linalg.norm(imu[:, 3:].std(axis=0))
+    turn = np.linalg.norm(imu[:, :3].mean(axis=0))
+    right_size = abs(size - STANDARD_GRAVITY) < SIZE_TOLERANCE * STANDARD_GRAVITY
+    return bool(right_size and shake < MAX_SHAKE and turn < MAX_TURN)
+
+
+def _direction(imu: F64) -> F64 | None:
+    """Unit mean of the accelerations in (N, 6); None in free fall."""
+    mean = imu[:, 3:].mean(axis=0)
+    size = float(np.linalg.norm(mean))
+    return mean / size if size > 0.5 * STANDARD_GRAVITY else None
 
 
 def level(up: F64, forward: F64) -> F64:

@@ -241,7 +241,9 @@ class VisualTracker:
         if self._gravity and up is None and not self._gravity.gave_up:
             return TrackResult(TrackState.INITIALISING, None)
         if up is None:
+            up = self._gravity.guess() if self._gravity else None
             self._gravity = None
+        if up is None:
             up = self._rig.T_body_cam0[:3, :3] @ np.array([0.0, -1.0, 0.0])
         forward = self._rig.T_body_cam0[:3, 2]
         self._T_odom_cam = gravity.level(up, forward) @ self._rig.T_body_cam0
