@@ -214,6 +214,14 @@ class House:
             lines += self.edge.refusals()
         return lines
 
+    def loses(self, agent: AgentLink, within_s: float = 4) -> None:
+        """The agent notices that its connection is gone; until then what it sends reaches nobody."""
+        end = time.monotonic() + within_s
+        while agent.send([b"in?"]):
+            assert time.monotonic() < end, "still connected"
+            assert agent.receive(5) is None
+            assert self.edge.receive(5) is None
+
     def greets(self, agent: AgentLink, run_id: int, within_s: float = 4) -> None:
         """A message there and back."""
         end = time.monotonic() + within_s
@@ -293,6 +301,7 @@ def test_a_revoked_key_is_thrown_out_and_the_others_are_back(house: House) -> No
     assert bad.send([b"too late"])
     assert house.edge.receive(50) is None
     assert not house.edge.send(peer_id(2), [b"for bob"])
+    house.loses(bad)
     assert "does not know this key" in str(house.refusals(bad) and bad.trouble())
     house.greets(ann, 1)
 
