@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import secrets
-import sys
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from share.cli import options
+from share.cli.progress import LiveLine
 from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
@@ -103,32 +103,26 @@ def _keys(folder: str | None, server_key: str | None) -> AgentKeys | None:
     return agent_keys(None if folder is None else Path(folder), server_key)
 
 
-class _LiveLine:
-    """One line on a terminal that is written over; elsewhere only what is said."""
+class _LiveLine(LiveLine):
+    """How far the run is, written over; and what is said, on lines of its own."""
 
     def __init__(self, total: int) -> None:
-        self._total, self._shown, self._tty = total, 0, sys.stderr.isatty()
+        super().__init__()
+        self._total = total
 
     def show(self, status: Status) -> None:
-        if not self._tty or (status.frames % 5 and status.frames != self._total):
+        if not self.seen or (status.frames % 5 and status.frames != self._total):
             return
-        r = status.report
+        r = status.report()
         rtt = "  –  " if r["rtt_ms"] is None else f"{r['rtt_ms']:.1f} ms"
-        text = (
+        self.write(
             f"{status.frames}/{self._total} {status.state:4} sent {r['sent']} acknowledged "
             f"{r['acknowledged']} corrections {r['corrections']} rtt {rtt} map {r['map_id'] or '–'}"
         )
-        click.echo("\r\x1b[K" + text, err=True, nl=False)
-        self._shown = len(text)
 
     def say(self, text: str) -> None:
         self.end()
         click.echo(f"share agent: {text}", err=True)
-
-    def end(self) -> None:
-        if self._shown:
-            click.echo("", err=True)
-        self._shown = 0
 
 
 def _summary(run: AgentRun) -> str:

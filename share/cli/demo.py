@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from share.cli.progress import progress
+from share.cli.progress import LiveLine, progress
 from share.config import POLICIES
 
 if TYPE_CHECKING:
@@ -54,8 +54,8 @@ def demo(seconds: float, policy: str, out: str, seed: int) -> None:
     with progress(100, "making the room") as bar:
         share_done = _Percent(bar)
         session = read_session(cached_session(seconds=seconds, seed=seed, progress=share_done))
-    live = _LiveLine(seconds)
-    folders = play(session, seconds, policy, folder, live.show)
+    live = LiveLine()
+    folders = play(session, seconds, policy, folder, lambda now: live.write(_line(now)))
     live.end()
     result = score(session, folders)
     click.echo(_table(result))
@@ -72,28 +72,18 @@ def demo(seconds: float, policy: str, out: str, seed: int) -> None:
 class _Percent:
     """Frames done of all, as steps of a bar of 100."""
 
-    def __init__(self, bar: object) -> None:
+    def __init__(self, bar: Callable[[int], None]) -> None:
         self._bar, self._done = bar, 0
 
     def __call__(self, done: int, total: int) -> None:
         percent = 100 * done // max(total, 1)
-        self._bar(percent - self._done)  # type: ignore[operator]
+        self._bar(percent - self._done)
         self._done = percent
 
 
-class _LiveLine:
-    def __init__(self, seconds: float) -> None:
-        self._seconds, self._tty = seconds, sys.stderr.isatty()
-
-    def show(self, now: Progress) -> None:
-        if self._tty:
-            frames = "  ".join(f"{name} {count}" for name, count in now.frames.items())
-            text = f"frames: {frames}   in a shared map: {now.joined}   corrections: {now.corrections}"
-            click.echo("\r\x1b[K" + text, err=True, nl=False)
-
-    def end(self) -> None:
-        if self._tty:
-            click.echo("", err=True)
+def _line(now: Progress) -> str:
+    frames = "  ".join(f"{name} {count}" for name, count in now.frames.items())
+    return f"frames: {frames}   in a shared map: {now.joined}   corrections: {now.corrections}"
 
 
 def _table(result: SessionScore) -> str:

@@ -16,6 +16,7 @@ from share import __version__
 from share.config import Config, to_mapping
 from share.core.inorder import InOrder
 from share.core.mapper import Finding, Job, Mapper
+from share.core.rate import seconds
 from share.errors import WireError
 from share.types import Keyframe, TrackState
 from share.wire import messages as wire
@@ -179,7 +180,7 @@ class Edge:
         edge = self._config.edge
         present = [peer for peer in self._peers.values() if not peer.gone]
         for peer in present:
-            if peer.hello.name == hello.name and now_ns - peer.heard_ns < edge.name_hold_s * 1e9:
+            if peer.hello.name == hello.name and now_ns - peer.heard_ns < seconds(edge.name_hold_s):
                 return f"the name '{hello.name}' is in use by another agent; choose another with --name"
         if len(present) >= edge.max_agents:
             return f"the edge serves {len(present)} agents already, as many as it may (edge.max_agents)"
@@ -194,7 +195,7 @@ class Edge:
 
     def _notice_silence(self, now_ns: int) -> None:
         for peer in self._peers.values():
-            if not peer.gone and now_ns - peer.heard_ns > self._config.edge.silent_s * 1e9:
+            if not peer.gone and now_ns - peer.heard_ns > seconds(self._config.edge.silent_s):
                 peer.gone = True
                 self._record(now_ns, "silent", peer, f"nothing heard for {self._config.edge.silent_s:g} s")
 

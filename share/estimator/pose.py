@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import poselib
 from numpy.typing import NDArray
 
 from share.geometry import se3
+from share.geometry.absolute_pose import absolute_pose
 from share.types import F64
 
 
@@ -22,20 +22,11 @@ class PoseEstimate:
 
 
 def consensus(points: F64, uv: F64, focal: float, threshold_px: float, seed: int) -> PoseEstimate | None:
-    """RANSAC over minimal solutions (P3P, LO-RANSAC; poselib, Larsson 2020), None without a model.
-
-    points: (N, 3) m, world. uv: (N, 2) normalised. focal turns them into px for the threshold.
-    """
+    """`absolute_pose` of points (N, 3) m, world, seen at uv (N, 2); None without a model."""
     if len(points) < 4:
         return None
-    camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
-    options = {"max_reproj_error": threshold_px, "seed": seed, "max_iterations": 1000, "min_iterations": 20}
-    pose, info = poselib.estimate_absolute_pose(uv * focal, points, camera, options, {})
-    inliers = np.asarray(info["inliers"], bool)
-    if inliers.sum() < 4:
-        return None
-    T = se3.compose(np.asarray(pose.R), np.asarray(pose.t))
-    return PoseEstimate(T, np.eye(6), inliers)
+    T, inliers = absolute_pose(points, uv, focal, threshold_px, seed)
+    return PoseEstimate(T, np.eye(6), inliers) if inliers.sum() >= 4 else None
 
 
 def refine(

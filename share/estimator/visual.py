@@ -19,7 +19,7 @@ from share.estimator import gravity, relocalise
 from share.estimator.localmap import LocalKeyframe, LocalMap
 from share.estimator.pose import PoseEstimate, consensus, refine
 from share.geometry import se3
-from share.geometry.camera import Rig
+from share.geometry.camera import Rig, rays
 from share.types import F32, F64, I64, U8, Candidate, Frame, TrackState
 from share.vision import corners, klt
 from share.vision.view import depth_at, make_view
@@ -228,8 +228,7 @@ class VisualTracker:
         uv = self._rig.cam0.normalise(px.astype(np.float64))
         z = depth_at(frame, self._rig, px, uv)
         known = ~np.isnan(z)
-        rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)[known]
-        points = se3.transform(self._T_odom_cam, rays * z[known, None])
+        points = se3.transform(self._T_odom_cam, rays(uv[known]) * z[known, None])
         ids = self._map.add_points(host, points, px[known])
         self._tracks = self._tracks.join(_Tracks(ids, px[known]))
 

@@ -13,6 +13,11 @@ import numpy as np
 from share.types import F64, checked_pose
 
 
+def rays(uv: F64) -> F64:
+    """Points (N, 3) at depth 1 on the rays through normalised coordinates (N, 2)."""
+    return np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
+
+
 @dataclass(frozen=True)
 class Camera:
     """Intrinsics in pixels; `distortion` is () or (k1, k2, p1, p2) or (k1, k2, p1, p2, k3)."""

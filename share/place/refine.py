@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.geometry import se3
+from share.geometry.camera import rays
 from share.types import F64
 
 Mask = NDArray[np.bool_]
@@ -56,8 +57,7 @@ def move(T: F64, y: F64) -> tuple[F64, F64, F64]:
     NaN for a point that is then behind the camera: it has no image.
     """
     rho = y[:, 2]
-    rays = np.concatenate([y[:, :2], np.ones((len(y), 1))], axis=1)
-    points = rays / rho[:, None]
+    points = rays(y[:, :2]) / rho[:, None]
     x, yy, z = se3.transform(T, points).T
     z = np.where(z > _NEAREST, z, np.nan)
     moved = np.stack([x / z, yy / z, 1 / z], axis=1)

@@ -11,16 +11,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import poselib
 
 from share.config import PlaceConfig
 from share.geometry import se3
+from share.geometry.absolute_pose import absolute_pose
+from share.geometry.camera import rays
 from share.place.matching import match
 from share.place.refine import Noise, refine
 from share.types import F64, View
 
 _NEAR, _FAR = 0.05, 1000.0  # m; a depth outside says nothing
 _WIDEST = 10.0  # |u|, |v| of a keypoint that a lens can see (84 degrees off the axis)
+
+
+MIN_ITERATIONS = 50  # of each consensus: one wrong place costs more than a millisecond
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,21 +136,15 @@ def _both_ways(y_q: F64, y_c: F64, focal_q: float, focal_c: float, config: Place
 
 
 def _absolute_pose(source: F64, target: F64, focal: float, whose: str, config: PlaceConfig, seed: int) -> F64:
-    """T_target_source from 3D points of the source seen by the target (LO-RANSAC + P3P, poselib)."""
+    """T_target_source from 3D points of the source seen by the target."""
     known = np.isfinite(source[:, 2])
     _need(int(known.sum()), config.min_direction_inliers, f"matches with the {whose} depth")
     y = source[known]
-    points = np.column_stack([y[:, :2], np.ones(len(y))]) / y[:, 2:]
-    camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal, 0.0, 0.0]}
-    ransac = {
-        "max_reproj_error": config.ransac_px,
-        "max_iterations": config.ransac_iterations,
-        "min_iterations": 50,
-        "seed": seed,
-    }
-    pose, info = poselib.estimate_absolute_pose(target[known, :2] * focal, points, camera, ransac, {})
-    _need(int(info["num_inliers"]), config.min_direction_inliers, f"inliers of the {whose} points")
-    T = se3.compose(np.asarray(pose.R), np.asarray(pose.t))
+    points, seen = rays(y[:, :2]) / y[:, 2:], target[known, :2]
+    T, inliers = absolute_pose(
+        points, seen, focal, config.ransac_px, seed, MIN_ITERATIONS, config.ransac_iterations
+    )
+    _need(int(inliers.sum()), config.min_direction_inliers, f"inliers of the {whose} points")
     if not np.isfinite(T).all():
         raise _RefusedError(f"no pose from the {whose} points")
     return T

@@ -43,7 +43,7 @@ class Status:
 
     frames: int
     state: str
-    report: dict[str, Any]
+    report: Callable[[], dict[str, Any]]
 
 
 @dataclass
@@ -225,7 +225,7 @@ class AgentRun:
                     self._files.map(effect.stamp_ns, effect.T_map_odom @ effect.T_odom_body, effect.map_id)
             case ev.FrameDone():
                 self._log.add(effect.stamp_ns, effect.track_ms, effect.state, effect.keyframe, effect.sent)
-                self._show(Status(len(self._log), str(effect.state), self._machine.report()))
+                self._show(Status(len(self._log), str(effect.state), self._machine.report))
             case ev.CorrectionApplied():
                 if effect.stamp_ns is not None and effect.corrected_ms is not None:
                     self._log.mark_corrected(effect.stamp_ns, effect.corrected_ms)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from share.geometry import se3
-from share.geometry.camera import Rig
+from share.geometry.camera import Rig, rays
 from share.types import F32, F64, U8
 from share.vision import klt
 
@@ -26,12 +26,12 @@ def from_depth_camera(depth: F32, rig: Rig, uv: F64) -> F64:
         return np.zeros(0)
     T_cam0_depth = se3.inverse(rig.T_depth_cam0)
     clean = _without_edges(depth)
-    rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
+    ray = rays(uv)
     out = np.full(len(uv), np.nan)
     for guess in (2.0, 1.0, 4.0):
         z = np.where(np.isnan(out), guess, out)
         for _ in range(4):
-            px = rig.depth.project(se3.transform(rig.T_depth_cam0, rays * z[:, None]))
+            px = rig.depth.project(se3.transform(rig.T_depth_cam0, ray * z[:, None]))
             seen = _sample(clean, px)
             points = _back_project(rig, px, seen)
             points = se3.transform(T_cam0_depth, points)
@@ -63,7 +63,7 @@ def _sample(depth: F32, px: F64) -> F64:
 def _back_project(rig: Rig, px: F64, z: F64) -> F64:
     assert rig.depth is not None
     uv = rig.depth.normalise(px)
-    return np.concatenate([uv, np.ones((len(uv), 1))], axis=1) * z[:, None]
+    return rays(uv) * z[:, None]
 
 
 def from_stereo(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, guess_m: F64 | None = None) -> F64:
@@ -76,17 +76,17 @@ def from_stereo(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, guess_m: F64
     out = np.full(len(px), np.nan)
     if len(px) == 0:
         return out
-    rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
+    ray = rays(uv)
     expected = np.full(len(px), np.nan) if guess_m is None else guess_m
     for fallback in (3.0, 1.2):
         todo = np.flatnonzero(np.isnan(out))
         if len(todo) == 0:
             break
         z = np.where(np.isnan(expected[todo]), fallback, expected[todo])
-        guess = rig.cam1.project(se3.transform(rig.T_cam1_cam0, rays[todo] * z[:, None]))
+        guess = rig.cam1.project(se3.transform(rig.T_cam1_cam0, ray[todo] * z[:, None]))
         start = np.where(np.isnan(guess), px[todo], guess).astype(np.float32)
         right, found = klt.follow(image0, image1, px[todo], start, window=15, levels=2, back_check_px=None)
-        depth, error_px = _two_rays(rig, rays[todo], rig.cam1.normalise(right.astype(np.float64)))
+        depth, error_px = _two_rays(rig, ray[todo], rig.cam1.normalise(right.astype(np.float64)))
         found &= (error_px < 1.5) & (depth > MIN_DEPTH) & (depth < MAX_DEPTH * 2)
         found &= klt.resemblance(image0, image1, px[todo], right) > 0.8
         out[todo[found]] = depth[found]

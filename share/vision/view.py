@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from share.geometry.camera import Rig
+from share.geometry.camera import Rig, rays
 from share.types import F32, F64, U8, Frame, View
 from share.vision import depth as depths
 
@@ -24,7 +24,7 @@ def make_view(frame: Frame, rig: Rig, count: int = 500) -> View:
     px, descriptors = orb(frame.image0, count)
     uv = rig.cam0.normalise(px.astype(np.float64))
     z = depth_at(frame, rig, px, uv)
-    points = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) * z[:, None]
+    points = rays(uv) * z[:, None]
     return View(uv.astype(np.float32), points.astype(np.float32), descriptors)
 
 
