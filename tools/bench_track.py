@@ -28,11 +28,11 @@ import poselib  # noqa: E402, F401 -- else the first frame would pay for it
 
 from share.config import Config, TrackerConfig  # noqa: E402
 from share.core.sequencer import SequencerCounters  # noqa: E402
-from share.emulate.agents import AGENTS, BASELINE, RATE_HZ, Agent  # noqa: E402
-from share.emulate.motion import move  # noqa: E402
-from share.emulate.render import Renderer  # noqa: E402
-from share.emulate.room import make_room  # noqa: E402
-from share.emulate.sensor import Sensor  # noqa: E402
+from share.emulate.plain.agents import AGENTS, BASELINE, RATE_HZ, Agent  # noqa: E402
+from share.emulate.plain.motion import move  # noqa: E402
+from share.emulate.plain.render import Renderer  # noqa: E402
+from share.emulate.plain.room import make_room  # noqa: E402
+from share.emulate.plain.sensor import Sensor  # noqa: E402
 from share.estimator.visual import VisualTracker  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.camera import Rig  # noqa: E402

@@ -44,7 +44,7 @@ def demo(seconds: float, policy: str, out: str, seed: int) -> None:
     Example:  share demo --seconds 30 --out /tmp/demo
     """
     folder = Path(out)
-    from share.emulate.session import cached_session
+    from share.emulate.plain.session import cached_session
     from share.io.files import writable_dir
     from share.io.session import read_session
     from share.run.demo import play

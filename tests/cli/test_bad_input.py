@@ -20,7 +20,7 @@ import pytest
 from recordings import make_euroc, make_tum
 
 from share.cli.main import main
-from share.emulate.session import make_session
+from share.emulate.plain.session import make_session
 
 SHARE = [sys.executable, "-m", "share"]
 NOBODY = "tcp://127.0.0.1:1"  # a port that nothing listens on

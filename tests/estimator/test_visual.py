@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from share.config import TrackerConfig
-from share.emulate.motion import STYLES, move
-from share.emulate.render import Renderer
-from share.emulate.room import make_room
-from share.emulate.sensor import Sensor
+from share.emulate.plain.motion import STYLES, move
+from share.emulate.plain.render import Renderer
+from share.emulate.plain.room import make_room
+from share.emulate.plain.sensor import Sensor
 from share.estimator import gravity
 from share.estimator.visual import VisualTracker
 from share.geometry import se3

@@ -12,7 +12,7 @@ import pytest
 from children import SHARE
 
 from share.config import Config
-from share.emulate.session import cached_session
+from share.emulate.plain.session import cached_session
 from share.geometry import se3
 from share.io.source import open_source
 from share.metrics.association import associate

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from children import SHARE, Child, start_agent
 
-from share.emulate.session import make_session
+from share.emulate.plain.session import make_session
 
 FRAMES = 20
 

@@ -1,6 +1,6 @@
 import numpy as np
 
-from share.emulate.sensor import Sensor
+from share.emulate.plain.sensor import Sensor
 
 
 def test_gray_noise_is_two_levels_and_belongs_to_the_frame():

@@ -14,7 +14,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from share.emulate.room import LEVELS, TEXELS_PER_M, Room
+from share.emulate.plain.room import LEVELS, TEXELS_PER_M, Room
 from share.geometry.camera import Camera
 from share.geometry.se3 import inverse, transform
 from share.types import F32, F64, U8

@@ -3,9 +3,9 @@ import functools
 import numpy as np
 import pytest
 
-from share.emulate.motion import STYLES, move
-from share.emulate.render import Renderer
-from share.emulate.room import make_room
+from share.emulate.plain.motion import STYLES, move
+from share.emulate.plain.render import Renderer
+from share.emulate.plain.room import make_room
 from share.geometry.camera import Camera
 from share.geometry.se3 import angle, inverse, transform
 

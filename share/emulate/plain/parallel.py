@@ -12,8 +12,8 @@ from typing import Any
 
 import cv2
 
-from share.emulate.agents import AGENTS
-from share.emulate.record import record
+from share.emulate.plain.agents import AGENTS
+from share.emulate.plain.record import record
 from share.errors import ShareError
 
 _POLL_S = 0.1

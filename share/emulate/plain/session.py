@@ -14,7 +14,7 @@ from glob import escape
 from pathlib import Path
 
 from share import __version__
-from share.emulate.agents import AGENTS, RATE_HZ, calibration
+from share.emulate.plain.agents import AGENTS, RATE_HZ, calibration
 from share.errors import ShareError, UsageError
 from share.io.files import atomic_write, writable_dir
 from share.io.session import SCHEMA, SESSION
@@ -71,7 +71,7 @@ def default_cache() -> Path:
 
 
 def _make(out: Path, frames: int, seed: int, workers: int, progress: Progress) -> None:
-    from share.emulate.parallel import record_all
+    from share.emulate.plain.parallel import record_all
 
     for left in out.parent.glob(f".{escape(out.name)}.partial-*"):
         shutil.rmtree(left, ignore_errors=True)

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 
 from share.core.measurement import CAM0, CAM1, DEPTH, Measurement
-from share.emulate.agents import AGENTS, BASELINE, RATE_HZ, Agent
-from share.emulate.motion import move
-from share.emulate.render import Renderer
-from share.emulate.room import Room, make_room
-from share.emulate.sensor import Sensor
+from share.emulate.plain.agents import AGENTS, BASELINE, RATE_HZ, Agent
+from share.emulate.plain.motion import move
+from share.emulate.plain.render import Renderer
+from share.emulate.plain.room import Room, make_room
+from share.emulate.plain.sensor import Sensor
 from share.geometry.se3 import inverse
 from share.io.files import atomic_write
 from share.io.images import EncodedImage

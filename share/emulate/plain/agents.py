@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from share.emulate.motion import STYLES, Style
+from share.emulate.plain.motion import STYLES, Style
 from share.geometry.camera import Camera, Rig
 from share.geometry.se3 import compose
 from share.types import AgentKind

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from share.emulate import texture
+from share.emulate.plain import texture
 from share.types import F32, F64, U8
 
 TEXELS_PER_M = 250.0

@@ -9,8 +9,8 @@ import pytest
 
 from share.core.measurement import CAM0, CAM1, DEPTH
 from share.emulate import session as session_module
-from share.emulate.agents import AGENTS, RATE_HZ
-from share.emulate.session import cached_session, default_cache, make_session
+from share.emulate.plain.agents import AGENTS, RATE_HZ
+from share.emulate.plain.session import cached_session, default_cache, make_session
 from share.errors import ShareError, UsageError
 from share.io.session import read_session
 from share.io.source import open_source
@@ -100,7 +100,7 @@ def test_default_cache_follows_xdg(monkeypatch, tmp_path):
 
 def test_a_worker_that_fails_is_heard(tmp_path):
     """A file where the recording's folder should be: the worker's own error, in one line."""
-    from share.emulate.parallel import record_all
+    from share.emulate.plain.parallel import record_all
 
     (tmp_path / "file").touch()
     with pytest.raises(UsageError, match="not a folder"):

@@ -1,0 +1,113 @@
+"""What the parts of the emulator hand to each other: meshes, a finished room, a moment, a path.
+
+    layout (world) -> where paths fit (motion) -> room with pictures and light (world)
+                   -> images of moments (render) -> what a sensor makes of them (sensor) -> a session
+
+World frame: z up, origin in a lower corner of the room, metres. Gray levels are linear in light:
+the non-linear parts (exposure, noise, saturation) are the sensor's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from share.geometry.camera import Camera
+from share.types import F32, F64, I64, U8, ImuBatch
+
+I32 = NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles. vertices (V, 3) m and unit normals (V, 3); uv (V, 2): places in a picture, 1 being
+    its whole width, repeating beyond; layer (V,): which picture, the same for all corners of a
+    triangle; faces (F, 3): corners, counter-clockwise as seen from outside (both sides are drawn)."""
+
+    vertices: F32
+    normals: F32
+    uv: F32
+    layer: I32
+    faces: I32
+
+    @property
+    def triangles(self) -> F32:
+        """Corners (F, 3, 3) m."""
+        return self.vertices[self.faces]
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """A room ready to be drawn.
+
+    size (3,) m. mesh: what does not move. pictures (L, P, P) uint8: albedo, one a layer. light_map
+    (H, W) uint8: baked light, 100 = as much as makes albedo the gray level; light_uv (V, 2): place of
+    each vertex of `mesh` in it, 0..1. movers: by name, the rigid parts of each agent that others may
+    see, each in the frame that `Moment.movers` places; their light is `mover_light` everywhere.
+    """
+
+    name: str
+    seed: int
+    size: F64
+    mesh: Mesh
+    pictures: U8
+    light_uv: F32
+    light_map: U8
+    movers: dict[str, tuple[Mesh, ...]] = field(default_factory=dict)
+    mover_light: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """What stands where at one instant. T_world_cam (4, 4); movers: by name, T_world_part (P, 4, 4).
+    An agent does not list itself: it does not see itself."""
+
+    T_world_cam: F64
+    movers: dict[str, F64] = field(default_factory=dict)
+
+
+class Renderer(Protocol):
+    """Draws one room. Made once a process; not safe for threads."""
+
+    def radiance(self, camera: Camera, moments: Sequence[Moment]) -> F32:
+        """Image (H, W) in linear gray levels 0..255, the mean over `moments`: one for a sharp image,
+        several for one blurred by motion. Honours the camera's distortion; pixel centres at integers."""
+        ...
+
+    def depth(self, camera: Camera, moment: Moment) -> F32:
+        """Exact depth (H, W) m along the optical axis through pixel centres, 0 where nothing is."""
+        ...
+
+
+class Path(Protocol):
+    """The true motion of one agent's body (its IMU frame), known at every instant of its span.
+
+    start_ns, end_ns: in the agent's clock, both included. gaps (G, 2) ns: where nobody knows the truth
+    (motion capture lost the body): no image is made there, and truth files have a gap.
+    recorded: a real IMU's samples, to be used untouched; None where the IMU is to be simulated.
+    """
+
+    start_ns: int
+    end_ns: int
+    gaps: I64
+    recorded: ImuBatch | None
+
+    def poses(self, stamps_ns: I64) -> F64:
+        """T_world_body (N, 4, 4). Raises ValueError outside the span."""
+        ...
+
+    def inertial(self, stamps_ns: I64) -> tuple[F64, F64]:
+        """What a perfect IMU would measure: angular rate (N, 3) rad/s and specific force (N, 3) m/s^2,
+        both in the body frame; gravity is `GRAVITY` along -z of the world."""
+        ...
+
+    def placed(self, T_world_old: F64) -> Path:
+        """The same motion elsewhere: turned about the vertical and shifted by T_world_old (4, 4)."""
+        ...
+
+
+GRAVITY = 9.81  # m/s^2
