@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from share.core.measurement import CAM0, CAM1, DEPTH
-from share.emulate import session as session_module
+from share.emulate.plain import session as session_module
 from share.emulate.plain.agents import AGENTS, RATE_HZ
 from share.emulate.plain.session import cached_session, default_cache, make_session
 from share.errors import ShareError, UsageError
