@@ -1,0 +1,1 @@
+"""Rooms as seeded data: layout, pictures, light, where one can move, users' own glTF rooms."""
