@@ -1,0 +1,157 @@
+"""One emulated device: all that a session needs to turn perfect pictures and motion into a recording.
+
+Everything follows from (seed, stream, frame): call it in any order, in any process.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from share.emulate.sensor import clock as clocks
+from share.emulate.sensor import exposure as exposures
+from share.emulate.sensor.clock import DeviceClock, Stream
+from share.emulate.sensor.depth import DepthSensor
+from share.emulate.sensor.draws import Seed
+from share.emulate.sensor.effects import Effects
+from share.emulate.sensor.exposure import Shot, Shots
+from share.emulate.sensor.imu import ImuStreams, measured
+from share.emulate.sensor.photometry import Imager
+from share.emulate.types import Path
+from share.io.profile_types import Inertial, Profile
+from share.types import F32, F64, I64, U8
+
+_PHASE, _DROPS, _JITTER, _LAMP, _CAMERA, _DEPTH, _GYRO, _ACCEL = range(8)  # streams of random numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """Frames that arrive: index (N,), when they are exposed (true time) and their stamps, both (N,) ns."""
+
+    index: I64
+    true_ns: I64
+    stamp_ns: I64
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+class Device:
+    """A device of `profile` with `effects`.
+
+    origin_ns: true time (the path's) at which it is switched on; frames count from there. seed: its own;
+    room_seed: what all devices in the room share, the lamps.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        effects: Effects | None = None,
+        seed: Seed = (0,),
+        origin_ns: int = 0,
+        room_seed: Seed = (0,),
+    ) -> None:
+        self.profile, self.effects = profile, effects or Effects()
+        self._seed, self._origin_ns, self._room_seed = seed, origin_ns, room_seed
+        facts = profile.device.clock
+        self.clock = DeviceClock(
+            origin_ns,
+            round(self.effects.clock_offset_ms * 1e6),
+            self.effects.clock_drift_ppm,
+            facts.tick_ns,
+            facts.bits if self.effects.wrap else 0,
+        )
+
+    # -- pictures ----------------------------------------------------------------------------
+
+    def pictures(self, start_ns: int, end_ns: int) -> Pictures:
+        """The frames exposed in [start, end] true time that are not dropped."""
+        effects = self.effects
+        index, true = self._stream(self.profile.rate_hz, _CAMERA).times(start_ns, end_ns)
+        lost = clocks.dropped((*self._seed, _DROPS), index, effects.drops, effects.drop_burst)
+        index, true = index[~lost], true[~lost]
+        error = clocks.jittered((*self._seed, _JITTER), index, effects.jitter_ms * 1e6)
+        return Pictures(index, true, self.clock.read(true - round(effects.time_offset_ms * 1e6) + error))
+
+    def light(self, true_ns: I64) -> F64:
+        """Of the room's lamps (N,) at true times (N,), against what the room was made with."""
+        effects = self.effects
+        since = np.asarray(true_ns) - self._origin_ns
+        return exposures.lamp((*self._room_seed, _LAMP), since, effects.lamp_every_s, effects.lamp_stops)
+
+    def shots(self, true_ns: I64, brightness: F64) -> Shots:
+        """How the pictures at true_ns (N,) are taken; brightness (N,): mean radiance of what they see."""
+        light, device = self.light(true_ns), self.profile.device
+        model, reference = self.profile.emulation.exposure, self._reference_ms
+        if not self.effects.exposure:
+            return Shots(np.full(len(light), reference), np.ones(len(light)), light)
+        seen = np.asarray(brightness, np.float64) * light * self._imagers[0].mean_response
+        time, gain = exposures.auto_exposure(seen, model, reference, device.exposure_ms, device.gain)
+        return Shots(time, gain, light)
+
+    def blur_offsets(self, shot: Shot, pixels_of_motion: float) -> F64:
+        """Times (S,) s about a picture's at which to draw it; pixels_of_motion: most, in the exposure."""
+        return exposures.blur_offsets(shot.exposure_ms, pixels_of_motion if self.effects.blur else 0.0)
+
+    def develop(self, radiance: F32, frame: int, camera: int, shot: Shot | None = None) -> U8:
+        """Radiance (H, W) float32 of camera 0 or 1 -> gray (H, W) uint8. frame: its `Pictures.index`.
+        Without `shot`: the reference exposure."""
+        return self._imagers[camera].develop(radiance, frame, shot or Shot(self._reference_ms))
+
+    def depth_mm(self, depth: F32, left: U8, frame: int) -> np.ndarray:
+        """Exact depth (H, W) m and the developed left picture -> the device's, uint16 mm, 0 = none."""
+        return self._depth.read(depth, left, frame)
+
+    # -- IMU ---------------------------------------------------------------------------------
+
+    def imu(self, path: Path) -> ImuStreams:
+        """All IMU samples of the span of `path`: recorded ones untouched, else simulated. Stamps are the
+        device clock's."""
+        if path.recorded is not None:
+            stamps = self.clock.read(path.recorded.stamps_ns)
+            return ImuStreams(stamps, path.recorded.gyro, stamps, path.recorded.accel)
+        facts = self.profile.device.imu
+        gyro_ns, gyro = self._inertial(path, facts.gyro, _GYRO, 0)
+        accel_ns, accel = self._inertial(path, facts.accel, _GYRO if facts.joined else _ACCEL, 1)
+        return ImuStreams(gyro_ns, gyro, accel_ns, accel)
+
+    def _inertial(self, path: Path, sensor: Inertial, stream: int, which: int) -> tuple[I64, F64]:
+        index, true = self._stream(sensor.rate_hz, stream).times(path.start_ns, path.end_ns)
+        effects = self.effects
+        errors = (effects.imu_noise, effects.imu_bias, effects.imu_limits)
+        values = measured(path.inertial(true)[which], sensor, (*self._seed, _GYRO, which), *errors)
+        jitter = clocks.jittered((*self._seed, _JITTER, stream), index, effects.imu_jitter_ms * 1e6)
+        return self.clock.read(true + jitter), values
+
+    # -- parts -------------------------------------------------------------------------------
+
+    def _stream(self, rate_hz: float, stream: int) -> Stream:
+        """A free-running stream begins somewhere in its first period; a triggered one at the origin."""
+        if self.profile.device.clock.triggered:
+            return Stream(rate_hz, self._origin_ns)
+        return Stream(rate_hz, self._origin_ns + clocks.phase_ns((*self._seed, _PHASE, stream), rate_hz))
+
+    @property
+    def _reference_ms(self) -> float:
+        return self.profile.emulation.camera.reference_ms
+
+    @cached_property
+    def _imagers(self) -> list[Imager]:
+        effects, model = self.effects, self.profile.emulation.camera
+        return [
+            Imager(
+                camera,
+                model,
+                (*self._seed, _CAMERA, i),
+                effects.noise,
+                effects.vignetting,
+                effects.lens_blur,
+            )
+            for i, camera in enumerate(self.profile.mode.cameras())
+        ]
+
+    @cached_property
+    def _depth(self) -> DepthSensor:
+        return DepthSensor(self.profile, (*self._seed, _DEPTH), self.effects.depth_noise)

@@ -1,0 +1,100 @@
+"""Which imperfections an emulated device has, and how much of each."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from share.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Effects:
+    """Each can be turned off or set. The defaults are a sound device; `NONE` is a perfect one.
+
+    Signs: a picture taken at IMU time t is stamped t - time_offset_ms (Kalibr's timeshift_cam_imu:
+    t_imu = t_cam + shift). A device's clock shows session time + clock_offset_ms, and gains
+    clock_drift_ppm microseconds a second from the start of the session. Raises UsageError for a value that
+    makes no sense.
+    """
+
+    noise: bool = True  # of the imager: shot, read, fixed pattern
+    vignetting: bool = True
+    lens_blur: bool = True
+    exposure: bool = True  # auto exposure; off: the reference exposure and gain 1 throughout
+    blur: bool = True  # motion blur over the exposure
+    depth_noise: bool = True  # errors and holes of stereo matching; off: exact, in mm
+    imu_noise: bool = True
+    imu_bias: bool = True
+    imu_limits: bool = True  # saturation and digits
+    lamp_every_s: float = 0.0  # mean time between switchings of a lamp; 0: none
+    lamp_stops: float = 1.5  # how much a switching changes the light, as a power of two, at most
+    drops: float = 0.0  # share of frames that are lost
+    drop_burst: float = 1.0  # mean number of frames lost together
+    jitter_ms: float = 0.0  # sigma of a picture's stamp
+    imu_jitter_ms: float = 0.0  # sigma of an IMU sample's stamp
+    time_offset_ms: float = 0.0
+    clock_offset_ms: float = 0.0
+    clock_drift_ppm: float = 0.0
+    wrap: bool = False  # stamps wrap as the device's counter does, where it does
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value, kind = getattr(self, field.name), bool if field.default is True or field.default is False else float
+            if type(value) is not kind and not (kind is float and type(value) is int):
+                raise UsageError(f"effect {field.name}: expected {_WORDS[kind]}, found {value!r}")
+            if kind is float and not math.isfinite(value):
+                raise UsageError(f"effect {field.name}: {value} is not finite")
+        for name, (low, high) in _LIMITS.items():
+            if not low <= getattr(self, name) <= high:
+                raise UsageError(f"effect {name}: {getattr(self, name):g} must lie in {low:g} .. {high:g}")
+
+
+_WORDS = {bool: "on or off", float: "a number"}
+_LIMITS: dict[str, tuple[float, float]] = {
+    "lamp_every_s": (0, 1e6),
+    "lamp_stops": (0, 6),
+    "drops": (0, 0.9),
+    "drop_burst": (1, 20),
+    "jitter_ms": (0, 20),
+    "imu_jitter_ms": (0, 20),
+    "time_offset_ms": (-1000, 1000),
+    "clock_offset_ms": (-1e12, 1e12),
+    "clock_drift_ppm": (-1000, 1000),
+}
+NONE = Effects(**{f.name: False for f in dataclasses.fields(Effects) if f.default is True})
+
+
+def parse(words: Iterable[str], base: Effects | None = None) -> Effects:
+    """`base` with changes such as "noise=off", "drops=0.02", "time_offset_ms=-8" and "none" (a perfect
+    device, then what follows). Raises UsageError naming the word and what is known."""
+    effects = base or Effects()
+    for word in words:
+        if word == "none":
+            effects = NONE
+            continue
+        name, _, text = word.partition("=")
+        effects = dataclasses.replace(effects, **{name: _value(name, text)})
+    return effects
+
+
+def _value(name: str, text: str) -> bool | float:
+    kinds = {field.name: type(field.default) for field in dataclasses.fields(Effects)}
+    if name not in kinds:
+        near = difflib.get_close_matches(name, kinds, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f"known: none, {', '.join(kinds)}"
+        raise UsageError(f"effect '{name}' is not known; {hint}")
+    if kinds[name] is bool:
+        if text not in _SWITCH:
+            raise UsageError(f"effect {name}: expected {name}=on or {name}=off, found '{text}'")
+        return _SWITCH[text]
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(f"effect {name}: expected a number, found '{text}'") from None
+
+
+_SWITCH = {"on": True, "off": False}
