@@ -271,7 +271,8 @@ def _cell(skin: Material, cell: int) -> F64:
     n = skin.cells
     row, column = divmod(cell % (n * n), n)
     low, high = _INSET, 1 - _INSET
-    return (np.array([(low, high), (high, high), (high, low), (low, low)]) + [column, row]) / n
+    corners = np.array([(low, high), (high, high), (high, low), (low, low)])
+    return np.asarray((corners + np.array([column, row])) / n)
 
 
 def _planar(corners: F64, uv: F64, skin: Material) -> Shape:
