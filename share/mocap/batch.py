@@ -1,0 +1,111 @@
+"""Least squares over all nodes at once, by Levenberg and Marquardt with a robust mocap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.geometry import se3
+from share.geometry.camera import ImuNoise
+from share.mocap.factors import Chain, Sightings, imu_chain, sightings
+from share.mocap.mocap import Mocap
+from share.mocap.options import FitOptions
+from share.mocap.solve import Normal, normal_equations, solve
+from share.mocap.state import SHARED, State
+from share.types import F64, ImuBatch
+
+_BIAS_SIGMA = np.repeat([0.2, 1.0], 3)  # rad/s, m/s^2: no IMU is worse; only holds what no motion shows
+_OFFSET_SIGMA = 0.02  # s: what the coarse offset may be wrong by
+_TILT_SIGMA = 1.0  # rad: none to speak of
+_CONVERGED = 1e-7  # of the cost
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The best state, what it was judged by, and its weights (K,) of the mocap samples, 0..1."""
+
+    state: State
+    chain: Chain
+    seen: Sightings
+    weight: F64
+    normal: Normal
+    cov_shared: F64
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """One problem: the IMU with its (inflated) noise, the mocap in the IMU's clock, where the chain of
+    nodes is broken, and a first T_body_mocap (4, 4)."""
+
+    imu: ImuBatch
+    noise: ImuNoise
+    mocap: Mocap
+    breaks: np.ndarray
+    guess: F64
+    options: FitOptions
+
+    def minimise(self, state: State) -> Solved:
+        """From `state` downhill until the cost stands still."""
+        chain, seen, cost = self._measure(state)
+        damping = 1e-4
+        for _ in range(self.options.max_iterations):
+            normal = self._normal(state, chain, seen)
+            nodes, shared, _ = solve(normal, damping)
+            moved = state.moved(nodes, shared)
+            tried = self._measure(moved)
+            if not tried[2] < cost:
+                if damping > 1e6:
+                    break
+                damping *= 10
+                continue
+            done = cost - tried[2] < _CONVERGED * cost
+            state, (chain, seen, cost) = moved, tried
+            damping = max(damping / 10, 1e-12)
+            if done:
+                break
+        normal = self._normal(state, chain, seen)
+        weight = self._weight(seen)
+        return Solved(state, chain, seen, weight, normal, solve(normal, 0.0)[2])
+
+    @property
+    def _share(self) -> float:
+        """What one mocap sample counts for: samples denser than they err independently share."""
+        return min(1.0, self.options.independent_hz * self.mocap.spacing_ns * 1e-9)
+
+    def _sigma(self) -> F64:
+        return np.repeat([self.options.sigma_rotation, self.options.sigma_position], 3)
+
+    def _weight(self, seen: Sightings) -> F64:
+        """Cauchy's, of the mean square of the six: (K,)."""
+        return np.asarray(1 / (1 + (seen.residual**2).mean(1) / self.options.cauchy**2), np.float64)
+
+    def _measure(self, state: State) -> tuple[Chain, Sightings, float]:
+        chain = imu_chain(state, self.imu, self.noise, self.options.gravity, self.breaks)
+        seen = sightings(
+            state, self.imu, self.options.gravity, self.mocap.stamps_ns, self.mocap.T, self._sigma()
+        )
+        robust = -6 * self.options.cauchy**2 * np.log(self._weight(seen)).sum() * self._share
+        first = np.concatenate([state.gyro_bias[0], state.accel_bias[0]]) / _BIAS_SIGMA
+        prior = (self._prior() * self._strayed(state) ** 2).sum()
+        return chain, seen, float((chain.residual**2).sum() + robust + (first**2).sum() + prior)
+
+    def _normal(self, state: State, chain: Chain, seen: Sightings) -> Normal:
+        weight = self._weight(seen) * self._share
+        out = normal_equations(chain, seen, weight, self._prior(), self._strayed(state), len(state.p))
+        out.diagonal[0, 9:, 9:] += np.diag(_BIAS_SIGMA**-2)
+        out.b_nodes[0, 9:] += np.concatenate([state.gyro_bias[0], state.accel_bias[0]]) / _BIAS_SIGMA**2
+        return out
+
+    def _prior(self) -> F64:
+        """Information (9,) of the first guess; without one from the user, hardly any."""
+        rotation, position = (3.0, 3.0) if self.options.T_body_mocap is None else self.options.guess_sigma
+        sigma = [_TILT_SIGMA] * 2 + [rotation] * 3 + [position] * 3 + [_OFFSET_SIGMA]
+        return np.array(sigma) ** -2
+
+    def _strayed(self, state: State) -> F64:
+        """How far (9,) the shared unknowns are from the first guess."""
+        out = np.zeros(SHARED)
+        out[:2], out[8] = state.tilt, state.offset_s
+        out[2:8] = se3.log(se3.inverse(self.guess) @ state.T_body_mocap)
+        return out

@@ -1,0 +1,169 @@
+"""Motion capture and IMU of one body in one batch: where the IMU really was.
+
+Mocap alone is noisy, its body is not the IMU's, its world not quite level, its clock another. So all
+are solved for at once: pose, velocity and biases at nodes, IMU preintegrated between them, mocap
+poses at their own times, robust, through an unknown tilt, mounting and delay. The mathematics and
+what it attains: docs/mocap-fit.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from share.errors import DataError, MisfitError
+from share.geometry import se3
+from share.geometry.camera import ImuNoise
+from share.mocap.batch import Batch, Solved
+from share.mocap.mocap import Mocap, check_imu, holes
+from share.mocap.offset import coarse_offset
+from share.mocap.options import FitOptions
+from share.mocap.residuals import Residuals, residuals
+from share.mocap.solve import node_covariances
+from share.mocap.start import first_state, hand_eye
+from share.types import F64, I64, ImuBatch
+
+_IMU_HOLE_NS = 100_000_000  # longer, and straight lines between samples are no motion
+_EDGE_NS = 50_000_000  # mocap this near to the ends is left out: the offset may yet carry it beyond
+_LEAST_S = 2.0
+_WORST_MM = 100.0  # a path farther than this from the mocap is not the same motion
+_TRUSTED = 0.2  # weight of a sample that counts as seen
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What was found. World: the mocap's, levelled: z up, same origin, same heading.
+
+    stamps_ns (N,), IMU clock; T_world_body (N, 4, 4) of the IMU; velocity (N, 3) m/s, world;
+    gyro_bias, accel_bias (N, 3). gaps (G, 2) ns, IMU clock: where the mocap says nothing for longer
+    than is bridged. breaks (N - 1,) bool: nothing joins this node to the next.
+    R_mocap_world (3, 3): from the levelled world to the mocap's; tilt_deg is its angle.
+    T_body_mocap (4, 4). offset_ns: IMU clock minus mocap clock.
+    cov_shared (9, 9): of tilt (2) rad, T_body_mocap (rotation rad, translation m; at the right), offset
+    s. cov_poses (N, 6, 6): of T_world_body, perturbed at the right.
+    """
+
+    stamps_ns: I64
+    T_world_body: F64
+    velocity: F64
+    gyro_bias: F64
+    accel_bias: F64
+    gaps: I64
+    breaks: np.ndarray
+    R_mocap_world: F64
+    T_body_mocap: F64
+    offset_ns: int
+    cov_shared: F64
+    cov_poses: F64
+    residuals: Residuals
+    gravity: float
+
+    @property
+    def tilt_deg(self) -> float:
+        return float(np.degrees(se3.angle(self.R_mocap_world)))
+
+
+def fit(imu: ImuBatch, noise: ImuNoise, mocap: Mocap, options: FitOptions | None = None) -> Fit:
+    """The path of the IMU over the time that both cover.
+
+    Raises DataError for stamps out of order, holes in the IMU, no or too little overlap, a body that
+    does not turn; MisfitError (a DataError) where the two do not tell of one motion.
+    """
+    options = options or FitOptions()
+    check_imu(imu, _IMU_HOLE_NS)
+    inflated = _inflated(noise, options.imu_inflation)
+    coarse_ns = coarse_offset(imu, mocap, options.within_s)
+    near = _overlap(imu, mocap.shifted(coarse_ns))
+    guess, bias = _mounting(imu, near, options)
+    nodes, breaks = _nodes(near, options)
+    seen = near.between(int(nodes[0]) + _EDGE_NS, int(nodes[-1]) - _EDGE_NS)
+    batch = Batch(imu, inflated, seen, breaks, guess, options)
+    return _report(batch, batch.minimise(first_state(nodes, imu, near, guess, bias)), coarse_ns)
+
+
+def _inflated(noise: ImuNoise, times: float) -> ImuNoise:
+    return replace(
+        noise,
+        gyro_density=noise.gyro_density * times,
+        accel_density=noise.accel_density * times,
+        gyro_walk=noise.gyro_walk * times,
+        accel_walk=noise.accel_walk * times,
+    )
+
+
+def _overlap(imu: ImuBatch, mocap: Mocap) -> Mocap:
+    """The mocap while the IMU runs."""
+    start = max(int(imu.stamps_ns[0]), int(mocap.stamps_ns[0]))
+    end = min(int(imu.stamps_ns[-1]), int(mocap.stamps_ns[-1]))
+    if end - start < _LEAST_S * 1e9:
+        raise DataError(
+            f"mocap and IMU overlap by {max(end - start, 0) * 1e-9:.1f} s, at least {_LEAST_S:.0f} s "
+            "are needed; are they of one recording?"
+        )
+    return mocap.between(start, end)
+
+
+def _mounting(imu: ImuBatch, mocap: Mocap, options: FitOptions) -> tuple[F64, F64]:
+    """A first T_body_mocap (4, 4), and gyro bias (3,)."""
+    if options.T_body_mocap is not None:
+        return options.T_body_mocap, np.zeros(3)
+    R, bias = hand_eye(imu, mocap)
+    return se3.compose(R, np.zeros(3)), bias
+
+
+def _nodes(mocap: Mocap, options: FitOptions) -> tuple[I64, np.ndarray]:
+    """Nodes (N,) ns at even times, none in holes that break the chain; (N - 1,) bool: where it breaks."""
+    step = round(options.node_s * 1e9)
+    nodes = np.arange(mocap.stamps_ns[0], mocap.stamps_ns[-1] + 1, step)
+    for start, end in holes(mocap.stamps_ns, round(options.break_s * 1e9)):
+        nodes = nodes[(nodes <= start) | (nodes >= end)]
+    return nodes, np.diff(nodes) > options.break_s * 1e9
+
+
+def _report(batch: Batch, solved: Solved, coarse_ns: int) -> Fit:
+    state, options = solved.state, batch.options
+    trusted = solved.weight > _TRUSTED
+    dt = np.diff(state.stamps_ns)[~batch.breaks] * 1e-9
+    sigma = np.repeat([options.sigma_rotation, options.sigma_position], 3)
+    off = np.linalg.norm((solved.seen.residual * sigma).reshape(-1, 2, 3), axis=2)
+    left = residuals(
+        solved.chain.without(batch.breaks), dt, options.imu_inflation, off[:, 1], off[:, 0], trusted
+    )
+    if not left.position_mm < _WORST_MM or trusted.mean() < 0.5:
+        raise MisfitError(
+            f"mocap and IMU do not tell of one motion: {left.position_mm:.0f} mm apart, "
+            f"{100 * left.doubted:.0f} % of the mocap doubted; check units (m), clocks, "
+            "and that both are of one body"
+        )
+    offset_ns = coarse_ns + round(state.offset_s * 1e9)
+    at = batch.mocap.stamps_ns[trusted] + round(state.offset_s * 1e9)
+    covs = node_covariances(solved.normal, solved.cov_shared)
+    return Fit(
+        stamps_ns=state.stamps_ns,
+        T_world_body=se3.compose(state.R, state.p),
+        velocity=state.v,
+        gyro_bias=state.gyro_bias,
+        accel_bias=state.accel_bias,
+        gaps=holes(_closed(at, state.stamps_ns), round(options.bridge_s * 1e9)),
+        breaks=batch.breaks,
+        R_mocap_world=state.R_mocap_world,
+        T_body_mocap=state.T_body_mocap,
+        offset_ns=offset_ns,
+        cov_shared=solved.cov_shared,
+        cov_poses=_right(state.R, covs[:, :6, :6]),
+        residuals=left,
+        gravity=options.gravity,
+    )
+
+
+def _closed(seen: I64, nodes: I64) -> I64:
+    """Stamps of what was seen, with both ends of the path."""
+    return np.concatenate([nodes[:1], seen, nodes[-1:]])
+
+
+def _right(R: F64, cov: F64) -> F64:
+    """Covariances (N, 6, 6) with positions in the world -> perturbations at the right of the pose."""
+    J = np.tile(np.eye(6), (len(R), 1, 1))
+    J[:, 3:, 3:] = R.swapaxes(1, 2)
+    return np.asarray(J @ cov @ J.swapaxes(1, 2), np.float64)

@@ -1,0 +1,102 @@
+"""A motion capture's record as the fit takes it: checked, and where it has holes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from share.errors import DataError
+from share.geometry import se3
+from share.types import F64, I64, ImuBatch, checked
+
+_HOLE = 5  # times the usual spacing of samples
+
+
+@dataclass(frozen=True, eq=False)
+class Mocap:
+    """Poses T (M, 4, 4) of the mocap's body (its markers') in the mocap's world at stamps_ns (M,), in
+    the mocap's clock, rising. Raises DataError for what is none."""
+
+    stamps_ns: I64
+    T: F64
+
+    def __post_init__(self) -> None:
+        n = len(self.stamps_ns)
+        if n < 2:
+            raise DataError(f"mocap: {n} poses; at least two are needed, record again")
+        check_stamps("mocap", self.stamps_ns)
+        try:
+            object.__setattr__(self, "T", checked("T", self.T, (n, 4, 4), np.float64))
+        except ValueError as error:
+            raise DataError(f"mocap: {error}; leave out the samples where the body was not seen") from None
+        R = self.T[:, :3, :3]
+        bad = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max((1, 2)) > 1e-3
+        bad |= np.linalg.det(R) < 0
+        if bad.any():
+            raise DataError(
+                f"mocap: pose {int(bad.argmax()) + 1} of {n} is not a rigid transform; leave it out"
+            )
+
+    @cached_property
+    def spacing_ns(self) -> int:
+        """The usual time between samples: their median."""
+        return int(np.median(np.diff(self.stamps_ns)))
+
+    def between(self, start_ns: int, end_ns: int) -> Mocap:
+        """Samples within [start_ns, end_ns]. Raises DataError if there are fewer than two."""
+        keep = (self.stamps_ns >= start_ns) & (self.stamps_ns <= end_ns)
+        return Mocap(self.stamps_ns[keep], self.T[keep])
+
+    def shifted(self, offset_ns: int) -> Mocap:
+        """The same with `offset_ns` added to every stamp."""
+        return Mocap(self.stamps_ns + offset_ns, self.T)
+
+    def known(self, stamps_ns: I64) -> np.ndarray:
+        """(N,) bool: stamps that lie between two neighbouring samples with no hole between."""
+        i = np.searchsorted(self.stamps_ns, stamps_ns, "right")
+        inside = (i > 0) & (i < len(self.stamps_ns))
+        i = np.clip(i, 1, len(self.stamps_ns) - 1)
+        spacing = self.stamps_ns[i] - self.stamps_ns[i - 1]
+        return np.asarray(inside & (spacing <= _HOLE * self.spacing_ns), bool)
+
+    def at(self, stamps_ns: I64) -> F64:
+        """Poses (N, 4, 4) between samples, straight and at even rate, holes or not."""
+        i = np.clip(np.searchsorted(self.stamps_ns, stamps_ns, "right"), 1, len(self.stamps_ns) - 1)
+        before, after = self.T[i - 1], self.T[i]
+        part = (stamps_ns - self.stamps_ns[i - 1]) / (self.stamps_ns[i] - self.stamps_ns[i - 1])
+        turn = se3.so3_log(before[:, :3, :3].swapaxes(1, 2) @ after[:, :3, :3])
+        t = before[:, :3, 3] + part[:, None] * (after[:, :3, 3] - before[:, :3, 3])
+        return se3.compose(before[:, :3, :3] @ se3.so3_exp(part[:, None] * turn), t)
+
+
+def holes(stamps_ns: I64, longer_ns: int) -> I64:
+    """(G, 2) ns: neighbouring stamps that lie more than `longer_ns` apart."""
+    far = np.flatnonzero(np.diff(stamps_ns) > longer_ns)
+    return np.stack([stamps_ns[far], stamps_ns[far + 1]], axis=1)
+
+
+def check_imu(imu: ImuBatch, longest_ns: int) -> None:
+    """Raises DataError for an IMU that cannot be integrated from end to end."""
+    if len(imu) < 2:
+        raise DataError(f"IMU: {len(imu)} samples; at least two are needed, record again")
+    check_stamps("IMU", imu.stamps_ns)
+    missing = holes(imu.stamps_ns, longest_ns)
+    if len(missing):
+        start, end = (missing[0] - imu.stamps_ns[0]) * 1e-9
+        raise DataError(
+            f"IMU: no samples from {start:.3f} to {end:.3f} s after its start; "
+            "fit the parts before and after apart"
+        )
+
+
+def check_stamps(name: str, stamps_ns: I64) -> None:
+    """Raises DataError unless strictly rising."""
+    back = np.flatnonzero(np.diff(stamps_ns) <= 0)
+    if len(back):
+        i = int(back[0]) + 1
+        raise DataError(
+            f"{name}: stamp {stamps_ns[i]} ns of sample {i + 1} is not later than the one before; "
+            "sort the samples by time and leave out double ones"
+        )

@@ -1,0 +1,95 @@
+"""Which time of one clock is which of another: where the turning of mocap body and IMU look alike.
+
+The angle turned through in a short window is the same for every part of a rigid body, whatever its
+frame. Its masked normalised correlation over all lags (Padfield, *Masked Object Registration in the
+Fourier Domain*, IEEE TIP 21(5), 2012, eq. 10) has its peak at the offset.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from share.errors import MisfitError
+from share.geometry import se3
+from share.mocap.mocap import Mocap
+from share.mocap.preintegrate import preintegrate
+from share.types import F64, I64, ImuBatch
+
+WINDOW_NS = 100_000_000
+_STEP_NS = 10_000_000
+_LEAST_OVERLAP_S = 5.0
+_LEAST_CORRELATION = 0.6
+
+
+def coarse_offset(imu: ImuBatch, mocap: Mocap, within_s: float | None) -> int:
+    """IMU clock minus mocap clock, ns, to a few ms. within_s: search no farther than that; None: all
+    offsets by which the two overlap by 5 s (or by the whole of the shorter).
+
+    Raises MisfitError if nowhere do the two turn alike.
+    """
+    a, a_ok, a_start = _on_grid(*imu_turning(imu))
+    b, b_ok, b_start = _on_grid(*mocap_turning(mocap))
+    score = _masked_correlation(a, a_ok, b, b_ok)
+    lags = np.arange(len(score)) - (len(b) - 1)  # a[i + lag] belongs to b[i]
+    offsets = (a_start - b_start) + lags * _STEP_NS
+    if within_s is not None:
+        score = np.where(np.abs(offsets) <= within_s * 1e9, score, -1.0)
+    best = int(score.argmax())
+    if score[best] < _LEAST_CORRELATION:
+        raise MisfitError(
+            f"mocap and IMU turn nowhere alike (correlation {max(score[best], 0):.2f} of "
+            f"{_LEAST_CORRELATION} needed); are they of one recording and one body, and does it turn enough?"
+        )
+    return int(offsets[best] + round(_peak(score, best) * _STEP_NS))
+
+
+def imu_turning(imu: ImuBatch) -> tuple[I64, F64]:
+    """Centres (N,) ns of windows and the rotation vectors (N, 3) rad turned in them, body frame."""
+    start = np.arange(imu.stamps_ns[0], imu.stamps_ns[-1] - WINDOW_NS, _STEP_NS)
+    zero = np.zeros((len(start), 3))
+    turned = preintegrate(imu, start, start + WINDOW_NS, zero, zero).dR
+    return start + WINDOW_NS // 2, se3.so3_log(turned)
+
+
+def mocap_turning(mocap: Mocap) -> tuple[I64, F64]:
+    """As `imu_turning`, in the mocap body's frame; windows without a hole only."""
+    start = np.arange(mocap.stamps_ns[0], mocap.stamps_ns[-1] - WINDOW_NS, _STEP_NS)
+    start = start[mocap.known(start) & mocap.known(start + WINDOW_NS)]
+    R0, R1 = mocap.at(start)[:, :3, :3], mocap.at(start + WINDOW_NS)[:, :3, :3]
+    return start + WINDOW_NS // 2, se3.so3_log(R0.swapaxes(1, 2) @ R1)
+
+
+def _on_grid(stamps: I64, turned: F64) -> tuple[F64, F64, int]:
+    """Angles on an even grid, 0 where unknown; 1 where known; the grid's first stamp."""
+    if len(stamps) == 0:
+        return np.zeros(1), np.zeros(1), 0
+    place = (stamps - stamps[0]) // _STEP_NS
+    value, known = np.zeros(place[-1] + 1), np.zeros(place[-1] + 1)
+    value[place], known[place] = np.linalg.norm(turned, axis=1), 1.0
+    return value, known, int(stamps[0])
+
+
+def _masked_correlation(a: F64, a_ok: F64, b: F64, b_ok: F64) -> F64:
+    """Pearson correlation of what overlaps, for every lag of b against a; -1 where too little does."""
+    size = len(a) + len(b) - 1
+
+    def correlate(x: F64, y: F64) -> F64:
+        return np.fft.irfft(np.fft.rfft(x, size) * np.fft.rfft(y[::-1], size), size)
+
+    n = correlate(a_ok, b_ok)
+    least = min(_LEAST_OVERLAP_S * 1e9 / _STEP_NS, 0.9 * a_ok.sum(), 0.9 * b_ok.sum())
+    enough = n >= max(least, 10)
+    n = np.maximum(n, 1)
+    sum_a, sum_b = correlate(a, b_ok), correlate(a_ok, b)
+    var_a = np.maximum(correlate(a**2, b_ok) - sum_a**2 / n, 1e-12)
+    var_b = np.maximum(correlate(a_ok, b**2) - sum_b**2 / n, 1e-12)
+    return np.where(enough, (correlate(a, b) - sum_a * sum_b / n) / np.sqrt(var_a * var_b), -1.0)
+
+
+def _peak(score: F64, i: int) -> float:
+    """Top of the parabola through three scores, in steps from the middle one."""
+    if not 0 < i < len(score) - 1:
+        return 0.0
+    left, middle, right = score[i - 1 : i + 2]
+    bend = left - 2 * middle + right
+    return float(np.clip((left - right) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0

@@ -1,0 +1,53 @@
+"""What the fit solves for: the body at every node, and how mocap and IMU lie to each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.geometry import se3
+from share.types import F64, I64
+
+NODE = 15  # rotation, position, velocity, gyro bias, accel bias
+SHARED = 9  # tilt, mocap body's rotation and position, time offset
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Nodes at stamps_ns (N,), IMU clock: R (N, 3, 3), p (N, 3) m, v (N, 3) m/s of the body in the
+    levelled world, biases (N, 3).
+
+    tilt (2,): R_mocap_world = Exp(tilt_x, tilt_y, 0), so that levelling turns nothing about the
+    vertical. T_body_mocap (4, 4). offset_s: IMU clock minus mocap clock, in addition to what was
+    taken off before.
+    """
+
+    stamps_ns: I64
+    R: F64
+    p: F64
+    v: F64
+    gyro_bias: F64
+    accel_bias: F64
+    tilt: F64
+    T_body_mocap: F64
+    offset_s: float = 0.0
+
+    @property
+    def R_mocap_world(self) -> F64:
+        return se3.so3_exp(np.append(self.tilt, 0.0))
+
+    def moved(self, nodes: F64, shared: F64) -> State:
+        """Nodes (N, 15): rotations at the right, the others added. shared (9,): tilt added, the body's
+        pose perturbed at the right, offset added [s]."""
+        return State(
+            self.stamps_ns,
+            self.R @ se3.so3_exp(nodes[:, :3]),
+            self.p + nodes[:, 3:6],
+            self.v + nodes[:, 6:9],
+            self.gyro_bias + nodes[:, 9:12],
+            self.accel_bias + nodes[:, 12:15],
+            self.tilt + shared[:2],
+            self.T_body_mocap @ se3.exp(shared[2:8]),
+            self.offset_s + float(shared[8]),
+        )
