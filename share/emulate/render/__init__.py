@@ -1,0 +1,1 @@
+"""Images and exact depth of a room by OpenGL, without a screen."""

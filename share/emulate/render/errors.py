@@ -1,0 +1,9 @@
+"""What a person is told where nothing can be drawn."""
+
+from __future__ import annotations
+
+from share.errors import ShareError
+
+
+class RenderError(ShareError):
+    """This machine cannot draw a room: a library or a driver is missing."""
