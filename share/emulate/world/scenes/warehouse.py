@@ -1,0 +1,242 @@
+"""A warehouse: racks with cartons, pallets, pillars, signs, pipes, lamps and windows. Much to see."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from share.emulate.world.furniture import (
+    barrels,
+    cartons,
+    doors,
+    forklift,
+    hoses,
+    ladders,
+    lockers,
+    pallets,
+    pillars,
+    pipes,
+    shelving,
+    signs,
+    small,
+    tables,
+)
+from share.emulate.world.furniture.parts import pick
+from share.emulate.world.layout import Layout
+from share.emulate.world.materials import Material
+from share.emulate.world.mesh import Rng, Shape
+from share.emulate.world.scenes import fill
+from share.emulate.world.scenes.fill import Maker
+from share.emulate.world.scenes.plan import Plan, Size, Wall, outer_walls
+from share.emulate.world.scenes.shell import bays, columns, enclose, girders, joints
+
+_ROW = 0.85  # m; depth of a row of islands
+_GIRDER = 0.3
+
+
+def warehouse(seed: int, size: Size) -> Layout:
+    """Furniture along the walls, rows of islands with aisles between them."""
+    rng = np.random.default_rng([seed, 11])
+    plan = Plan("warehouse", seed, size, rng)
+    walls = outer_walls(size)
+    _shell(plan, walls)
+    _openings(plan, walls)
+    _rows(plan)
+    _belt(plan, walls)
+    _overhead(plan)
+    for wall in walls:
+        fill.hang(plan, wall, _HANGINGS, int(1.5 * wall.length), min(size[2] - 0.5, 3.3))
+    return plan.done(ambient=0.12)
+
+
+def _shell(plan: Plan, walls: tuple[Wall, ...]) -> None:
+    rng, z = plan.rng, plan.size[2]
+    lower = pick(rng, str(rng.choice(["block", "brick", "concrete"])))
+    upper = pick(rng, str(rng.choice(["corrugated", "panel", "block", "plaster"])))
+    enclose(plan, [(rng.uniform(1.8, 2.6), lower), (z, upper)], Material("screed"), Material("corrugated", 0))
+    joints(plan)
+    columns(plan, walls)
+    girders(plan, _GIRDER)
+
+
+def _openings(plan: Plan, walls: tuple[Wall, ...]) -> None:
+    """A roller door and a door on different walls, windows high up on the others."""
+    rng, z = plan.rng, plan.size[2]
+    order = rng.permutation(4)
+    first, second = walls[order[0]], walls[order[1]]
+    width = float(min(rng.uniform(2.2, 2.6), _bay(first) - 0.6))
+    fill.centred(plan, first, "roller door", doors.roller(rng, width, 2.6), _middle(rng, first), 1.2)
+    fill.centred(plan, second, "door", doors.door(rng), _middle(rng, second), 1.2)
+    for k in order[1:]:
+        for at in _middles(walls[k]):
+            if rng.random() < 0.45:
+                tall = min(0.8, z - _GIRDER - 2.75)
+                shape = doors.window(rng, rng.uniform(1.0, 1.8), tall)
+                fill.daylight(plan, walls[k], at, z - _GIRDER - tall - 0.15, shape, rng.uniform(0.8, 2.2))
+
+
+def _bay(wall: Wall) -> float:
+    return wall.length / (len(bays(wall.length)) + 1)
+
+
+def _middles(wall: Wall) -> list[float]:
+    return [_bay(wall) * (k + 0.5) for k in range(len(bays(wall.length)) + 1)]
+
+
+def _middle(rng: Rng, wall: Wall) -> float:
+    return float(rng.choice(_middles(wall)))
+
+
+def _belt_depth(size: Size) -> float:
+    """How deep furniture along walls may be: little in a small room, where people must pass."""
+    return 0.62 if min(size[:2]) < 8 else 1.1
+
+
+def _belt(plan: Plan, walls: tuple[Wall, ...]) -> None:
+    deep = _belt_depth(plan.size)
+    makers = {n: (w, m) for n, (w, m) in _standing(plan.size).items() if _depth(m) <= deep}
+    for wall in walls:
+        fill.along(plan, wall, makers, (0.03, 0.45))
+
+
+def _depth(maker: Maker) -> float:
+    """Of one example."""
+    return float(np.ptp(maker(np.random.default_rng(0)).bounds[:, 1]))
+
+
+def _rack_height(size: Size) -> float:
+    return min(size[2] - 1.1, 5.0)
+
+
+def _standing(size: Size) -> dict[str, tuple[float, Maker]]:
+    """What stands along walls: how often, and how it is made."""
+    top = _rack_height(size)
+
+    def rack(rng: Rng) -> Shape:
+        height = rng.uniform(1.8, min(2.6, top)) if rng.random() < 0.6 else rng.uniform(0.75 * top, top)
+        return shelving.rack(
+            rng, rng.uniform(1.2, 2.4), rng.uniform(0.4, 0.55), height, rng.uniform(0.45, 0.8)
+        )
+
+    return {
+        "rack": (5, rack),
+        "cartons": (3, lambda r: cartons.stack(r, r.uniform(0.5, 1.4), 0.5, r.uniform(0.6, 1.7))),
+        "cupboard": (1.5, lambda r: shelving.cupboard(r, r.uniform(0.8, 1.6), 0.36, r.uniform(1.2, 2.1))),
+        "drums": (1, lambda r: barrels.drums(r, int(r.integers(1, 4)))),
+        "workbench": (1.2, lambda r: tables.workbench(r, r.uniform(1.3, 2.0))),
+        "lockers": (0.6, lambda r: lockers.lockers(r, int(r.integers(2, 5)))),
+        "crate": (1, small.crate),
+        "tool box": (0.6, small.tool_box),
+        "bin": (0.5, barrels.bin_),
+        "hand truck": (0.6, small.hand_truck),
+        "ladder": (0.5, lambda r: ladders.leaning(r, r.uniform(1.8, 2.1))),
+        "extinguisher": (0.8, hoses.extinguisher),
+        "conduit": (0.7, lambda r: pipes.conduit(r, size[2])),
+        "loaded pallet": (2, lambda r: pallets.loaded(r, r.uniform(0.7, 1.8))),
+        "pallets": (0.8, lambda r: pallets.pile(r, int(r.integers(3, 9)))),
+    }
+
+
+_HANGINGS: dict[str, tuple[float, Maker]] = {
+    "sign": (4, signs.sign),
+    "poster": (3, signs.poster),
+    "notice": (3, signs.notice),
+    "pin board": (0.7, signs.pin_board),
+    "tool wall": (0.7, signs.tool_wall),
+    "fuse box": (1, signs.fuse_box),
+}
+
+
+def _rows(plan: Plan) -> None:
+    """Rows of islands along x; between them, round them and at gaps in them one can pass."""
+    x, y, _ = plan.size
+    rng, margin = plan.rng, _belt_depth(plan.size) + (1.6 if y < 8 else 1.7)
+    aisle = rng.uniform(1.8, 2.3)
+    count = max(1, int((y - 2 * margin + aisle) / (_ROW + aisle)))
+    spread = (y - 2 * margin - _ROW) / max(count - 1, 1) if count > 1 else 0.0
+    for k in range(count):
+        middle = margin + _ROW / 2 + k * spread if count > 1 else y / 2 + rng.uniform(-0.15, 0.15)
+        _row(plan, middle, margin, x - margin, longest=1.9 if x < 12 else 6.0)
+
+
+def _row(plan: Plan, y: float, left: float, right: float, longest: float) -> None:
+    rng, x = plan.rng, left
+    while right - x > 1.2:
+        end = min(x + rng.uniform(1.25, longest), right)
+        start = x
+        if rng.random() < 0.5:
+            side = rng.uniform(0.28, 0.4)
+            pillar = pillars.concrete(rng, side, plan.size[2] - _GIRDER) if rng.random() < 0.5 else None
+            plan.build(
+                "pillar", (pillar or pillars.steel(rng, 0.24, plan.size[2])).at(x + 0.25, y), keeps_off=True
+            )
+            x += 0.5
+        x = _island(plan, x, end, y)
+        fill.frame(plan, (start - 0.12, y - _ROW / 2 - 0.1), (max(x, end) + 0.12, y + _ROW / 2 + 0.1))
+        x = max(x, end) + rng.uniform(1.5, 1.9)
+
+
+def _island(plan: Plan, left: float, right: float, y: float) -> float:
+    """Racks end to end, or things on pallets, from `left` as far as `right` allows; where it ended."""
+    rng, front = plan.rng, -np.pi / 2
+    del front
+    racks = rng.random() < (0.35 if right - left < 2 else 0.7)
+    while right - left > 0.6:
+        if racks and right - left >= 1.0:
+            name, shape = "rack", _double_rack(plan, min(right - left, rng.uniform(1.6, 2.6)))
+        else:
+            name, shape = _goods(rng, right - left)
+        wide, deep = (float(v) for v in np.ptp(shape.bounds, axis=0)[:2])
+        if wide > right - left + 1e-6:
+            break
+        turned = np.pi * rng.integers(2)
+        middle = y + (deep / 2 if turned == 0 else -deep / 2)
+        plan.add(name, shape.at(left + wide / 2 - _centre(shape, turned), middle, 0, turned))
+        left += wide + rng.uniform(0.02, 0.15)
+    return left
+
+
+def _centre(shape: Shape, turned: float) -> float:
+    """Where along x the middle of a shape is, which need not be 0."""
+    return float(shape.bounds[:, 0].mean()) * (1 if turned == 0 else -1)
+
+
+def _double_rack(plan: Plan, width: float) -> Shape:
+    height = (
+        min(plan.rng.uniform(1.5, 2.4), _rack_height(plan.size))
+        if plan.size[2] < 5
+        else _rack_height(plan.size)
+    )
+    return shelving.rack(plan.rng, width, plan.rng.uniform(0.6, _ROW), height, plan.rng.uniform(0.5, 0.9))
+
+
+def _goods(rng: Rng, room: float) -> tuple[str, Shape]:
+    """Something that stands in the middle of a warehouse and is narrower than `room` m."""
+    kind = str(rng.choice(["loaded pallet", "pallets", "table", "crate", "drums", "cartons", "pallet truck"]))
+    if room < 1.25 or kind == "crate":
+        return "crate", small.crate(rng)
+    if kind == "loaded pallet":
+        return kind, pallets.loaded(rng, rng.uniform(0.6, 1.6))
+    if kind == "pallets":
+        return kind, pallets.pile(rng, int(rng.integers(2, 8)))
+    if kind == "drums":
+        return kind, barrels.drums(rng, 2)
+    if kind == "table":
+        return kind, tables.table(rng, min(room, rng.uniform(1.2, 1.8)))
+    if kind == "pallet truck" and room > 1.7:
+        return kind, forklift.pallet_truck(rng).at(0, 0, 0, -np.pi / 2)
+    return "cartons", cartons.stack(rng, min(room, 1.4), 0.7, rng.uniform(0.8, 1.6))
+
+
+def _overhead(plan: Plan) -> None:
+    x, y, z = plan.size
+    middles = [x / (len(bays(x)) + 1) * (k + 0.5) for k in range(len(bays(x)) + 1)]
+    shift = plan.rng.uniform(-0.4, 0.4)
+    rows = max(2, round(y / 4))
+    ys = [y * (k + 0.5) / rows for k in range(rows)]
+    if z > 5.5:
+        fill.light_bells(plan, [m + shift for m in middles[::2]], ys, plan.rng.uniform(0.4, 1.2))
+    else:
+        fill.light_tubes(
+            plan, [m + shift for m in middles], ys, plan.rng.uniform(1.0, 1.5), plan.rng.uniform(0.1, 0.5)
+        )
+    fill.overhead(plan, len(middles) + 1)
