@@ -25,6 +25,7 @@ COMMANDS = {
     "agent": ("share.cli.agent", "agent", "Track one agent at sensor rate and share its map."),
     "edge": ("share.cli.edge", "edge", "Join the maps of all agents and send corrections back."),
     "dataset": ("share.cli.dataset", "dataset", "Look into, convert and recover recordings."),
+    "emulate": ("share.cli.emulate", "emulate", "Record agents that move through a virtual room."),
     "keys": ("share.cli.keys", "keys", "Who may connect to an edge from another machine."),
 }
 

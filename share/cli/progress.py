@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import click
 
@@ -35,3 +35,25 @@ class LiveLine:
         if self._shown:
             click.echo("", err=True)
         self._shown = False
+
+
+class Stages:
+    """A bar for each stage of a longer task, one after the other. Call it with (stage, done, total)."""
+
+    def __init__(self) -> None:
+        self._stage, self._done = "", 0
+        self._stack = ExitStack()
+        self._bar: Callable[[int], None] = lambda more: None
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        if stage != self._stage:
+            self.end()
+            self._stage = stage
+            self._bar = self._stack.enter_context(progress(total, f"{stage:24}"))
+        self._bar(done - self._done)
+        self._done = done
+
+    def end(self) -> None:
+        """Ends the bar that is shown, if any."""
+        self._stack.close()
+        self._stage, self._done = "", 0

@@ -1,0 +1,160 @@
+"""`share emulate`: virtual rooms that carry real motion."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import click
+
+from share.cli import options
+from share.cli.progress import Stages
+
+_WORKERS = 2
+
+
+class _Size(click.ParamType[tuple[float, ...]]):
+    name = "LxWxH"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        numbers = re.fullmatch(r"([\d.]+)x([\d.]+)x([\d.]+)", str(value))
+        try:
+            return tuple(float(number) for number in numbers.groups()) if numbers else self._fail(value)
+        except ValueError:
+            return self._fail(value)
+
+    def _fail(self, value: Any) -> Any:
+        self.fail(f"'{value}' is not a size in metres such as 9x6x4")
+
+
+@click.command()
+@click.option(
+    "--scene", required=True, help="warehouse, firestation, corridor-twins, whitewall, plain, or a .glb file."
+)
+@click.option(
+    "--motion",
+    "motions",
+    multiple=True,
+    required=True,
+    metavar="[NAME=]SPEC",
+    help="Who moves, and how; see below. May be repeated.",
+)
+@click.option("--out", required=True, metavar="SESSION", help="A new folder.")
+@click.option("--seconds", type=float, default=30, show_default=True, help="How long the session lasts.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Another room, other noise."
+)
+@click.option("--size", type=_Size(), metavar="LxWxH", help="Of the room, in metres.  [default: the scene's]")
+@click.option(
+    "--profile",
+    "profiles",
+    multiple=True,
+    metavar="[NAME=]PROFILE[:MODE]",
+    help="Which device records: d435i, euroc or a YAML file; mode as 848x480@30.",
+)
+@click.option(
+    "--sensors",
+    multiple=True,
+    metavar="[NAME=]stereo|rgbd",
+    help="Infrared pair, or left image and depth.  [default: stereo; rgbd for robot:]",
+)
+@click.option(
+    "--effect",
+    "effects",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Of the sensors: none, noise=off, blur=off, drops=0.02, jitter_ms=1, time_offset_ms=5 …",
+)
+@click.option("--images", type=click.Choice(["jpeg", "png"]), help="[default: jpeg, for --format euroc png]")
+@click.option(
+    "--format", "form", type=click.Choice(["session", "euroc"]), default="session", show_default=True
+)
+@options.as_json
+@click.option("--workers", type=click.IntRange(1, 64), default=_WORKERS, show_default=True, help="Processes.")
+def emulate(
+    scene: str,
+    motions: tuple[str, ...],
+    out: str,
+    seconds: float,
+    seed: int,
+    size: tuple[float, float, float] | None,
+    profiles: tuple[str, ...],
+    sensors: tuple[str, ...],
+    effects: tuple[str, ...],
+    images: str | None,
+    form: str,
+    as_json: bool,
+    workers: int,
+) -> None:
+    """Record agents that move through a virtual room.
+
+    The room is drawn for the motion, the motion is real or simulated, and each agent's device sees,
+    measures and errs as a real one does. The session that comes out is as one from the field, with the
+    truth beside it. If it is broken off, the same command goes on where it stopped.
+
+    \b
+    Motions:  walk:[speed=0.9,...]      a person with a headset
+              robot:[speed=0.35,...]    a robot with two wheels
+              paper:1 .. paper:5        two people and a robot, 60 s, in 9x6x4 m
+              euroc:FOLDER[,start=S]    real IMU and motion of a EuRoC recording
+              tumvi:FOLDER[,start=S]    the same of a TUM-VI recording
+              tum:FILE                  poses of a file; the IMU is simulated
+    \b
+    Example:  share emulate --scene warehouse --motion ann=walk: --motion bob=walk: --out room1
+              share track room1/ann
+    """
+    from share.emulate.recipe import Recipe
+    from share.emulate.sensor.effects import parse
+    from share.emulate.session import make_session
+
+    euroc = form == "euroc"
+    recipe = Recipe(
+        scene=scene,
+        motions=motions,
+        seconds=seconds,
+        seed=seed,
+        size=size,
+        sensors=_by_name(sensors) or ({"": "stereo"} if euroc else {}),
+        profiles=_by_name(profiles),
+        effects=parse(effects),
+        images=images or ("png" if euroc else "jpeg"),
+    )
+    stages = Stages()
+    try:
+        folder = make_session(recipe, Path(out), workers, stages, asl=euroc)
+    finally:
+        stages.end()
+    made = _described(folder, euroc)
+    click.echo(json.dumps(made) if as_json else _text(made))
+
+
+def _by_name(words: tuple[str, ...]) -> dict[str, str]:
+    """`NAME=VALUE` by its name, a bare VALUE, which is for everybody, by ""."""
+    pairs = [word.rpartition("=") for word in words]
+    return {name: value for name, _, value in pairs}
+
+
+def _described(folder: Path, euroc: bool) -> dict[str, Any]:
+    """What is in the new folder, as plain data."""
+    from share.io.describe import describe
+    from share.io.section import read_yaml
+    from share.io.source import open_source
+
+    top = read_yaml(folder / ("emulation.yaml" if euroc else "session.yaml"))
+    agents = {name: describe(open_source(str(folder / name))) for name in top.section("agents").data}
+    kinds = {name: agent["kind"] for name, agent in top.section("agents").data.items()}
+    return {"folder": str(folder), "kinds": kinds, "agents": agents, "provenance": top.get("provenance")}
+
+
+def _text(made: dict[str, Any]) -> str:
+    """A line an agent."""
+    lines = list(made["provenance"]["notes"])
+    for name, agent in made["agents"].items():
+        frames, truth = agent["streams"]["cam0"], agent["truth"]
+        lines.append(
+            f"{name:>12}  {made['kinds'][name]:5}  {agent['kind']:10}  {frames['count']} frames at "
+            f"{frames['rate_hz']:.4g} Hz  {agent['duration_s']:.1f} s  {truth['length_m']:.2f} m"
+        )
+    return "\n".join([*lines, f"{made['folder']}: ready"])

@@ -1,0 +1,39 @@
+"""A finished session as EuRoC/ASL folders, for other people's programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from share.emulate.progress import Progress
+from share.emulate.stage import Stage
+from share.errors import UsageError
+from share.io.convert import to_euroc
+from share.io.session import SESSION
+from share.io.source import open_source
+
+
+def check_asl(stage: Stage) -> None:
+    """Raises UsageError where an agent has what such a folder has no place for."""
+    for actor in stage.actors:
+        if actor.rig.depth is not None:
+            raise UsageError(
+                f"{actor.name}: an ASL folder has no place for depth; give --sensors {actor.name}=stereo"
+            )
+
+
+def to_asl(folder: Path, names: list[str], progress: Progress) -> None:
+    """Each NAME.mcap of the session in `folder` to NAME/mav0; the truth is in there too."""
+    for name in names:
+        source, done = open_source(str(folder / name)), 0
+
+        def count(more: int, name: str = name, total: int = source.images_count) -> None:
+            nonlocal done
+            done += more
+            progress(f"writing {name}/mav0", done, total)
+
+        to_euroc(source, folder / f"{name}.asl", count)
+        (folder / f"{name}.asl").rename(folder / name)
+        (folder / f"{name}.mcap").unlink()
+        (folder / "truth" / f"{name}.tum").unlink()
+    (folder / "truth").rmdir()
+    (folder / SESSION).rename(folder / "emulation.yaml")

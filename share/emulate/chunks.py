@@ -1,0 +1,43 @@
+"""A few frames of one agent, encoded, on disk until its recording is written: what a break leaves
+is not drawn again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from share.core.measurement import DEPTH, Measurement
+from share.errors import DataError
+from share.io.files import atomic_write
+from share.io.images import EncodedImage
+
+DEPTH_SCALE = 1000.0  # millimetres
+
+
+class Picture(msgspec.Struct, frozen=True, array_like=True):
+    """One image as it will be recorded: JPEG or PNG."""
+
+    stream: str
+    stamp_ns: int
+    width: int
+    height: int
+    data: bytes
+
+
+def write_chunk(path: Path, pictures: list[Picture]) -> None:
+    """Whole or not at all. Raises as `atomic_write`."""
+    atomic_write(path, msgspec.msgpack.encode(pictures))
+
+
+def read_chunk(path: Path) -> Iterator[Measurement]:
+    """In the order in which they were written. Raises DataError if it is damaged."""
+    try:
+        pictures = msgspec.msgpack.decode(path.read_bytes(), type=list[Picture])
+    except (msgspec.DecodeError, msgspec.ValidationError) as error:
+        raise DataError(f"{path}: is damaged ({error}); delete it and run the command again") from None
+    for p in pictures:
+        scale = DEPTH_SCALE if p.stream == DEPTH else 0.0
+        image = EncodedImage(p.data, str(path), p.width, p.height, scale)
+        yield Measurement(p.stream, p.stamp_ns, image)

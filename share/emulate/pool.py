@@ -1,0 +1,66 @@
+"""Jobs on several processes, spawned: threads, locks and graphics contexts are not inherited."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
+from multiprocessing import connection, get_context, parent_process
+from types import TracebackType
+from typing import TypeVar
+
+from share.errors import ShareError
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+_AHEAD = 2  # jobs handed out per worker, so that none waits for work
+
+
+class Pool:
+    """`workers` processes, each of which first calls `start(*arguments)`. They end with the block, or
+    with this process."""
+
+    def __init__(self, workers: int, start: Callable[..., None], arguments: tuple[object, ...]) -> None:
+        self._workers = workers
+        self._pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (start, arguments))
+
+    def run(self, work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result]]:
+        """Every job with `work(job)`, in the order in which they are done. Raises what a job raised."""
+        waiting = iter(jobs)
+        running: dict[Future[Result], Job] = {}
+        try:
+            while True:
+                for job in islice(waiting, _AHEAD * self._workers - len(running)):
+                    running[self._pool.submit(work, job)] = job
+                if not running:
+                    return
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    yield running.pop(future), future.result()
+        except BrokenProcessPool:
+            raise ShareError("a process that makes images has died; is memory short?") from None
+
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._pool.shutdown(cancel_futures=True)  # waits for the jobs that run, about a second
+
+
+def _begin(start: Callable[..., None], arguments: tuple[object, ...]) -> None:
+    """The first thing that a process does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    start(*arguments)
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)

@@ -1,0 +1,110 @@
+"""From a recipe to a stage: the room is furnished, paths are found in it, devices are set up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from share.emulate import room_file
+from share.emulate.motion import avatars
+from share.emulate.motion.plan import Agent, Plan, plan
+from share.emulate.progress import Progress
+from share.emulate.recipe import Recipe
+from share.emulate.sensor.device import Device, Pictures
+from share.emulate.stage import Actor, Stage
+from share.emulate.world.layout import Layout
+from share.errors import UsageError
+from share.geometry.camera import Rig
+from share.io.profile import profile
+from share.io.profile_types import Profile
+from share.types import I64, AgentKind
+
+_ROOM = "room"
+_DEFAULT_PROFILE = {"euroc": "euroc"}  # by kind of motion; else:
+_PROFILE = "d435i"
+_DEPTH = "rgbd"
+
+
+def prepare(recipe: Recipe, work: Path, progress: Progress) -> tuple[Stage, tuple[str, ...]]:
+    """The stage, its room kept in `work`, and notes for a person. Raises UsageError, ConfigError, DataError
+    for what cannot be made."""
+    progress("planning", 0, 1)
+    planned = plan(recipe.motions, furnish(recipe), recipe.seconds, recipe.seed)
+    _check_names(recipe, planned)
+    actors = tuple(_actor(agent, k, recipe) for k, agent in enumerate(planned.agents))
+    room = work / _ROOM
+    if not room.exists():
+        progress("making the room", 0, 1)
+        growing = work / f"{_ROOM}.part"
+        growing.mkdir(exist_ok=True)
+        room_file.keep(planned.layout, {a.name: a.avatar.shapes for a in actors}, growing)
+        growing.rename(room)
+    notes = planned.notes + tuple(f"{a.name}: {note}" for a in planned.agents for note in a.notes)
+    return Stage(room, actors), notes
+
+
+def furnish(recipe: Recipe) -> Layout:
+    """What stands where. Raises UsageError for an unknown scene or a size that it cannot have."""
+    if recipe.scene == room_file.PLAIN:
+        from share.emulate.plain.scene import layout as plain_layout
+
+        return plain_layout(recipe.seed, recipe.size)
+    if recipe.scene.endswith((".glb", ".gltf")):
+        from share.emulate.world.gltf import load_gltf
+
+        return load_gltf(Path(recipe.scene))
+    from share.emulate.world.scenes import layout
+
+    return layout(recipe.scene, recipe.seed, recipe.size)
+
+
+def _actor(agent: Agent, number: int, recipe: Recipe) -> Actor:
+    sensors = _chosen(recipe.sensors, agent.name) or _usual_sensors(agent)
+    made = _profile(agent, recipe)
+    rig = _mounted(made.rig(depth=sensors == _DEPTH), agent)
+    seed = (recipe.seed, 7, number)
+    device = Device(made, recipe.effects, seed, agent.path.start_ns, (recipe.seed, 8))
+    pictures = _outside(device.pictures(agent.path.start_ns, agent.path.end_ns), agent.path.gaps)
+    if len(pictures) < 2:
+        raise UsageError(f"{agent.name}: {agent.spec} leaves {len(pictures)} pictures; give it more time")
+    avatar = avatars.make(agent.look, agent.path, (recipe.seed, 9, number))
+    return Actor(agent.name, agent.kind, rig, agent.path, device, avatar, pictures)
+
+
+def _profile(agent: Agent, recipe: Recipe) -> Profile:
+    """`NAME` or `NAME:MODE`, as asked for, or what the motion was recorded with."""
+    usual = _DEFAULT_PROFILE.get(agent.spec.partition(":")[0], _PROFILE)
+    name, _, mode = (_chosen(recipe.profiles, agent.name) or usual).partition(":")
+    return profile(name, mode or None)
+
+
+def _usual_sensors(agent: Agent) -> str:
+    """Depth helps a robot not to bump into things; a headset has the infrared pair."""
+    simulated = agent.path.recorded is None
+    return _DEPTH if agent.kind is AgentKind.ROBOT and simulated else "stereo"
+
+
+def _mounted(rig: Rig, agent: Agent) -> Rig:
+    """The cameras where the recorded rig had them, and its IMU's noise."""
+    if agent.T_body_cam0 is not None:
+        rig = replace(rig, T_body_cam0=agent.T_body_cam0)
+    return rig if agent.imu is None else replace(rig, imu=agent.imu)
+
+
+def _outside(pictures: Pictures, gaps: I64) -> Pictures:
+    """Without those taken where nobody knows the truth."""
+    t = pictures.true_ns[:, None]
+    known = ~((t > gaps[:, 0]) & (t < gaps[:, 1])).any(axis=1)
+    return Pictures(pictures.index[known], pictures.true_ns[known], pictures.stamp_ns[known])
+
+
+def _chosen(table: dict[str, str], name: str) -> str | None:
+    return table.get(name, table.get(""))
+
+
+def _check_names(recipe: Recipe, planned: Plan) -> None:
+    known = {agent.name for agent in planned.agents}
+    for table in (recipe.sensors, recipe.profiles):
+        for name in table:
+            if name and name not in known:
+                raise UsageError(f"'{name}' is not one of the agents: {', '.join(sorted(known))}")

@@ -1,0 +1,56 @@
+"""All that decides what a session holds: the same recipe gives the same bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from share.emulate.sensor.effects import Effects
+from share.errors import UsageError
+
+GENERATOR_VERSION = 2  # raise it when any picture, motion or file changes: cached sessions are made anew
+SENSORS = ("stereo", "rgbd")
+IMAGES = ("jpeg", "png")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """scene: a name, or a glTF file. motions: `[NAME=]SPEC` each. size: of the room, m; None: the scene's
+    own. sensors, profiles: one for all (key "") or by an agent's name; profiles may name a mode, as
+    `d435i:848x480@30`. images: jpeg is quality 95; png keeps every gray level. Raises UsageError for what
+    cannot be made."""
+
+    scene: str
+    motions: tuple[str, ...]
+    seconds: float = 30.0
+    seed: int = 0
+    size: tuple[float, float, float] | None = None
+    sensors: dict[str, str] = field(default_factory=dict)
+    profiles: dict[str, str] = field(default_factory=dict)
+    effects: Effects = field(default_factory=Effects)
+    images: str = "jpeg"
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.seconds <= 3600:
+            raise UsageError(f"{self.seconds:g} seconds: a session lasts 1 to 3600 seconds")
+        if not 0 <= self.seed < 2**63:
+            raise UsageError(f"seed {self.seed}: must be 0 .. 2^63 - 1")
+        for sensors in self.sensors.values():
+            if sensors not in SENSORS:
+                raise UsageError(f"sensors '{sensors}' are not known; known: {', '.join(SENSORS)}")
+        if self.images not in IMAGES:
+            raise UsageError(f"images '{self.images}' are not known; known: {', '.join(IMAGES)}")
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data, for a person and for session.yaml."""
+        out = asdict(self) | {"motions": list(self.motions), "generator_version": GENERATOR_VERSION}
+        out["size"] = None if self.size is None else list(self.size)
+        return out
+
+    @property
+    def digest(self) -> str:
+        """Twelve characters that differ where anything does."""
+        text = json.dumps(self.plain(), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:12]

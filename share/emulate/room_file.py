@@ -1,0 +1,39 @@
+"""A room kept for other processes to open, and the renderer that can draw it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from share.emulate.types import Renderer
+from share.emulate.world.layout import Layout
+from share.emulate.world.mesh import Shape
+from share.io.files import atomic_write
+
+PLAIN = "plain"
+_PLAIN_FILE = "plain.json"
+
+
+def keep(layout: Layout, movers: dict[str, tuple[Shape, ...]], folder: Path) -> None:
+    """Draw pictures, bake light and write it all into `folder`."""
+    if layout.name == PLAIN:
+        atomic_write(folder / _PLAIN_FILE, json.dumps({"seed": layout.seed, "size": layout.size}))
+        return
+    from share.emulate.world.build import build
+    from share.emulate.world.files import save_room
+
+    save_room(build(layout, movers), folder)
+
+
+def open_renderer(folder: Path) -> Renderer:
+    """Raises RenderError where nothing can be drawn here."""
+    plain = folder / _PLAIN_FILE
+    if plain.exists():
+        from share.emulate.plain.scene import PlainRenderer
+
+        data = json.loads(plain.read_text())
+        return PlainRenderer(data["seed"], tuple(data["size"]))
+    from share.emulate.render.gl import GlRenderer
+    from share.emulate.world.files import load_room
+
+    return GlRenderer(load_room(folder))

@@ -1,0 +1,186 @@
+"""Makes a session folder: session.yaml, NAME.mcap and truth/NAME.tum per agent.
+
+A folder under its own name is whole. It grows as `.NAME.partial-DIGEST`, where what a break leaves is
+used by the next attempt at the same recipe, and is renamed at the end.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from share import __version__
+from share.emulate import shooting
+from share.emulate.asl import check_asl, to_asl
+from share.emulate.pool import Pool
+from share.emulate.preparation import prepare
+from share.emulate.progress import Progress, silent
+from share.emulate.recipe import Recipe
+from share.emulate.sensor.exposure import Shots
+from share.emulate.shooting import Take
+from share.emulate.stage import Actor, Stage
+from share.emulate.takes import write_recording, write_truth
+from share.errors import ShareError, UsageError
+from share.io.files import atomic_write, writable_dir, writing
+from share.io.kalibr import to_kalibr
+from share.io.session import SCHEMA, SESSION
+
+START_NS = 1_750_000_000 * 10**9  # session time 0 in the clock of an agent whose IMU is simulated
+_FRAMES = 24  # of a chunk: what a break costs a process
+_METERED = 200  # frames of a metering job
+_BYTES = {"jpeg": 130_000, "png": 330_000}  # of an image, about; to see beforehand whether the disk will do
+
+
+def make_session(
+    recipe: Recipe, out: Path, workers: int = 2, progress: Progress = silent, asl: bool = False
+) -> Path:
+    """Make a session in the new folder `out` with `workers` processes; with `asl`, an EuRoC/ASL folder
+    NAME/mav0 of each agent instead.
+
+    Raises UsageError where `out` exists, or for what cannot be made; ShareError where the disk is full.
+    """
+    with _lock(out):
+        if out.exists():
+            raise UsageError(f"{out}: exists already; give the name of a new folder")
+        _make(recipe, out, workers, progress, asl)
+    return out
+
+
+def cached_session(
+    recipe: Recipe, cache: Path | None = None, workers: int = 2, progress: Progress = silent
+) -> Path:
+    """The session of this recipe in `cache` (default: the user's), made if it is not there yet."""
+    out = (default_cache() if cache is None else cache) / f"session-{recipe.digest}"
+    if not out.exists():
+        with _lock(out):
+            if not out.exists():  # nobody else made it while we waited
+                _make(recipe, out, workers, progress)
+    return out
+
+
+def default_cache() -> Path:
+    """$XDG_CACHE_HOME/share, or ~/.cache/share (XDG Base Directory Specification)."""
+    home = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(home) if Path(home).is_absolute() else Path.home() / ".cache") / "share"
+
+
+def _make(recipe: Recipe, out: Path, workers: int, progress: Progress, asl: bool = False) -> None:
+    partial = out.with_name(f".{out.name}.partial-{recipe.digest}")
+    with writing(out):
+        (partial / "truth").mkdir(parents=True, exist_ok=True)
+        work = partial / "work"
+        work.mkdir(exist_ok=True)
+        stage, notes = prepare(recipe, work, progress)
+        if asl:
+            check_asl(stage)
+        _check_space(partial, stage, recipe)
+        with Pool(workers, shooting.begin, (stage, recipe.images)) as pool:
+            exposures = [_exposures(pool, stage, who, work, progress) for who in range(len(stage.actors))]
+            chunks = _shoot(pool, stage, exposures, work, progress)
+        for k, (actor, files) in enumerate(zip(stage.actors, chunks, strict=True)):
+            progress("writing recordings", k, len(stage.actors))
+            write_recording(actor, files, partial / f"{actor.name}.mcap")
+            write_truth(actor, partial / "truth" / f"{actor.name}.tum")
+        atomic_write(partial / SESSION, _description(recipe, stage, notes))
+        if asl:
+            to_asl(partial, [actor.name for actor in stage.actors], progress)
+        shutil.rmtree(work)
+        partial.rename(out)
+
+
+def _exposures(pool: Pool, stage: Stage, who: int, work: Path, progress: Progress) -> Shots:
+    """How each of the actor's frames is exposed, from a quick look at all of them."""
+    actor, kept = stage.actors[who], work / f"{stage.actors[who].name}.brightness.npy"
+    if kept.exists():
+        brightness = np.load(kept)
+    else:
+        count = len(actor.pictures)
+        jobs = [Take(who, k, min(k + _METERED, count)) for k in range(0, count, _METERED)]
+        brightness = np.zeros(count)
+        for done, (job, values) in enumerate(pool.run(shooting.meter, jobs)):
+            brightness[job.first : job.last] = values
+            progress(f"metering {actor.name}", done + 1, len(jobs))
+        np.save(kept, brightness)
+    return actor.device.shots(actor.pictures.true_ns, brightness)
+
+
+def _shoot(
+    pool: Pool, stage: Stage, exposures: list[Shots], work: Path, progress: Progress
+) -> list[list[Path]]:
+    """The chunks of each actor, in order; those that are there already are not drawn again."""
+    takes = [_takes(stage.actors[who], who, exposures[who], work) for who in range(len(stage.actors))]
+    todo = [take for them in takes for take in them if not _file(take).exists()]
+    total = sum(len(actor.pictures) for actor in stage.actors)
+    done = total - sum(take.last - take.first for take in todo)
+    progress("drawing images", done, total)
+    for take, _ in pool.run(shooting.shoot, todo):
+        done += take.last - take.first
+        progress("drawing images", done, total)
+    return [[_file(take) for take in them] for them in takes]
+
+
+def _takes(actor: Actor, who: int, shots: Shots, work: Path) -> list[Take]:
+    folder = work / actor.name
+    folder.mkdir(exist_ok=True)
+    count = len(actor.pictures)
+    spans = [(k, min(k + _FRAMES, count)) for k in range(0, count, _FRAMES)]
+    return [Take(who, a, b, folder / f"{a:06d}.chunk", shots.part(a, b)) for a, b in spans]
+
+
+def _file(take: Take) -> Path:
+    assert take.file is not None
+    return take.file
+
+
+def _check_space(folder: Path, stage: Stage, recipe: Recipe) -> None:
+    """Before hours are spent: the chunks and the recordings are there side by side at the end."""
+    images = sum(2 * len(actor.pictures) for actor in stage.actors)
+    need, free = 2 * images * _BYTES[recipe.images], shutil.disk_usage(folder).free
+    if need > free:
+        raise ShareError(
+            f"{folder.parent}: about {need / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB are free; "
+            "make room, or fewer --seconds"
+        )
+
+
+def _description(recipe: Recipe, stage: Stage, notes: tuple[str, ...]) -> str:
+    """session.yaml. A stamp in an agent's files is session time + clock_offset_ns."""
+    import yaml
+
+    agents = {
+        actor.name: {
+            "kind": actor.kind.value,
+            "sensors": actor.rig.kind,
+            "rate_hz": actor.device.profile.rate_hz,
+            "clock_offset_ns": actor.clock_offset_ns - START_NS + actor.device.clock.offset_ns,
+            "calibration": to_kalibr(actor.rig),
+        }
+        for actor in stage.actors
+    }
+    provenance = {
+        "generator": "share emulate",
+        "share_version": __version__,
+        **recipe.plain(),
+        "notes": list(notes),
+    }
+    data = {"schema": SCHEMA, "provenance": provenance, "agents": agents}
+    return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
+
+
+@contextmanager
+def _lock(out: Path) -> Iterator[None]:
+    """Only one process makes a session in a folder at a time; others wait. The lock is on the folder
+    itself, so nothing is left behind, and the system releases it if we are killed."""
+    import fcntl
+
+    handle = os.open(writable_dir(out.parent), os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)

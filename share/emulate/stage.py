@@ -1,0 +1,108 @@
+"""A room with its agents in it, ready to be recorded: who is where at any moment, and what looks on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path as FilePath
+from typing import Protocol
+
+import numpy as np
+
+from share.emulate.sensor.device import Device, Pictures
+from share.emulate.sensor.exposure import Shot
+from share.emulate.types import Moment, Path
+from share.emulate.world.mesh import Shape
+from share.geometry import se3
+from share.geometry.camera import Camera, Rig
+from share.types import F64, I64, AgentKind
+
+_NEAR_M = 1.5  # what motion blur is reckoned for; nearer things blur more than their samples show
+
+
+class Avatar(Protocol):
+    """What others see of an agent: rigid parts that move as its path does."""
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        """The parts, each in a frame of its own."""
+        ...
+
+    def poses(self, stamps_ns: I64) -> F64:
+        """T_world_part (N, P, 4, 4) at stamps (N,) of the agent's own clock."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Actor:
+    """One agent of the session. pictures: all frames that it records, in true time (its path's)."""
+
+    name: str
+    kind: AgentKind
+    rig: Rig
+    path: Path
+    device: Device
+    avatar: Avatar
+    pictures: Pictures
+
+    @property
+    def clock_offset_ns(self) -> int:
+        """Its first instant: sessions begin at 0."""
+        return self.path.start_ns
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """room: where it is kept, for `share.emulate.shooting` to open."""
+
+    room: FilePath
+    actors: tuple[Actor, ...]
+
+    def moments(self, who: int, true_ns: int, offsets_s: F64, camera: str = "cam0") -> list[Moment]:
+        """What camera `camera` of actor number `who` sees at true_ns + offsets_s (S,)."""
+        actor = self.actors[who]
+        times = true_ns + np.rint(offsets_s * 1e9).astype(np.int64)
+        times = np.clip(times, actor.path.start_ns, actor.path.end_ns)
+        T_world_cam = actor.path.poses(times) @ T_body(actor.rig, camera)
+        others = self._others(who, times - actor.clock_offset_ns)
+        return [
+            Moment(T, {name: poses[k] for name, poses in others.items()}) for k, T in enumerate(T_world_cam)
+        ]
+
+    def motion_px(self, who: int, true_ns: int, shot: Shot) -> float:
+        """How far things at _NEAR_M move in the picture during the exposure, px."""
+        actor = self.actors[who]
+        half = int(shot.exposure_ms * 5e5)
+        ends = np.array([true_ns - half, true_ns + half])
+        T = actor.path.poses(np.clip(ends, actor.path.start_ns, actor.path.end_ns))
+        turned = float(se3.angle(T[0, :3, :3].T @ T[1, :3, :3]))
+        gone = float(np.linalg.norm(T[1, :3, 3] - T[0, :3, 3]))
+        return actor.rig.cam0.focal * (turned + gone / _NEAR_M)
+
+    def _others(self, who: int, session_ns: I64) -> dict[str, F64]:
+        """Poses (S, P, 4, 4) of all but `who`; before its path begins and after it ends, one stands still."""
+        out = {}
+        for k, actor in enumerate(self.actors):
+            if k != who:
+                there = session_ns + actor.clock_offset_ns
+                out[actor.name] = actor.avatar.poses(np.clip(there, actor.path.start_ns, actor.path.end_ns))
+        return out
+
+
+def T_body(rig: Rig, camera: str) -> F64:
+    """T_body_camera (4, 4) of cam0, cam1 or depth."""
+    T_camera_cam0 = {"cam0": np.eye(4), "cam1": rig.T_cam1_cam0, "depth": rig.T_depth_cam0}[camera]
+    assert T_camera_cam0 is not None
+    return rig.T_body_cam0 @ se3.inverse(T_camera_cam0)
+
+
+def smaller(camera: Camera, factor: int) -> Camera:
+    """The same view in `factor` times fewer pixels each way."""
+    return replace(
+        camera,
+        width=camera.width // factor,
+        height=camera.height // factor,
+        fx=camera.fx / factor,
+        fy=camera.fy / factor,
+        cx=(camera.cx + 0.5) / factor - 0.5,
+        cy=(camera.cy + 0.5) / factor - 0.5,
+    )

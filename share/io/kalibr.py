@@ -1,0 +1,48 @@
+"""A rig written under Kalibr's names, as `share.io.calibration` reads it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from share.geometry import se3
+from share.geometry.camera import Camera, ImuNoise, Rig
+
+_DEPTH_SCALE = 1000.0  # 16-bit depth in millimetres
+
+
+def to_kalibr(rig: Rig) -> dict[str, Any]:
+    """cam0, cam1, depth (ours) and imu0 of the rig, as plain data for a YAML file."""
+    out = {"cam0": _camera(rig.cam0)}
+    if rig.imu is not None:
+        out["cam0"]["T_cam_imu"] = se3.inverse(rig.T_body_cam0).tolist()
+        out["imu0"] = _imu(rig.imu)
+    if rig.cam1 is not None and rig.T_cam1_cam0 is not None:
+        out["cam1"] = _camera(rig.cam1) | {"T_cn_cnm1": rig.T_cam1_cam0.tolist()}
+    if rig.depth is not None and rig.T_depth_cam0 is not None:
+        T = rig.T_depth_cam0.tolist()
+        out["depth"] = _camera(rig.depth) | {"T_depth_cam0": T, "depth_scale": _DEPTH_SCALE}
+    return out
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    distortion = (
+        {"distortion_model": "radtan", "distortion_coeffs": list(camera.distortion)}
+        if camera.distortion
+        else {"distortion_model": "none"}
+    )
+    return {
+        "camera_model": "pinhole",
+        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+        **distortion,
+        "resolution": [camera.width, camera.height],
+    }
+
+
+def _imu(imu: ImuNoise) -> dict[str, Any]:
+    return {
+        "gyroscope_noise_density": imu.gyro_density,
+        "gyroscope_random_walk": imu.gyro_walk,
+        "accelerometer_noise_density": imu.accel_density,
+        "accelerometer_random_walk": imu.accel_walk,
+        "update_rate": imu.rate_hz,
+    }
