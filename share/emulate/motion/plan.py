@@ -9,6 +9,7 @@ from share.emulate.motion.spec import parse
 from share.emulate.types import Path
 from share.emulate.world.layout import Layout
 from share.errors import UsageError
+from share.geometry.camera import ImuNoise
 from share.types import F64, I64, AgentKind
 
 
@@ -17,7 +18,7 @@ class Agent:
     """One who moves. look: what the others see of it, `person`, `robot` or `drone`.
 
     T_body_cam0 (4, 4): how the camera sits on the body, where a recorded motion brings its own rig, else
-    None: the sensor's profile says (a simulated body is the profile's IMU). images_ns (M,): stamps of
+    None: the sensor's profile says (a simulated body is the profile's IMU). imu: noise of its recorded IMU. images_ns (M,): stamps of
     the recorded images, where there are any. spec: what the user asked for. notes: for a person.
     """
 
@@ -28,6 +29,7 @@ class Agent:
     spec: str
     T_body_cam0: F64 | None = None
     images_ns: I64 | None = None
+    imu: ImuNoise | None = None
     notes: tuple[str, ...] = ()
 
 

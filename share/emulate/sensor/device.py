@@ -72,8 +72,18 @@ class Device:
         index, true = self._stream(self.profile.rate_hz, _CAMERA).times(start_ns, end_ns)
         lost = clocks.dropped((*self._seed, _DROPS), index, effects.drops, effects.drop_burst)
         index, true = index[~lost], true[~lost]
-        error = clocks.jittered((*self._seed, _JITTER), index, effects.jitter_ms * 1e6)
+        error = clocks.jitter(
+            (*self._seed, _JITTER, _CAMERA), index, effects.jitter_ms * 1e6, self.profile.rate_hz
+        )
         return Pictures(index, true, self.clock.read(true - round(effects.time_offset_ms * 1e6) + error))
+
+    def truth_times(self, pictures: Pictures) -> tuple[I64, I64]:
+        """(true_ns, stamp_ns), each (N,): when the clock shows the stamps of `pictures`, and these stamps
+        as a reader repairs them, without wraps."""
+        error = pictures.stamp_ns - self.clock.read(pictures.true_ns)
+        if period := self.clock.period_ns:
+            error = (error + period // 2) % period - period // 2
+        return pictures.true_ns + error, clocks.unwrapped(pictures.stamp_ns, self.clock.period_ns)
 
     def light(self, true_ns: I64) -> F64:
         """Of the room's lamps (N,) at true times (N,), against what the room was made with."""
@@ -100,9 +110,9 @@ class Device:
         Without `shot`: the reference exposure."""
         return self._imagers[camera].develop(radiance, frame, shot or Shot(self._reference_ms))
 
-    def depth_mm(self, depth: F32, left: U8, frame: int) -> np.ndarray:
+    def depth_mm(self, depth: F32, left: U8, frame: int, shot: Shot | None = None) -> np.ndarray:
         """Exact depth (H, W) m and the developed left picture -> the device's, uint16 mm, 0 = none."""
-        return self._depth.read(depth, left, frame)
+        return self._depth.read(depth, left, frame, shot.gain if shot else 1.0)
 
     # -- IMU ---------------------------------------------------------------------------------
 
@@ -111,19 +121,20 @@ class Device:
         device clock's."""
         if path.recorded is not None:
             stamps = self.clock.read(path.recorded.stamps_ns)
-            return ImuStreams(stamps, path.recorded.gyro, stamps, path.recorded.accel)
+            return ImuStreams(stamps, path.recorded.gyro, stamps, path.recorded.accel, self.clock.period_ns)
         facts = self.profile.device.imu
         gyro_ns, gyro = self._inertial(path, facts.gyro, _GYRO, 0)
         accel_ns, accel = self._inertial(path, facts.accel, _GYRO if facts.joined else _ACCEL, 1)
-        return ImuStreams(gyro_ns, gyro, accel_ns, accel)
+        return ImuStreams(gyro_ns, gyro, accel_ns, accel, self.clock.period_ns)
 
     def _inertial(self, path: Path, sensor: Inertial, stream: int, which: int) -> tuple[I64, F64]:
         index, true = self._stream(sensor.rate_hz, stream).times(path.start_ns, path.end_ns)
         effects = self.effects
         errors = (effects.imu_noise, effects.imu_bias, effects.imu_limits)
         values = measured(path.inertial(true)[which], sensor, (*self._seed, _GYRO, which), *errors)
-        jitter = clocks.jittered((*self._seed, _JITTER, stream), index, effects.imu_jitter_ms * 1e6)
-        return self.clock.read(true + jitter), values
+        sigma_ns = effects.imu_jitter_ms * 1e6
+        error = clocks.jitter((*self._seed, _JITTER, stream), index, sigma_ns, sensor.rate_hz)
+        return self.clock.read(true + error), values
 
     # -- parts -------------------------------------------------------------------------------
 

@@ -35,6 +35,11 @@ class Shots:
     def __len__(self) -> int:
         return len(self.exposure_ms)
 
+    def part(self, first: int, last: int) -> Shots:
+        """Those of pictures first .. last - 1."""
+        here = slice(first, last)
+        return Shots(self.exposure_ms[here], self.gain[here], self.light[here])
+
     def __getitem__(self, i: int) -> Shot:
         return Shot(float(self.exposure_ms[i]), float(self.gain[i]), float(self.light[i]))
 
