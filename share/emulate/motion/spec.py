@@ -1,6 +1,6 @@
 """What a user asks for: `walk:`, `robot:speed=0.5`, `ann=euroc:V1_02,start=5`, `paper:3`.
 
-    [NAME=]KIND:[ARGUMENT][,key=value ...]
+[NAME=]KIND:[ARGUMENT][,key=value ...]
 """
 
 from __future__ import annotations
@@ -143,7 +143,9 @@ def _make(kind: str, argument: str, options: dict[str, str], text: str) -> Spec:
     cls = KINDS[kind]
     if cls is PaperSpec:
         if argument not in ("1", "2", "3", "4", "5") or options:
-            raise UsageError(f"'{text}': the paper has five experiments; say paper:1 to paper:5, nothing more")
+            raise UsageError(
+                f"'{text}': the paper has five experiments; say paper:1 to paper:5, nothing more"
+            )
         return PaperSpec(int(argument))
     takes_path = issubclass(cls, RecordedSpec)
     if argument and not takes_path:

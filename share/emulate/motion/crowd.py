@@ -1,0 +1,172 @@
+"""Several simulated agents at once: tracks that keep apart, then bodies that look about and at each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from share.emulate.motion import robot, walk
+from share.emulate.motion.gaze import Seen
+from share.emulate.motion.schedule import Other
+from share.emulate.motion.spline import SplinePath
+from share.emulate.motion.together import Ground, Wish, move, nearest, obstacle
+from share.emulate.motion.track import Track, instants
+from share.emulate.types import Path
+from share.errors import UsageError
+from share.types import F64
+
+_ATTEMPTS = 12
+_ROUNDS = 6  # of bringing lengths to what they shall be
+_LENGTH = 0.008  # relative; the paper's are asked to 2 %
+_COUNT_S = 1 / 30  # a length is that of the line through poses at 30 Hz
+START_NS = 1_000_000_000  # of a simulated path: 0 means "no stamp" to ROS
+
+
+@dataclass(frozen=True)
+class Member:
+    """One simulated agent. height: m, of eyes or camera. turns: rad/s, of a person's quickest turn of the
+    head. vibration: m/s^2, of a robot. length: m of the body's path at 30 Hz, None for any."""
+
+    name: str
+    wish: Wish
+    height: float
+    turns: float = 2.6
+    vibration: float = 0.4
+    length: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Present:
+    """One whose path is settled already. xyz (M, 3) m every KNOT_S of its own time from its start;
+    distance: m that others keep from it."""
+
+    xyz: F64
+    distance: float
+
+
+def crowd(
+    ground: Ground,
+    members: Sequence[Member],
+    present: Sequence[Present],
+    things: F64,
+    duration: float,
+    seed: tuple[int, ...],
+) -> list[SplinePath]:
+    """Paths of `duration` s, in the members' order. things (K, 3) m: what there is to look at. Raises
+    UsageError where no attempt finds room for all."""
+    for attempt in range(_ATTEMPTS):
+        paths = _attempt(ground, members, present, things, duration, (*seed, attempt))
+        if paths is not None:
+            return paths
+    names = ", ".join(m.name for m in members)
+    raise UsageError(
+        f"{names}: found no paths that keep people {0.6} m and robots {0.5} m apart in this room; "
+        "take fewer agents, lower speeds, a larger --size or another --seed"
+    )
+
+
+def _attempt(
+    ground: Ground,
+    members: Sequence[Member],
+    present: Sequence[Present],
+    things: F64,
+    duration: float,
+    seed: tuple[int, ...],
+) -> list[SplinePath] | None:
+    wishes = [replace(m.wish, gone=m.length) for m in members]
+    for _ in range(_ROUNDS):
+        tracks = _tracks(ground, wishes, present, duration, seed)
+        if tracks is None:
+            return None
+        paths = _bodies(members, tracks, present, things, duration, seed)
+        if not _apart(members, paths, present):
+            return None
+        missing = [
+            0.0 if m.length is None else m.length - length_of(p) for m, p in zip(members, paths, strict=True)
+        ]
+        if all(abs(d) <= _LENGTH * (m.length or 1.0) for d, m in zip(missing, members, strict=True)):
+            return paths
+        wishes = [
+            w if w.gone is None else replace(w, gone=max(0.5, w.gone + d))
+            for w, d in zip(wishes, missing, strict=True)
+        ]
+    return None
+
+
+def length_of(path: Path) -> float:
+    """Metres of the line through the body's positions at 30 Hz, as `share dataset info` counts them."""
+    stamps = np.arange(path.start_ns, path.end_ns + 1, round(_COUNT_S * 1e9))
+    steps = np.diff(path.poses(stamps)[:, :3, 3], axis=0)
+    return float(np.linalg.norm(steps, axis=1).sum())
+
+
+def present_of(path: Path, distance: float) -> Present:
+    """A settled path as others must respect it."""
+    seconds = instants((path.end_ns - path.start_ns) / 1e9)
+    stamps = np.minimum(path.start_ns + np.round(seconds * 1e9).astype(np.int64), path.end_ns)
+    return Present(path.poses(stamps)[:, :3, 3], distance)
+
+
+def _tracks(
+    ground: Ground,
+    wishes: Sequence[Wish],
+    present: Sequence[Present],
+    duration: float,
+    seed: tuple[int, ...],
+) -> list[Track] | None:
+    """The quick ones have the right of way: they have the least time to spare."""
+    found: dict[int, Track] = {}
+    for i in sorted(range(len(wishes)), key=lambda i: -wishes[i].speed):
+        taken = [_kept(p.xyz, p.distance, wishes[i]) for p in present]
+        taken += [_kept(track.xy, wishes[k].distance, wishes[i]) for k, track in found.items()]
+        track = move(ground, wishes[i], taken, duration, (*seed, i))
+        if track is None:
+            return None
+        found[i] = track
+    return [found[i] for i in range(len(wishes))]
+
+
+def _kept(xyz: F64, distance: float, wish: Wish) -> Other:
+    return obstacle(xyz[:, :2], max(distance, wish.distance) if wish.look == "person" else distance)
+
+
+def _bodies(
+    members: Sequence[Member],
+    tracks: Sequence[Track],
+    present: Sequence[Present],
+    things: F64,
+    duration: float,
+    seed: tuple[int, ...],
+) -> list[SplinePath]:
+    count = len(tracks[0].seconds)
+    seen = [Seen(t.xy, m.height) for t, m in zip(tracks, members, strict=True)]
+    strangers = [Seen(_held(p.xyz[:, :2], count), float(p.xyz[:, 2].mean())) for p in present]
+    paths = []
+    for i, (m, track) in enumerate(zip(members, tracks, strict=True)):
+        rng = np.random.default_rng((*seed, i, 1))
+        others = [s for k, s in enumerate(seen) if k != i] + strangers
+        if m.wish.look == "person":
+            path = walk.path_of(track, m.height, m.turns, things, others, START_NS, rng)
+        else:
+            path = robot.path_of(track, m.height, m.vibration, START_NS, rng)
+        paths.append(replace(path, end_ns=START_NS + round(duration * 1e9)))
+    return paths
+
+
+def _apart(members: Sequence[Member], paths: Sequence[SplinePath], present: Sequence[Present]) -> bool:
+    """Whether nobody is ever nearer to another than both like."""
+    bodies = [present_of(p, m.wish.distance) for p, m in zip(paths, members, strict=True)]
+    everyone = [*bodies, *present]
+    for i, a in enumerate(bodies):
+        for b in everyone[i + 1 :]:
+            count = max(len(a.xyz), len(b.xyz))
+            if nearest(_held(a.xyz, count), _held(b.xyz, count)) < min(a.distance, b.distance):
+                return False
+    return True
+
+
+def _held(values: F64, count: int) -> F64:
+    """(count, D): the first rows, the last one repeated where there are fewer."""
+    return values[np.minimum(np.arange(count), len(values) - 1)]

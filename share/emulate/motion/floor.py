@@ -1,0 +1,43 @@
+"""Free floor as a grid: how far from every place the nearest obstacle is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.types import F64
+
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """clearance (X, Y) m at the corners (i, j) * step m of a grid that begins at the world's origin:
+    distance to the nearest obstacle between floor and head, negative or 0 inside one."""
+
+    clearance: F64
+    step: float
+
+    @property
+    def extent(self) -> F64:
+        """The far corner (2,) m."""
+        return (np.array(self.clearance.shape) - 1) * self.step
+
+    def at(self, xy: F64) -> F64:
+        """Clearance (N,) m at places (N, 2) m, bilinear; outside the grid as at its edge."""
+        i, f = self._cells(xy)
+        c = self.clearance
+        low = c[i[:, 0], i[:, 1]] * (1 - f[:, 1]) + c[i[:, 0], i[:, 1] + 1] * f[:, 1]
+        high = c[i[:, 0] + 1, i[:, 1]] * (1 - f[:, 1]) + c[i[:, 0] + 1, i[:, 1] + 1] * f[:, 1]
+        out: F64 = low * (1 - f[:, 0]) + high * f[:, 0]
+        return out
+
+    def away(self, xy: F64) -> F64:
+        """Gradient (N, 2) of the clearance: where to go to gain room."""
+        h = self.step * np.eye(2)
+        return np.stack([self.at(xy + d) - self.at(xy - d) for d in h], axis=1) / (2 * self.step)
+
+    def _cells(self, xy: F64) -> tuple[np.ndarray, F64]:
+        most = np.array(self.clearance.shape) - 1
+        place = (np.asarray(xy) / self.step).clip(0, most - 1e-9)
+        cell = place.astype(int)
+        return cell, place - cell

@@ -1,0 +1,112 @@
+"""Several agents on one floor at once: each finds a way and a schedule that keeps off those before it.
+
+The first has the right of way. Who finds no way through tries other tours; where none of them helps,
+all begin anew with another seed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import ModuleType
+
+import numpy as np
+
+from share.emulate.motion import robot, walk
+from share.emulate.motion.floor import Floor
+from share.emulate.motion.route import Network, Way
+from share.emulate.motion.schedule import STEP_S, Limits, Other, schedule, speed_limit
+from share.emulate.motion.track import KNOT_S, Track
+from share.types import F64
+
+PEOPLE_M, ROBOT_M = 0.6, 0.5  # no nearer than this at any time
+_SPARE_M = 0.17  # heads lean and schedules are smoothed: plan for this much more
+_TOURS = 12  # that each agent tries before all begin anew
+_BEGIN_S = 0.8  # the smoothing in time lets motion begin this much sooner
+_PAUSE_S = (1.5, 4.5)
+_EASE = 1.08  # bends take their time: hope for this much more than is to be gone
+_BRANCHES: dict[str, ModuleType] = {"person": walk, "robot": robot}
+
+
+@dataclass(frozen=True)
+class Wish:
+    """How one would like to move. look: `person` or `robot`. speed: m/s. pauses: a minute. gone: m to
+    have gone at the end, None for as many as it takes. near: (x, y) m, where to start."""
+
+    look: str
+    speed: float
+    pauses: float
+    gone: float | None = None
+    near: tuple[float, float] | None = None
+
+    @property
+    def limits(self) -> Limits:
+        """Of its body."""
+        found: Limits = _BRANCHES[self.look].limits(self.speed)
+        return found
+
+    @property
+    def distance(self) -> float:
+        """Least distance (m) that others keep from it."""
+        return PEOPLE_M if self.look == "person" else ROBOT_M
+
+
+class Ground:
+    """One floor and what bodies of each look can reach of it: made once, used for every attempt."""
+
+    def __init__(self, floor: Floor) -> None:
+        self.floor = floor
+        self._networks: dict[str, Network] = {}
+
+    def network(self, look: str) -> Network:
+        """Where a body can be."""
+        if look not in self._networks:
+            self._networks[look] = Network(self.floor, _BRANCHES[look].RADIUS)
+        return self._networks[look]
+
+
+def move(
+    ground: Ground, wish: Wish, taken: Sequence[Other], duration: float, seed: tuple[int, ...]
+) -> Track | None:
+    """The motion of one that keeps off `taken` for `duration` s; None if no tour does."""
+    branch = _BRANCHES[wish.look]
+    for attempt in range(_TOURS):
+        rng = np.random.default_rng((*seed, attempt))
+        wanted = _wanted(wish, branch.STILL_S, duration, rng)
+        longest = 1.15 * max(wanted.sum() * STEP_S, wish.gone or 0.0) + 1.0
+        start = None if wish.near is None else np.array(wish.near)
+        legs = ground.network(wish.look).tour(longest, rng, start)
+        if not legs:
+            return None
+        way: Way = branch.way_of(ground.floor, legs)
+        steps = schedule(way, speed_limit(way, wish.limits), wanted, taken, wish.gone)
+        if steps is None:
+            continue
+        track: Track = branch.track_of(way, steps, duration)
+        if ground.floor.at(track.xy[::20]).min() >= branch.RADIUS - ground.floor.step:
+            return track
+    return None
+
+
+def obstacle(xy: F64, distance: float) -> Other:
+    """What others keep off: places xy (M, 2) m every KNOT_S."""
+    return Other(xy[:: round(STEP_S / 2 / KNOT_S)], distance + _SPARE_M)
+
+
+def nearest(a: F64, b: F64) -> float:
+    """Least horizontal distance (m) of two that are at a (N, 2 or 3) and b (N, 2 or 3) at the same times."""
+    return float(np.linalg.norm(a[:, :2] - b[:, :2], axis=1).min())
+
+
+def _wanted(wish: Wish, still: float, duration: float, rng: np.random.Generator) -> F64:
+    """Speed (T,) m/s in each step of the schedule: standing at first, pauses now and then, and as many
+    more as leave about `wish.gone` metres."""
+    steps = int(np.ceil(duration / STEP_S)) + 1
+    t = (np.arange(steps) + 0.5) * STEP_S
+    speed = np.where(t < still + _BEGIN_S, 0.0, wish.speed)
+    count = int(np.floor(wish.pauses * duration / 60 + rng.random()))
+    while count > 0 or (wish.gone is not None and speed.sum() * STEP_S > _EASE * wish.gone):
+        at, took = rng.uniform(min(still + 3, duration / 2), duration), rng.uniform(*_PAUSE_S)
+        speed[(t > at) & (t < at + took)] = 0.0
+        count -= 1
+    return speed

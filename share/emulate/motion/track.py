@@ -1,0 +1,42 @@
+"""The planar part of a motion: where on the floor, facing where, how far gone, at every instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.types import F64
+
+KNOT_S = 0.005  # between the knots of a path: carries motion up to 60 Hz
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """seconds (M,) from 0 every KNOT_S; xy (M, 2) m; heading (M,) rad, without jumps; speed (M,) m/s."""
+
+    seconds: F64
+    xy: F64
+    heading: F64
+    speed: F64
+
+
+def instants(duration: float) -> F64:
+    """Seconds (M,) from 0, every KNOT_S, to at least `duration`."""
+    return np.arange(int(np.ceil(duration / KNOT_S - 1e-9)) + 1) * KNOT_S
+
+
+def wander(rng: np.random.Generator, seconds: F64, periods: tuple[float, float], waves: int = 4) -> F64:
+    """A signal (M,) that comes and goes with `periods` (shortest, longest) s, rms 1, never repeating."""
+    rates = 2 * np.pi / rng.uniform(*periods, waves)
+    phases = rng.uniform(0, 2 * np.pi, waves)
+    out: F64 = np.sin(seconds[:, None] * rates + phases).sum(axis=1) * np.sqrt(2 / waves)
+    return out
+
+
+def min_jerk(x: F64) -> F64:
+    """From 0 to 1 while x goes from 0 to 1, at rest and without acceleration at both ends (Flash & Hogan,
+    J. Neurosci. 5(7), 1985). Steepest in the middle: 1.875."""
+    x = x.clip(0, 1)
+    out: F64 = x**3 * (10 - 15 * x + 6 * x**2)
+    return out
