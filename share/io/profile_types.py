@@ -196,17 +196,21 @@ class ExposureModel:
 
 @dataclass(frozen=True)
 class DepthModel:
-    """Noise of stereo matching, fitted to block matching (docs/sensors.md)."""
+    """Errors of stereo matching, as block matching has them. sigma_px: of disparity where texture is
+    plenty. window_px: side of the matcher's window. hole_snr: gradient over noise at which half of the
+    pixels find no match; hole_spread: sigma of that limit. smooth_px: sigma of the blur over which errors
+    agree. fattening_px: by how much near things grow."""
 
-    sigma_px: float  # of disparity where texture is plenty
-    contrast: float  # rms gray levels in the window at which texture stops to help
-    hole_contrast: float  # below this, no reading
-    smooth_px: float  # sigma over which errors agree
-    window_px: int  # of the matcher: width of what it cannot see behind an edge
+    sigma_px: float
+    window_px: int
+    hole_snr: float
+    hole_spread: float
+    smooth_px: float
+    fattening_px: int
 
     def __post_init__(self) -> None:
-        _positive(self, "contrast", "window_px")
-        _not_negative(self, "sigma_px", "hole_contrast", "smooth_px")
+        _positive(self, "window_px")
+        _not_negative(self, "sigma_px", "hole_snr", "hole_spread", "smooth_px", "fattening_px")
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from share.emulate.sensor.draws import Seed, normal, uniform
 from share.types import I64
 
 _LONGEST_BURST = 64  # frames
+_IN_ORDER = 0.45  # of a period: how far a stamp may be off without overtaking the next
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,11 @@ class DeviceClock:
     drift_ppm: float = 0.0
     tick_ns: int = 1
     bits: int = 0
+
+    @property
+    def period_ns(self) -> int:
+        """After how long the counter wraps; 0 = it does not."""
+        return self.tick_ns << self.bits if self.bits else 0
 
     def read(self, true_ns: I64) -> I64:
         """What the clock shows at true times (N,)."""
@@ -98,8 +104,17 @@ def _start_probability(share: float, survive: NDArray[Any]) -> float:
     return (low + high) / 2
 
 
-def jittered(seed: Seed, index: I64, sigma_ns: float) -> I64:
-    """Error of each sample's stamp (N,) ns: normal, cut at 3 sigma."""
+def jitter(seed: Seed, index: I64, sigma_ns: float, rate_hz: float) -> I64:
+    """Error of each sample's stamp (N,) ns: normal, cut at 3 sigma and so that stamps stay in order."""
     if sigma_ns <= 0:
         return np.zeros(len(index), np.int64)
-    return np.rint(np.clip(normal(seed, index), -3, 3) * sigma_ns).astype(np.int64)
+    most = min(3 * sigma_ns, _IN_ORDER * 1e9 / rate_hz)
+    return np.rint(np.clip(normal(seed, index) * sigma_ns, -most, most)).astype(np.int64)
+
+
+def unwrapped(stamps_ns: I64, period_ns: int) -> I64:
+    """Stamps (N,) of one stream in order, without the wraps of its counter."""
+    if not period_ns:
+        return stamps_ns
+    wraps = np.cumsum(np.diff(stamps_ns, prepend=stamps_ns[:1]) < -period_ns // 2)
+    return stamps_ns + period_ns * wraps

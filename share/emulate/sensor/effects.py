@@ -7,6 +7,7 @@ import difflib
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 from share.errors import UsageError
 
@@ -43,7 +44,7 @@ class Effects:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            value, kind = getattr(self, field.name), bool if field.default is True or field.default is False else float
+            value, kind = getattr(self, field.name), _kind(field)
             if type(value) is not kind and not (kind is float and type(value) is int):
                 raise UsageError(f"effect {field.name}: expected {_WORDS[kind]}, found {value!r}")
             if kind is float and not math.isfinite(value):
@@ -53,7 +54,11 @@ class Effects:
                 raise UsageError(f"effect {name}: {getattr(self, name):g} must lie in {low:g} .. {high:g}")
 
 
-_WORDS = {bool: "on or off", float: "a number"}
+def _kind(field: dataclasses.Field[Any]) -> type[bool] | type[float]:
+    return bool if isinstance(field.default, bool) else float
+
+
+_WORDS: dict[type, str] = {bool: "on or off", float: "a number"}
 _LIMITS: dict[str, tuple[float, float]] = {
     "lamp_every_s": (0, 1e6),
     "lamp_stops": (0, 6),
@@ -77,12 +82,12 @@ def parse(words: Iterable[str], base: Effects | None = None) -> Effects:
             effects = NONE
             continue
         name, _, text = word.partition("=")
-        effects = dataclasses.replace(effects, **{name: _value(name, text)})
+        effects = dataclasses.replace(effects, **{name: _value(name, text)})  # type: ignore[arg-type]
     return effects
 
 
 def _value(name: str, text: str) -> bool | float:
-    kinds = {field.name: type(field.default) for field in dataclasses.fields(Effects)}
+    kinds = {field.name: _kind(field) for field in dataclasses.fields(Effects)}
     if name not in kinds:
         near = difflib.get_close_matches(name, kinds, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f"known: none, {', '.join(kinds)}"

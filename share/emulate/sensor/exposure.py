@@ -81,10 +81,9 @@ def lamp(seed: Seed, since_ns: I64, every_s: float, stops: float) -> F64:
     """
     if every_s <= 0 or len(since_ns) == 0:
         return np.ones(len(since_ns))
-    rng = np.random.default_rng(seed)
     count = int(since_ns.max() / 1e9 / every_s * 2) + 50
-    at = np.cumsum(rng.exponential(every_s, count)) * 1e9
-    level = 2.0 ** rng.uniform(-stops, stops, count)
+    at = np.cumsum(np.random.default_rng((*seed, 0)).exponential(every_s, count)) * 1e9
+    level = 2.0 ** np.random.default_rng((*seed, 1)).uniform(-stops, stops, count)
     passed = np.searchsorted(at, since_ns, side="right")
     out: F64 = np.where(passed % 2 == 1, level[passed - 1], 1.0)
     return out

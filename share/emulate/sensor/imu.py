@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from share.emulate.sensor.clock import unwrapped
 from share.emulate.sensor.draws import Seed
 from share.io.profile_types import Inertial
 from share.types import F64, I64, ImuBatch
@@ -20,23 +21,32 @@ Inertia = Callable[[I64], tuple[F64, F64]]  # stamps (N,) ns -> angular rate, sp
 
 @dataclass(frozen=True, eq=False)
 class ImuStreams:
-    """Two streams with stamps of their own, in the device's clock: gyro (N, 3) rad/s, accel (M, 3) m/s^2."""
+    """Two streams with stamps of their own, in the device's clock: gyro (N, 3) rad/s, accel (M, 3) m/s^2.
+    period_ns: after which its stamps wrap, 0 = never."""
 
     gyro_ns: I64
     gyro: F64
     accel_ns: I64
     accel: F64
+    period_ns: int = 0
 
     def joined(self) -> ImuBatch:
         """Six values at the gyroscope's stamps, the acceleration interpolated, as drivers do; without the
         stamps that lie outside the accelerometer's."""
-        both = (self.gyro_ns >= self.accel_ns[0]) & (self.gyro_ns <= self.accel_ns[-1])
-        at = self.gyro_ns[both]
-        origin = self.accel_ns[0]  # float64 holds differences exactly, not stamps
-        accel = np.stack(
-            [np.interp(at - origin, self.accel_ns - origin, column) for column in self.accel.T], axis=1
-        )
-        return ImuBatch(at, self.gyro[both], accel)
+        if not (len(self.gyro_ns) and len(self.accel_ns)):
+            return ImuBatch.empty()
+        gyro_ns, accel_ns = self._counted()
+        both = (gyro_ns >= accel_ns[0]) & (gyro_ns <= accel_ns[-1])
+        at, known = gyro_ns[both] - accel_ns[0], accel_ns - accel_ns[0]  # float64 holds these exactly
+        accel = np.stack([np.interp(at, known, column) for column in self.accel.T], axis=1)
+        return ImuBatch(self.gyro_ns[both], self.gyro[both], accel)
+
+    def _counted(self) -> tuple[I64, I64]:
+        """Stamps of both streams without wraps."""
+        gyro_ns, accel_ns = (unwrapped(stamps, self.period_ns) for stamps in (self.gyro_ns, self.accel_ns))
+        if self.period_ns:  # the two start within a period of the slower: nearer than half a wrap
+            accel_ns = accel_ns + self.period_ns * round((gyro_ns[0] - accel_ns[0]) / self.period_ns)
+        return gyro_ns, accel_ns
 
 
 def measured(

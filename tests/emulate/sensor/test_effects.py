@@ -1,0 +1,37 @@
+import dataclasses
+
+import pytest
+
+from share.emulate.sensor.effects import NONE, Effects, parse
+from share.errors import UsageError
+
+
+def test_words_change_single_effects():
+    effects = parse(["noise=off", "drops=0.02", "time_offset_ms=-8"])
+    assert effects == Effects(noise=False, drops=0.02, time_offset_ms=-8.0)
+    assert parse(["none", "noise=on"]) == dataclasses.replace(NONE, noise=True)
+    assert not any(value is True for value in dataclasses.asdict(NONE).values())
+
+
+@pytest.mark.parametrize(
+    ("word", "says"),
+    [
+        ("drop=0.1", "did you mean 'drops'"),
+        ("fog=1", "known: none, noise,"),
+        ("noise", "noise=on or noise=off"),
+        ("noise=0.5", "noise=on or noise=off"),
+        ("drops=many", "expected a number, found 'many'"),
+        ("drops=1", "must lie in 0 .. 0.9"),
+        ("drops=nan", "not finite"),
+        ("drop_burst=0.5", "must lie in 1 .. 20"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(word: str, says: str):
+    with pytest.raises(UsageError, match=r"^effect ") as refused:
+        parse([word])
+    assert says in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_value_of_another_type_is_refused():
+    with pytest.raises(UsageError, match="effect noise: expected on or off"):
+        Effects(noise=0.5)  # type: ignore[arg-type]

@@ -1,0 +1,101 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from share.emulate.sensor.imu import ImuStreams, bias_of, measured
+from share.io.profile import profile
+from share.io.profile_types import Inertial
+from share.metrics.allan import allan_deviation, fit
+
+D435I = profile("d435i", gyro_hz=200).device.imu
+EUROC = profile("euroc").device.imu
+SENSORS = {
+    "BMI055 gyro": D435I.gyro,
+    "BMI055 accel": D435I.accel,
+    "ADIS gyro": EUROC.gyro,
+    "ADIS accel": EUROC.accel,
+}
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_allan_deviation_of_rest_is_that_of_the_profile(name: str):
+    """1 h at rest, four times: sigma^2 = N^2 / tau + K^2 tau / 3 within 5 % of the root mean square over
+    axes and runs, from 1 ms-averages up to where an hour still holds enough spans to tell (tau = 100 s)."""
+    sensor = replace(SENSORS[name], step=0.0)
+    hour = int(3600 * sensor.rate_hz)
+    curves = [
+        allan_deviation(measured(np.zeros((hour, 3)), sensor, (seed,)), sensor.rate_hz) for seed in range(4)
+    ]
+    taus = curves[0].taus
+    seen = np.sqrt(np.mean([curve.deviation**2 for curve in curves], axis=(0, 2)))
+    stated = np.sqrt(sensor.density**2 / taus + sensor.walk**2 * taus / 3)
+    assert np.abs(seen / stated - 1)[taus < 100].max() < 0.05
+    found = [fit(curve) for curve in curves]
+    assert np.abs(np.mean([f.density for f in found]) / sensor.density - 1) < 0.01
+    assert np.abs(np.mean([f.walk for f in found]) / sensor.walk - 1) < 0.08
+
+
+def test_digits_add_what_theory_says_to_a_coarse_accelerometer():
+    """A 12-bit digit is of the noise's size: step^2 / 12 comes on top."""
+    sensor = D435I.accel
+    hour = int(3600 * sensor.rate_hz)
+    found = fit(allan_deviation(measured(np.zeros((hour, 3)), sensor, (0,)), sensor.rate_hz))
+    expected = np.sqrt(sensor.density**2 + sensor.step**2 / 12 / sensor.rate_hz)
+    assert np.abs(found.density / expected - 1).max() < 0.01
+
+
+def test_bias_starts_within_the_data_sheet_and_wanders():
+    starts = np.array([bias_of(D435I.gyro, 1, (seed,))[0] for seed in range(400)])
+    assert np.abs(starts).max() <= np.sqrt(3) * D435I.gyro.start_bias
+    assert abs(starts.std() / D435I.gyro.start_bias - 1) < 0.05
+    ends = np.array([np.ptp(bias_of(D435I.gyro, 2000, (seed,))[[0, -1]], axis=0) for seed in range(200)])
+    assert abs(np.sqrt((ends**2).mean()) / (D435I.gyro.walk * np.sqrt(10)) - 1) < 0.1
+
+
+def test_bias_instability_is_stationary_with_its_sigma_and_correlation():
+    sensor = Inertial(10, (10,), 10, 0, 0, 0, 0, instability=0.01, instability_s=5.0)
+    bias = np.concatenate([bias_of(sensor, 20_000, (seed,)) for seed in range(5)], axis=1)
+    assert abs(bias.std() / 0.01 - 1) < 0.05
+    assert abs(bias[:10].std() / 0.01 - 1) < 0.4
+    lag = (bias[50:] * bias[:-50]).mean() / bias.var()
+    assert abs(lag - np.exp(-1)) < 0.05
+    assert sensor.kalibr_walk == pytest.approx(0.01 * np.sqrt(2 / 5))
+
+
+def test_readings_saturate_and_come_in_digits():
+    spin = np.linspace(-30, 30, 3000)[:, None] * np.ones(3)
+    out = measured(spin, D435I.gyro, (0,), noise=False, bias=False)
+    assert np.abs(out).max() == pytest.approx(np.deg2rad(1000), rel=1e-4)
+    assert np.allclose(out / D435I.gyro.step, np.rint(out / D435I.gyro.step), atol=1e-6)
+    inside = np.abs(spin) < 17
+    assert np.abs(out - spin)[inside].max() <= D435I.gyro.step / 2 * 1.0001
+    assert np.array_equal(measured(spin, D435I.gyro, (0,), False, False, False), spin)
+
+
+def test_a_shorter_series_is_the_head_of_a_longer_one():
+    sensor = replace(D435I.gyro, instability=1e-4)
+    whole = measured(np.zeros((5000, 3)), sensor, (9,))
+    assert np.array_equal(measured(np.zeros((700, 3)), sensor, (9,)), whole[:700])
+    assert not np.allclose(measured(np.zeros((700, 3)), sensor, (8,)), whole[:700])
+
+
+def test_joined_stream_interpolates_acceleration_at_the_gyroscope_stamps_even_over_a_wrap():
+    wrap = 2**32 * 1000
+    gyro_ns = (wrap - 10**9 + 10**6 + np.arange(400, dtype=np.int64) * 5_000_000) % wrap
+    accel_true = wrap - 10**9 + np.arange(500, dtype=np.int64) * 4_000_000
+    accel = np.stack([np.sin((accel_true - wrap) * 1e-9 + k) for k in range(3)], axis=1)
+    gyro = np.arange(1200.0).reshape(400, 3)
+    batch = ImuStreams(gyro_ns, gyro, accel_true % wrap, accel, wrap).joined()
+    at = wrap - 10**9 + 10**6 + np.arange(len(batch)) * 5_000_000
+    assert len(batch) == 400 and np.array_equal(batch.stamps_ns, at % wrap)
+    assert np.array_equal(batch.gyro, gyro[: len(batch)])
+    truth = np.stack([np.sin((at - wrap) * 1e-9 + k) for k in range(3)], axis=1)
+    assert np.abs(batch.accel - truth).max() < 3e-6
+
+
+def test_joined_stream_ends_where_acceleration_is_no_longer_known():
+    gyro_ns, accel_ns = np.arange(0, 1000, 10), np.arange(35, 905, 20)
+    batch = ImuStreams(gyro_ns, np.zeros((100, 3)), accel_ns, np.zeros((len(accel_ns), 3))).joined()
+    assert batch.stamps_ns[0] == 40 and batch.stamps_ns[-1] == 890
+    assert len(ImuStreams(gyro_ns[:0], np.zeros((0, 3)), accel_ns, np.zeros((44, 3))).joined()) == 0
