@@ -32,13 +32,9 @@ def prepare(recipe: Recipe, work: Path, progress: Progress) -> tuple[Stage, tupl
     planned = plan(recipe.motions, furnish(recipe), recipe.seconds, recipe.seed)
     _check_names(recipe, planned)
     actors = tuple(_actor(agent, k, recipe) for k, agent in enumerate(planned.agents))
+    progress("making the room", 0, 1)
     room = work / _ROOM
-    if not room.exists():
-        progress("making the room", 0, 1)
-        growing = work / f"{_ROOM}.part"
-        growing.mkdir(exist_ok=True)
-        room_file.keep(planned.layout, {a.name: a.avatar.shapes for a in actors}, growing)
-        growing.rename(room)
+    room_file.keep(planned.layout, {a.name: a.avatar.shapes for a in actors}, room)
     notes = planned.notes + tuple(f"{a.name}: {note}" for a in planned.agents for note in a.notes)
     return Stage(room, actors), notes
 

@@ -12,11 +12,15 @@ from share.io.files import atomic_write
 
 PLAIN = "plain"
 _PLAIN_FILE = "plain.json"
+_GL_FILE = "room.json"  # of `share.emulate.world.files`
 
 
 def keep(layout: Layout, movers: dict[str, tuple[Shape, ...]], folder: Path) -> None:
-    """Draw pictures, bake light and write it all into `folder`."""
+    """Draw pictures, bake light and write it all as the new folder `folder`, unless that was done before."""
+    if (folder / _PLAIN_FILE).exists() or (folder / _GL_FILE).exists():
+        return
     if layout.name == PLAIN:
+        folder.mkdir(exist_ok=True)
         atomic_write(folder / _PLAIN_FILE, json.dumps({"seed": layout.seed, "size": layout.size}))
         return
     from share.emulate.world.build import build

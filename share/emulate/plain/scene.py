@@ -41,7 +41,7 @@ def _walls(room: F64) -> list[F64]:
     out = []
     for axis in range(3):
         for side in (0, 1):
-            wall = room + [[-_WALL], [_WALL]]
+            wall = room + np.array([[-_WALL], [_WALL]])
             wall[1 - side, axis] = room[side, axis]
             out.append(wall)
     return out
@@ -66,7 +66,7 @@ class PlainRenderer:
     def _caster(self, camera: Camera) -> Caster:
         if camera.distortion:
             raise UsageError(
-                "scene 'plain' has no lens distortion; take a profile without, such as d435i, or another scene"
+                "scene 'plain' has no lens distortion; take a profile without (d435i) or another scene"
             )
         if camera not in self._casters:
             self._casters[camera] = Caster(self._room, camera)
