@@ -44,7 +44,8 @@ def stack(rng: Rng, width: float, depth: float, height: float) -> Shape:
 
 
 def _column(rng: Rng, x: float, width: float, depth: float, height: float) -> list[Shape]:
-    out, z, w, d = [], 0.0, width, depth * rng.uniform(0.75, 1)
+    out: list[Shape] = []
+    z, w, d = 0.0, width, depth * rng.uniform(0.75, 1)
     while not out or z + 0.2 < height:
         h = min(rng.uniform(0.2, 0.5), max(height - z, 0.2))
         slack_x, slack_y = (width - w) / 2, (depth - d) / 2
@@ -56,7 +57,8 @@ def _column(rng: Rng, x: float, width: float, depth: float, height: float) -> li
 
 def load(rng: Rng, width: float, depth: float, height: float) -> list[Shape]:
     """What stands on one shelf: cartons of all sizes with gaps, at most `height` m high; may be empty."""
-    out, x = [], -width / 2 + rng.uniform(0.0, 0.15)
+    out: list[Shape] = []
+    x = -width / 2 + rng.uniform(0.0, 0.15)
     while True:
         w = rng.uniform(0.15, 0.6)
         if x + w > width / 2:

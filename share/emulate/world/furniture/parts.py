@@ -12,7 +12,16 @@ from share.emulate.world.mesh import Rng, Shape, box, concat, decal
 Point = Sequence[float]
 
 # Pictures of each kind that one room owns; two where nothing is said. Few, so that they fit in memory.
-VARIANTS = {"cardboard": 4, "steel": 4, "plastic": 4, "poster": 3, "sign": 3, "goods": 3, "label": 1}
+VARIANTS = {
+    "cardboard": 4,
+    "steel": 4,
+    "plastic": 4,
+    "poster": 5,
+    "sign": 5,
+    "goods": 3,
+    "notice": 3,
+    "label": 1,
+}
 
 
 def pick(rng: Rng, kind: str) -> Material:

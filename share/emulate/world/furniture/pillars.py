@@ -16,7 +16,7 @@ def concrete(rng: Rng, side: float, height: float) -> Shape:
     out = [block((0, 0, 0), (side, side, height), pick(rng, "concrete"), rng)]
     for x in (-1, 1):
         for y in (-1, 1):
-            low = np.array([x * half, y * half, 0.02]) + [-0.05 * (x > 0), -0.05 * (y > 0), 0]
+            low = np.array([x * half - 0.05 * (x > 0), y * half - 0.05 * (y > 0), 0.02])
             low += 0.008 * np.array([x, y, 0])
             out.append(box(low, low + np.array([0.05, 0.05, 1.2]), guard, rng))
     for turn in range(4):

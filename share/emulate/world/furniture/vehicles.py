@@ -49,12 +49,11 @@ def _wheel(x: float, y: float, radius: float, wide: float, rng: Rng) -> Shape:
 def _arch(x: float, y: float, radius: float) -> Shape:
     """The dark half disc above a wheel, on a side at x."""
     angle = np.linspace(0, np.pi, 9)
-    ring = np.column_stack(
-        [0 * angle, y + np.cos(angle) * radius * 1.15, radius * 0.55 + np.sin(angle) * radius * 1.1]
-    )
+    high = radius * 1.12
+    ring = np.column_stack([0 * angle, y + np.cos(angle) * high * 1.05, radius * 1.1 + np.sin(angle) * high])
     if x < 0:
         ring = ring[::-1]
-    return polygon(ring + [x + np.sign(x) * 0.004, 0, 0], Material("rubber"))
+    return polygon(ring + np.array([x + np.sign(x) * 0.004, 0, 0]), Material("rubber"))
 
 
 def _pane(x: float, y: float, z: float, wide: float, high: float, rng: Rng, kind: str = "glass") -> Shape:

@@ -15,11 +15,11 @@ import numpy as np
 from share.emulate.world.furniture import barrels, doors, hoses, lockers, pipes, shelving, signs, tables
 from share.emulate.world.layout import Layout, Light, Piece
 from share.emulate.world.materials import Material
-from share.emulate.world.mesh import Rng, concat, quad
+from share.emulate.world.mesh import decal, quad
 from share.emulate.world.scenes import fill
 from share.emulate.world.scenes.fill import Maker
-from share.emulate.world.scenes.plan import Plan, Size, Wall, outer_walls
-from share.emulate.world.scenes.shell import enclose, skirting
+from share.emulate.world.scenes.plan import Plan, Size, Wall, Walls, outer_walls
+from share.emulate.world.scenes.shell import skirting, surface
 from share.types import F64
 
 
@@ -46,7 +46,8 @@ def corridor_twins(seed: int, size: Size) -> Layout:
     plan = Plan("corridor-twins", seed, size, rng)
     _, _, T = twins(size)
     walls, inner = outer_walls(size), _core(size)
-    _shell(plan, (*walls, *inner))
+    _shell(plan, walls, inner)
+    _threshold(plan)
     made, lit = len(plan.pieces), len(plan.lights)
     _corridor(plan, walls[0], inner[0])
     plan.pieces += [_turned(p, T, len(plan.pieces) + k) for k, p in enumerate(plan.pieces[made:])]
@@ -54,40 +55,49 @@ def corridor_twins(seed: int, size: Size) -> Layout:
     plan.lights += [_turned_light(light, T) for light in plan.lights[lit:]]
     for outer, core in ((walls[1], inner[1]), (walls[3], inner[3])):
         _passage(plan, outer, core)
-    _differences(plan, walls, inner)
+    _differences(plan, inner)
     return plan.done(ambient=0.3)
 
 
-def _core(size: Size) -> tuple[Wall, Wall, Wall, Wall]:
+def _core(size: Size) -> Walls:
     """The walls of the core, seen from outside it: north, east, south, west."""
     x, y, z = size
     wide, end = widths(size)
-    (l, b), (r, t) = (end, wide), (x - end, y - wide)
+    (west, south), (east, north) = (end, wide), (x - end, y - wide)
     return (
-        Wall(r, t, np.pi, r - l, z),
-        Wall(r, b, np.pi / 2, t - b, z),
-        Wall(l, b, 0, r - l, z),
-        Wall(l, t, -np.pi / 2, t - b, z),
+        Wall(east, north, np.pi, east - west, z),
+        Wall(east, south, np.pi / 2, north - south, z),
+        Wall(west, south, 0, east - west, z),
+        Wall(west, north, -np.pi / 2, north - south, z),
     )
 
 
-def _shell(plan: Plan, walls: tuple[Wall, ...]) -> None:
-    """The same paint on all walls, no seams that could tell one place from another."""
-    rng, z = plan.rng, plan.size[2]
-    low, high = Material("plaster", 0, gray=150), Material("plaster", 1)
-    edge = rng.uniform(0.9, 1.2)
+def _shell(plan: Plan, outer: Walls, inner: Walls) -> None:
+    """One half of walls, floor and ceiling, and the same turned: nothing tells one half from the other."""
+    rng, (x, y, z), T = plan.rng, plan.size, twins(plan.size)[2]
+    paint = [(z, Material("plaster"))]
     floor = Material(str(rng.choice(["tiles", "planks", "carpet"])))
-    enclose(plan, [(z, high)], floor, Material("ceiling"))
-    del low, edge
-    for wall in walls[4:]:
-        plan.build("core", wall.put(quad((0, 0, 0), (wall.length, 0, 0), (0, 0, z), high, rng), 0))
-    skirting(plan, walls)
+    half = [surface(wall, paint, rng) for wall in (*outer[:2], *inner[:2])]
+    half.append(quad((0, y / 2, 0), (x, 0, 0), (0, y / 2, 0), floor, rng))
+    half.append(quad((0, y, z), (x, 0, 0), (0, -y / 2, 0), Material("ceiling"), rng))
+    for shape in half:
+        plan.build("shell", shape)
+        plan.build("shell", shape.moved(T))
+    skirting(plan, (*outer, *inner))
+
+
+def _threshold(plan: Plan) -> None:
+    """A metal strip in the floor of each passage, where the halves meet."""
+    (x, y, _), (_, end) = plan.size, widths(plan.size)
+    for left in (0.0, x - end):
+        strip = decal((left, y / 2 - 0.02, 0), (end, 0, 0), (0, 0.04, 0), Material("galvanised"), proud=0.002)
+        plan.lay("threshold", strip)
 
 
 def _corridor(plan: Plan, outer: Wall, inner: Wall) -> None:
     """Doors every 3 m on both sides, lamps, furniture along the outer wall."""
     rng, (wide, end) = plan.rng, widths(plan.size)
-    z, length = plan.size[2], inner.length
+    length = inner.length
     count = max(2, int(length / 3.2))
     for k in range(count):
         at = length * (k + 0.5) / count
@@ -101,7 +111,6 @@ def _corridor(plan: Plan, outer: Wall, inner: Wall) -> None:
         fill.hang(plan, wall, _HANGINGS, int(0.9 * length), 2.0)
     xs = [end + length * (k + 0.5) / count for k in range(count)]
     fill.light_tubes(plan, xs, [plan.size[1] - wide / 2], 1.2, 0.0)
-    del z
 
 
 _FURNITURE: dict[str, tuple[float, Maker]] = {
@@ -132,18 +141,14 @@ def _passage(plan: Plan, outer: Wall, core: Wall) -> None:
     fill.along(plan, outer, _FURNITURE, (0.4, 1.6))
     for wall in (outer, core):
         fill.hang(plan, wall, _HANGINGS, int(wall.length), 2.0)
-    at = core.put(
-        concat([quad((-0.01, -1.3, 0), (0.02, 0, 0), (0, 0, 1), Material("paint"))]), core.length / 2
-    )
-    x, y = at.bounds[:, :2].mean(0)
-    fill.light_tubes(plan, [float(x)], [float(y)], 1.2, 0.0)
+    x, y = outer.point(outer.length / 2, widths(plan.size)[1] / 2)
+    fill.light_tubes(plan, [x], [y], 1.2, 0.0)
 
 
-def _differences(plan: Plan, walls: tuple[Wall, ...], inner: tuple[Wall, ...]) -> None:
+def _differences(plan: Plan, inner: Walls) -> None:
     """One small thing more on each side, so that the truth can be told by looking closely."""
     for wall in (inner[0], inner[2]):
         fill.hang(plan, wall, {"notice": (1, signs.notice)}, 1, 1.7)
-    del walls
 
 
 def _turned(piece: Piece, T: F64, number: int) -> Piece:
@@ -160,6 +165,3 @@ def _turned_light(light: Light, T: F64) -> Light:
     x, y, z = T[:3, :3] @ light.position + T[:3, 3]
     fx, fy, fz = T[:3, :3] @ light.facing
     return replace(light, position=(float(x), float(y), float(z)), facing=(float(fx), float(fy), float(fz)))
-
-
-_ = Rng

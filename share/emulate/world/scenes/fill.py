@@ -60,12 +60,12 @@ def centred(plan: Plan, wall: Wall, name: str, shape: Shape, at: float, clear: f
         return False
     if clear:
         _, wide = shape.bounds[:, 0]
-        front = wall.put(_keep(float(wide), clear), at).bounds
-        plan.reserve(tuple(front[0]), tuple(front[1]))  # type: ignore[arg-type]
+        plan.reserve(wall.put(_keep(float(wide), clear), at).bounds)
     return True
 
 
 def _keep(half: float, clear: float) -> Shape:
+    """The place before something `half` m to each side of its middle."""
     return box((-half, -clear - 0.4, 0), (half, -0.4, 2.0), Material("paint"))
 
 
@@ -109,8 +109,8 @@ def daylight(plan: Plan, wall: Wall, at: float, low: float, shape: Shape, power:
         return False
     width, height = float(np.ptp(shape.bounds[:, 0])), float(np.ptp(shape.bounds[:, 2]))
     c, s = float(np.cos(wall.yaw)), float(np.sin(wall.yaw))
-    x, y = wall.x + c * at + 0.12 * s, wall.y + s * at - 0.12 * c
-    plan.lights.append(Light((x, y, low + height / 2), power, (width, height), (s, -c, 0.0)))
+    middle = (*wall.point(at, 0.12), low + height / 2)
+    plan.lights.append(Light(middle, power, (width, height), (s, -c, 0.0)))
     return True
 
 

@@ -11,6 +11,7 @@ from share.emulate.world.mesh import Rng, Shape
 from share.types import F64
 
 Size = tuple[float, float, float]
+Walls = tuple["Wall", "Wall", "Wall", "Wall"]
 
 _TOUCH = 1e-4  # m; nearer than this, things only touch
 
@@ -28,11 +29,15 @@ class Wall:
 
     def put(self, shape: Shape, at: float, z: float = 0.0, away: float = 0.0) -> Shape:
         """`shape` with its middle `at` m along the wall, `z` m up and its back `away` m off it."""
-        c, s = np.cos(self.yaw), np.sin(self.yaw)
-        return shape.at(self.x + c * at + s * away, self.y + s * at - c * away, z, self.yaw)
+        return shape.at(*self.point(at, away), z, self.yaw)
+
+    def point(self, at: float, away: float) -> tuple[float, float]:
+        """The place (x, y) m before the wall, `at` m along it and `away` m off it."""
+        c, s = float(np.cos(self.yaw)), float(np.sin(self.yaw))
+        return self.x + c * at + s * away, self.y + s * at - c * away
 
 
-def outer_walls(size: Size) -> tuple[Wall, Wall, Wall, Wall]:
+def outer_walls(size: Size) -> Walls:
     """North, east, south, west, seen from inside."""
     x, y, z = size
     return (
@@ -84,9 +89,9 @@ class Plan:
         """Where it is, without asking: paint on a floor, a plate on something that was placed."""
         self.pieces.append(Piece(f"{name} {len(self.pieces)}", shape, solid))
 
-    def reserve(self, low: tuple[float, float, float], high: tuple[float, float, float]) -> None:
-        """Keep a box free of whatever comes later."""
-        self.taken.append(np.array([low, high], float))
+    def reserve(self, bounds: F64) -> None:
+        """Keep a box (2, 3) m free of whatever comes later."""
+        self.taken.append(bounds)
 
     def done(self, ambient: float = 0.15) -> Layout:
         """The room as data."""

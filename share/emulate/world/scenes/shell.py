@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -21,10 +22,13 @@ def bays(length: float, pitch: float = BAY) -> list[float]:
     return [length * k / count for k in range(1, count)]
 
 
-def surface(wall: Wall, bands: Sequence[tuple[float, Material]], rng: Rng) -> Shape:
-    """The wall itself, bay by bay, in horizontal bands: (upper edge m, material), lowest first."""
-    edges, out = [0.0, *bays(wall.length), wall.length], []
-    for left, right in zip(edges, edges[1:], strict=False):
+Bands = Sequence[tuple[float, Material]]  # of a wall, lowest first: (upper edge m, material)
+
+
+def surface(wall: Wall, bands: Bands, rng: Rng, pitch: float = np.inf) -> Shape:
+    """The wall itself, in bays of about `pitch` m that repeat nowhere; the joints between them show."""
+    edges, out = [0.0, *bays(wall.length, pitch), wall.length], []
+    for left, right in pairwise(edges):
         low = 0.0
         for high, skin in bands:
             out.append(quad((left, 0, low), (right - left, 0, 0), (0, 0, high - low), skin, rng))
@@ -32,13 +36,13 @@ def surface(wall: Wall, bands: Sequence[tuple[float, Material]], rng: Rng) -> Sh
     return wall.put(concat(out), 0)
 
 
-def enclose(plan: Plan, bands: Sequence[tuple[float, Material]], floor: Material, ceiling: Material) -> None:
-    """The four walls, the floor and the ceiling."""
+def enclose(plan: Plan, bands: Bands, floor: Material, ceiling: Material, pitch: float = np.inf) -> None:
+    """The four walls in bays of `pitch` m, the floor in slabs, the ceiling."""
     x, y, z = plan.size
     for wall in outer_walls(plan.size):
-        plan.build("wall", surface(wall, bands, plan.rng))
+        plan.build("wall", surface(wall, bands, plan.rng, pitch))
     plan.build("floor", panels((0, 0, 0), (x, 0, 0), (0, y, 0), [floor], BAY, plan.rng))
-    plan.build("ceiling", panels((0, y, z), (x, 0, 0), (0, -y, 0), [ceiling], BAY, plan.rng))
+    plan.build("ceiling", panels((0, y, z), (x, 0, 0), (0, -y, 0), [ceiling], min(pitch, 1e3), plan.rng))
 
 
 def joints(plan: Plan) -> None:

@@ -27,7 +27,7 @@ from share.emulate.world.mesh import Rng, Shape
 from share.emulate.world.scenes import fill
 from share.emulate.world.scenes.fill import Maker
 from share.emulate.world.scenes.plan import Plan, Size, Wall, outer_walls
-from share.emulate.world.scenes.shell import bays, columns, enclose, girders, joints
+from share.emulate.world.scenes.shell import BAY, bays, columns, enclose, girders, joints
 
 _ROW = 0.85  # m; depth of a row of islands
 _GIRDER = 0.3
@@ -52,7 +52,9 @@ def _shell(plan: Plan, walls: tuple[Wall, ...]) -> None:
     rng, z = plan.rng, plan.size[2]
     lower = pick(rng, str(rng.choice(["block", "brick", "concrete"])))
     upper = pick(rng, str(rng.choice(["corrugated", "panel", "block", "plaster"])))
-    enclose(plan, [(rng.uniform(1.8, 2.6), lower), (z, upper)], Material("screed"), Material("corrugated", 0))
+    enclose(
+        plan, [(rng.uniform(1.8, 2.6), lower), (z, upper)], Material("screed"), Material("corrugated", 0), BAY
+    )
     joints(plan)
     columns(plan, walls)
     girders(plan, _GIRDER)
@@ -63,7 +65,7 @@ def _openings(plan: Plan, walls: tuple[Wall, ...]) -> None:
     rng, z = plan.rng, plan.size[2]
     order = rng.permutation(4)
     first, second = walls[order[0]], walls[order[1]]
-    width = float(min(rng.uniform(2.2, 2.6), _bay(first) - 0.6))
+    width = float(min(rng.uniform(2.2, 2.6), _bay(first) - 0.9))
     fill.centred(plan, first, "roller door", doors.roller(rng, width, 2.6), _middle(rng, first), 1.2)
     fill.centred(plan, second, "door", doors.door(rng), _middle(rng, second), 1.2)
     for k in order[1:]:
@@ -177,8 +179,7 @@ def _row(plan: Plan, y: float, left: float, right: float, longest: float) -> Non
 
 def _island(plan: Plan, left: float, right: float, y: float) -> float:
     """Racks end to end, or things on pallets, from `left` as far as `right` allows; where it ended."""
-    rng, front = plan.rng, -np.pi / 2
-    del front
+    rng = plan.rng
     racks = rng.random() < (0.35 if right - left < 2 else 0.7)
     while right - left > 0.6:
         if racks and right - left >= 1.0:
