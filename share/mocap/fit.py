@@ -77,8 +77,7 @@ def fit(imu: ImuBatch, noise: ImuNoise, mocap: Mocap, options: FitOptions | None
     near = _overlap(imu, mocap.shifted(coarse_ns))
     guess, bias = _mounting(imu, near, options)
     nodes, breaks = _nodes(near, options)
-    seen = near.between(int(nodes[0]) + _EDGE_NS, int(nodes[-1]) - _EDGE_NS)
-    batch = Batch(imu, inflated, seen, breaks, guess, options)
+    batch = Batch(imu, inflated, _inner(near, nodes, breaks), breaks, guess, options)
     return _report(batch, batch.minimise(first_state(nodes, imu, near, guess, bias)), coarse_ns)
 
 
@@ -121,21 +120,29 @@ def _nodes(mocap: Mocap, options: FitOptions) -> tuple[I64, np.ndarray]:
     return nodes, np.diff(nodes) > options.break_s * 1e9
 
 
+def _inner(mocap: Mocap, nodes: I64, breaks: np.ndarray) -> Mocap:
+    """The mocap, less what the offset may yet carry beyond the ends of the chain or of its parts."""
+    t = mocap.stamps_ns
+    ends = np.concatenate([nodes[:1], nodes[:-1][breaks], nodes[1:][breaks], nodes[-1:]])
+    near_end = np.abs(t[:, None] - ends).min(1) < _EDGE_NS
+    inside = np.isin(np.searchsorted(nodes, t, "right") - 1, np.flatnonzero(~breaks))
+    keep = inside & ~near_end
+    return Mocap(t[keep], mocap.T[keep])
+
+
 def _report(batch: Batch, solved: Solved, coarse_ns: int) -> Fit:
     state, options = solved.state, batch.options
     trusted = solved.weight > _TRUSTED
+    if trusted.mean() < 0.5:
+        raise MisfitError(_apart(f"{100 * (1 - trusted.mean()):.0f} % of the mocap's poses are elsewhere"))
     dt = np.diff(state.stamps_ns)[~batch.breaks] * 1e-9
     sigma = np.repeat([options.sigma_rotation, options.sigma_position], 3)
     off = np.linalg.norm((solved.seen.residual * sigma).reshape(-1, 2, 3), axis=2)
     left = residuals(
         solved.chain.without(batch.breaks), dt, options.imu_inflation, off[:, 1], off[:, 0], trusted
     )
-    if not left.position_mm < _WORST_MM or trusted.mean() < 0.5:
-        raise MisfitError(
-            f"mocap and IMU do not tell of one motion: {left.position_mm:.0f} mm apart, "
-            f"{100 * left.doubted:.0f} % of the mocap doubted; check units (m), clocks, "
-            "and that both are of one body"
-        )
+    if not left.position_mm < _WORST_MM:
+        raise MisfitError(_apart(f"{left.position_mm:.0f} mm rms are left"))
     offset_ns = coarse_ns + round(state.offset_s * 1e9)
     at = batch.mocap.stamps_ns[trusted] + round(state.offset_s * 1e9)
     covs = node_covariances(solved.normal, solved.cov_shared)
@@ -154,6 +161,13 @@ def _report(batch: Batch, solved: Solved, coarse_ns: int) -> Fit:
         cov_poses=_right(state.R, covs[:, :6, :6]),
         residuals=left,
         gravity=options.gravity,
+    )
+
+
+def _apart(what: str) -> str:
+    return (
+        f"mocap and IMU do not tell of one motion: {what}; check units (m, rad/s, m/s^2), "
+        "and that both are of one body"
     )
 
 

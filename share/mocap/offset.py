@@ -29,6 +29,8 @@ def coarse_offset(imu: ImuBatch, mocap: Mocap, within_s: float | None) -> int:
     """
     a, a_ok, a_start = _on_grid(*imu_turning(imu))
     b, b_ok, b_start = _on_grid(*mocap_turning(mocap))
+    possible = b <= 1.5 * a.max()  # the body never turned faster: an outlier of the mocap did
+    b, b_ok = b * possible, b_ok * possible
     score = _masked_correlation(a, a_ok, b, b_ok)
     lags = np.arange(len(score)) - (len(b) - 1)  # a[i + lag] belongs to b[i]
     offsets = (a_start - b_start) + lags * _STEP_NS
@@ -37,8 +39,8 @@ def coarse_offset(imu: ImuBatch, mocap: Mocap, within_s: float | None) -> int:
     best = int(score.argmax())
     if score[best] < _LEAST_CORRELATION:
         raise MisfitError(
-            f"mocap and IMU turn nowhere alike (correlation {max(score[best], 0):.2f} of "
-            f"{_LEAST_CORRELATION} needed); are they of one recording and one body, and does it turn enough?"
+            f"mocap and IMU turn nowhere alike (correlation {score[best]:.2f} of {_LEAST_CORRELATION} "
+            "needed); are both of one recording, the clocks as near as was said, and does the body turn?"
         )
     return int(offsets[best] + round(_peak(score, best) * _STEP_NS))
 

@@ -22,18 +22,20 @@ def hand_eye(imu: ImuBatch, mocap: Mocap) -> tuple[F64, F64]:
 
     Raises DataError if the body turned about one axis only.
     """
-    times, turned = mocap_turning(mocap)
-    own, gyro = imu_turning(imu)
+    times, seen = mocap_turning(mocap)
+    own, felt = imu_turning(imu)
     keep = (times >= own[0]) & (times <= own[-1])
-    times, turned = times[keep], turned[keep]
-    rates = ImuBatch(own, gyro, np.zeros_like(gyro))
-    spread = np.linalg.svd(turned - turned.mean(0), compute_uv=False) / np.sqrt(max(len(times), 1))
+    felt = sampled(ImuBatch(own, felt, felt), times[keep], felt)
+    seen = seen[keep]
+    spread = np.linalg.svd(felt - felt.mean(0), compute_uv=False) / np.sqrt(max(len(felt), 1))
     if spread[1] < _LEAST_TURN * WINDOW_NS * 1e-9:
         raise DataError(
             "mocap and IMU: the body turned about one axis only, so how the mocap's body sits on it cannot "
             "be found; turn it about two axes, or give T_body_mocap"
         )
-    T = umeyama(turned, sampled(rates, times, rates.gyro))
+    like = np.abs(np.linalg.norm(seen, axis=1) - np.linalg.norm(felt, axis=1))
+    like = like <= 3 * np.median(like)  # an outlier of the mocap turns by something else
+    T = umeyama(seen[like], felt[like])
     return T[:3, :3], T[:3, 3] / (WINDOW_NS * 1e-9)
 
 
