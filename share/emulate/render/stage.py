@@ -1,0 +1,167 @@
+"""What OpenGL holds of a room, and the passes over it: one image, one depth, one map of triangles.
+
+Every pass is of an undistorted camera, one sample a pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from share.emulate.render import context, shaders
+from share.emulate.render.surface import Surface, surface
+from share.emulate.render.view import U16, projection
+from share.emulate.types import I32, Mesh, Moment, Room
+from share.geometry.camera import Camera
+from share.geometry.se3 import inverse
+from share.types import F32, F64
+
+STEPS = 64.0  # stored steps in a gray level: 16 bits hold up to 1023 gray levels
+FINER = -1.0  # level of detail of a sample that is a quarter of a pixel
+_FULL_LIGHT = 100.0  # in the light map
+_LAMP = np.array([0.12, 0.08, 0.22])  # direction and strength of the movers' fixed shading, world frame
+_COLUMNS = {"position": 3, "normal": 3, "uv": 2, "layer": 1, "light_uv": 2}  # of a vertex, float32
+
+
+class Stage:
+    """Raises RenderError where this machine cannot draw."""
+
+    def __init__(self, room: Room) -> None:
+        self._gl = gl = context.create()
+        self._far = 2.0 * float(np.linalg.norm(room.size)) + 10.0  # from anywhere near to anything in it
+        self._depth = gl.program(shaders.FACE_VERTEX, shaders.DEPTH_FRAGMENT)
+        self._face = gl.program(shaders.FACE_VERTEX, shaders.FACE_FRAGMENT)
+        self._images = {bias: self._image_programs(room, bias) for bias in (0.0, FINER)}
+        self._room = self._piece(0, room.mesh, room.light_uv)
+        self._movers = {name: [self._piece(1, part) for part in parts] for name, parts in room.movers.items()}
+        self._textures = _textures(gl, room)
+        self._targets: dict[tuple[int, int, str], Any] = {}
+        gl.enable(gl.DEPTH_TEST)
+
+    @property
+    def device(self) -> str:
+        """What draws: other drivers give other bytes."""
+        return f"{self._gl.info['GL_RENDERER']}, {self._gl.info['GL_VERSION']}"
+
+    def image(self, camera: Camera, moment: Moment, lod_bias: float) -> U16:
+        """(H, W) in 1 / STEPS gray levels; pictures are low-passed to a pixel, times 2 ** lod_bias."""
+        target = self._target(camera, "nu2")
+        room, mover = self._images[lod_bias]
+        lamp = _LAMP @ moment.T_world_cam[:3, :3]
+        for piece, T in self._pieces(moment):
+            program = room if piece is self._room else mover
+            if program is mover:
+                program["lamp"] = tuple(T[:3, :3] @ lamp)
+            self._draw(piece, program, camera, T, piece.surface.visible(camera, T))
+        out: U16 = _read(target, camera, "nu2", np.uint16)
+        return out
+
+    def depth(self, camera: Camera, moment: Moment) -> F32:
+        """(H, W) m along the optical axis, 0 where nothing is."""
+        target = self._target(camera, "f4")
+        self._depth["focal"], self._depth["centre"] = (camera.fx, camera.fy), (camera.cx, camera.cy)
+        for piece, T in self._pieces(moment):
+            chunks = piece.surface.visible(camera, T)
+            slopes = piece.surface.slopes(chunks, T)
+            piece.slopes.orphan()
+            piece.slopes.write(np.pad(slopes, ((0, 0), (0, 1))).astype(np.float32))
+            piece.slopes.bind_to_storage_buffer(0)
+            self._draw(piece, self._depth, camera, T, chunks)
+        out: F32 = _read(target, camera, "f4", np.float32)
+        return out
+
+    def faces(self, camera: Camera, moment: Moment) -> tuple[I32, F64, F64]:
+        """Which triangle is seen (H, W), 0 for none; then of each triangle slopes (T, 3), see `Surface`,
+        and corners (T, 3, 3) m in the camera frame."""
+        target = self._target(camera, "i4")
+        slopes, corners, count = [np.zeros((1, 3))], [np.zeros((1, 3, 3))], 1
+        for piece, T in self._pieces(moment):
+            chunks = piece.surface.visible(camera, T)
+            self._face["first"] = count
+            self._draw(piece, self._face, camera, T, chunks)
+            slopes.append(piece.surface.slopes(chunks, T))
+            corners.append((piece.surface.corners[chunks].reshape(-1, 3, 3) - T[:3, 3]) @ T[:3, :3])
+            count += len(slopes[-1])
+        return _read(target, camera, "i4", np.int32), np.concatenate(slopes), np.concatenate(corners)
+
+    def _pieces(self, moment: Moment) -> Iterator[tuple[_Piece, F64]]:
+        """All there is, with T_piece_cam."""
+        for name, poses in moment.movers.items():
+            for piece, T_world_part in zip(self._movers[name], poses, strict=True):
+                yield piece, inverse(T_world_part) @ moment.T_world_cam
+        yield self._room, moment.T_world_cam
+
+    def _draw(self, piece: _Piece, program: Any, camera: Camera, T_piece_cam: F64, chunks: Any) -> None:
+        if not len(chunks):
+            return
+        faces = piece.surface.faces[chunks]
+        piece.indices.orphan()
+        piece.indices.write(faces)
+        program["turn"].write(T_piece_cam[:3, :3].astype("f4").tobytes())  # by columns: the transpose
+        program["origin"] = tuple(T_piece_cam[:3, 3])
+        program["projection"].write(projection(camera, self._far).T.astype("f4").tobytes())
+        piece.arrays[program].render(vertices=faces.size)
+
+    def _target(self, camera: Camera, dtype: str) -> Any:
+        key = camera.width, camera.height, dtype
+        if key not in self._targets:
+            size = key[:2]
+            color = self._gl.texture(size, 1, dtype=dtype)
+            self._targets[key] = self._gl.framebuffer([color], self._gl.depth_renderbuffer(size))
+        target = self._targets[key]
+        target.use()
+        target.clear()
+        return target
+
+    def _image_programs(self, room: Room, lod_bias: float) -> tuple[Any, Any]:
+        """One for the room, one for movers."""
+        stored = 255 * STEPS / 65535
+        of_room = self._gl.program(shaders.ROOM_VERTEX, shaders.room_fragment(lod_bias))
+        of_room["pictures"], of_room["light_map"], of_room["gain"] = 0, 1, stored * 255 / _FULL_LIGHT
+        of_mover = self._gl.program(shaders.MOVER_VERTEX, shaders.mover_fragment(lod_bias))
+        of_mover["pictures"], of_mover["gain"], of_mover["light"] = 0, stored, room.mover_light
+        return of_room, of_mover
+
+    def _piece(self, kind: int, mesh: Mesh, light_uv: F32 | None = None) -> _Piece:
+        programs = [self._depth, self._face, *(pair[kind] for pair in self._images.values())]
+        return _Piece(self._gl, programs, mesh, light_uv)
+
+
+class _Piece:
+    """A surface as OpenGL holds it."""
+
+    def __init__(self, gl: Any, programs: list[Any], mesh: Mesh, light_uv: F32 | None) -> None:
+        self.surface: Surface = surface(mesh)
+        light = np.zeros((len(mesh.vertices), 2), np.float32) if light_uv is None else light_uv
+        columns = (mesh.vertices, mesh.normals, mesh.uv, mesh.layer[:, None], light)
+        vertices = gl.buffer(np.concatenate(columns, axis=1).astype("f4").tobytes())
+        self.indices = gl.buffer(reserve=self.surface.faces.nbytes, dynamic=True)
+        self.slopes = gl.buffer(reserve=self.surface.faces.nbytes // 3 * 4, dynamic=True)
+        self.arrays = {program: _array(gl, program, vertices, self.indices) for program in programs}
+
+
+def _array(gl: Any, program: Any, vertices: Any, indices: Any) -> Any:
+    layout = " ".join(f"{n}f" if name in program else f"{4 * n}x" for name, n in _COLUMNS.items())
+    names = [name for name in _COLUMNS if name in program]
+    return gl.vertex_array(program, [(vertices, layout, *names)], indices)
+
+
+def _textures(gl: Any, room: Room) -> tuple[Any, Any]:
+    """Pictures at unit 0, repeated and mip-mapped, trilinear (Williams 1983); the light map at unit 1."""
+    layers, height, width = room.pictures.shape
+    pictures = gl.texture_array((width, height, layers), 1, np.ascontiguousarray(room.pictures), alignment=1)
+    pictures.build_mipmaps()
+    pictures.filter = (gl.LINEAR_MIPMAP_LINEAR, gl.LINEAR)
+    light = gl.texture(room.light_map.shape[::-1], 1, np.ascontiguousarray(room.light_map), alignment=1)
+    light.filter, light.repeat_x, light.repeat_y = (gl.LINEAR, gl.LINEAR), False, False
+    pictures.use(0)
+    light.use(1)
+    return pictures, light
+
+
+def _read(target: Any, camera: Camera, stored: str, dtype: Any) -> Any:
+    out = np.empty((camera.height, camera.width), dtype)
+    target.read_into(out, components=1, dtype=stored, alignment=1)
+    return out
