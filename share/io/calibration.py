@@ -56,8 +56,8 @@ def kalibr(chain: Section, imu: Section | None) -> Calibration:
     cam0 = chain.section("cam0")
     rig = Rig(
         cam0=_camera(cam0),
-        T_body_cam0=_kalibr_T_imu_cam(cam0) if imu else np.eye(4),
-        imu=_imu_noise(imu, "update_rate") if imu else None,
+        T_body_cam0=kalibr_T_imu_cam(cam0) if imu else np.eye(4),
+        imu=imu_noise(imu, "update_rate") if imu else None,
     )
     if "cam1" in cams:
         T_cam1_cam0 = _kalibr_T_cam1_cam0(cam0, cams["cam1"])
@@ -98,7 +98,7 @@ def read_euroc(cam0: Path, cam1: Path | None, imu0: Path | None) -> Calibration:
     if imu0:
         imu = read_yaml(imu0)
         T_imu_cam0 = se3.inverse(imu.pose("T_BS")) @ T_b_cam0
-        rig = replace(rig, imu=_imu_noise(imu, "rate_hz"), T_body_cam0=T_imu_cam0)
+        rig = replace(rig, imu=imu_noise(imu, "rate_hz"), T_body_cam0=T_imu_cam0)
     return Calibration(rig, str(cam0))
 
 
@@ -145,7 +145,9 @@ def _distortion(section: Section) -> tuple[float, ...]:
     return tuple(section.numbers(key, (4, 5)))
 
 
-def _imu_noise(section: Section, rate: str) -> ImuNoise:
+def imu_noise(section: Section, rate: str) -> ImuNoise:
+    """An IMU's noise by Kalibr's keys; `rate` is the key of its rate in Hz. Raises ConfigError."""
+
     def positive(key: str) -> float:
         return section.number(key, positive=True)
 
@@ -158,7 +160,7 @@ def _imu_noise(section: Section, rate: str) -> ImuNoise:
     )
 
 
-def _kalibr_T_imu_cam(cam: Section) -> F64:
+def kalibr_T_imu_cam(cam: Section) -> F64:
     """`T_cam_imu` takes IMU coordinates to the camera (Kalibr's own); `T_imu_cam` the other way."""
     if "T_cam_imu" in cam:
         return se3.inverse(cam.pose("T_cam_imu"))
@@ -173,4 +175,4 @@ def _kalibr_T_cam1_cam0(cam0: Section, cam1: Section) -> F64:
         return cam1.pose("T_cn_cnm1")
     if not ({"T_cam_imu", "T_imu_cam"} & cam1.data.keys()):
         raise ConfigError(f"{cam1.where}: has no extrinsics to cam0; add T_cn_cnm1, T_cam_imu or T_imu_cam")
-    return se3.inverse(_kalibr_T_imu_cam(cam1)) @ _kalibr_T_imu_cam(cam0)
+    return se3.inverse(kalibr_T_imu_cam(cam1)) @ kalibr_T_imu_cam(cam0)

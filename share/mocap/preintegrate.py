@@ -48,7 +48,8 @@ def preintegrate(
     n = len(start_ns)
     dR: F64 = np.tile(np.eye(3), (n, 1, 1))
     dp, dv = np.zeros((n, 3)), np.zeros((n, 3))
-    D, P = np.zeros((n, 9, 6)), np.zeros((n, 9, 9))
+    D: F64 = np.zeros((n, 9, 6))
+    P: F64 = np.zeros((n, 9, 9))
     for k in range(step.shape[1]):
         t = step[:, k, None]
         w, a = (gyro[:, k] + gyro[:, k + 1]) / 2, (accel[:, k] + accel[:, k + 1]) / 2
@@ -61,7 +62,8 @@ def preintegrate(
         dp = dp + dv * t + a_start[..., 0] * t**2 / 2
         dv = dv + a_start[..., 0] * t
         dR = dR @ half @ half
-    return Increments((end_ns - start_ns) * 1e-9, dR, dp, dv, D, P, gyro[:, -1])
+    dt: F64 = (end_ns - start_ns).astype(np.float64) * 1e-9
+    return Increments(dt, dR, dp, dv, D, P, gyro[:, -1])
 
 
 def sampled(imu: ImuBatch, stamps_ns: I64, values: F64) -> F64:

@@ -13,6 +13,7 @@ from share.types import F64, I64, ImuBatch
 
 NOISE = ImuNoise(1.7e-4, 2e-3, 2e-5, 3e-3, 200.0)
 G = 9.81
+UP_G = np.array([0, 0, G])
 START_NS = 1_600_000_000_000_000_000  # where floats no longer resolve nanoseconds
 BODY = se3.exp(np.array([0.3, -2.1, 0.7, 0.04, -0.09, 0.06]))  # T_body_mocap
 TILT = np.radians([0.4, -0.7])
@@ -41,7 +42,7 @@ class Motion:
         before, here, after = (self.pose(t + s * _STEP) for s in (-1, 0, 1))
         rate = se3.so3_log(before[:, :3, :3].swapaxes(1, 2) @ after[:, :3, :3]) / (2 * _STEP)
         a = (before[:, :3, 3] - 2 * here[:, :3, 3] + after[:, :3, 3]) / _STEP**2
-        return rate, np.einsum("nji,nj->ni", here[:, :3, :3], a + (0, 0, G))
+        return rate, np.einsum("nji,nj->ni", here[:, :3, :3], a + UP_G)
 
 
 def stamps(seconds: float, hz: float, start_s: float = 0.0) -> I64:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from mocap_sim import BODY, G, NOISE, START_NS, TILT, Motion, record_imu, record_mocap, stamps
+from mocap_sim import BODY, NOISE, START_NS, TILT, G, Motion, record_imu, record_mocap, stamps
 
 from share.errors import DataError, MisfitError
 from share.geometry import se3

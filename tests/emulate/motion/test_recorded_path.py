@@ -1,0 +1,175 @@
+"""A recorded motion between its nodes, and the folders it is read from."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from share.emulate.motion import sources
+from share.emulate.motion.recorded import RecordedPath
+from share.emulate.motion.sources import EUROC, TUMVI, Recording, open_recording
+from share.emulate.types import GRAVITY
+from share.errors import DataError, ShareError, UsageError
+from share.geometry import se3
+
+
+@pytest.fixture(scope="module")
+def euroc(shared_data: Path) -> Recording:
+    return open_recording(shared_data / "motion/euroc/V1_02_medium", EUROC, 10.0, 12.0)
+
+
+def rates_of(path: RecordedPath, stamps: np.ndarray, step_ns: int) -> np.ndarray:
+    before, after = path.poses(stamps - step_ns), path.poses(stamps + step_ns)
+    turned = se3.so3_log(before[:, :3, :3].swapaxes(1, 2) @ after[:, :3, :3])
+    return turned / (2e-9 * step_ns)
+
+
+def test_the_real_imu_is_untouched(euroc: Recording, shared_data: Path) -> None:
+    stamps, values = sources.tables.read_table(shared_data / "motion/euroc/V1_02_medium/imu0.csv", 7)
+    recorded = euroc.path.recorded
+    at = np.searchsorted(stamps, recorded.stamps_ns)
+    np.testing.assert_array_equal(stamps[at], recorded.stamps_ns)
+    np.testing.assert_array_equal(values[at], np.concatenate([recorded.gyro, recorded.accel], axis=1))
+    assert len(recorded) == pytest.approx(12 * 200, abs=2)
+
+
+def test_the_path_is_what_its_imu_felt(euroc: Recording) -> None:
+    """Its derivatives are the readings, also across nodes; what is left is the closing error."""
+    path = euroc.path
+    stamps = np.arange(path.start_ns + 50_000_000, path.end_ns - 50_000_000, 7_000_003)
+    rate, force = path.inertial(stamps)
+    step = 1_000_000
+    v = (path.velocity(stamps + step) - path.velocity(stamps - step)) / (2e-9 * step)
+    R = path.poses(stamps)[:, :3, :3]
+    felt = np.einsum("nji,nj->ni", R, v + (0, 0, GRAVITY))  # noqa: RUF005 - an array, not a tuple
+    assert np.sqrt(((rates_of(path, stamps, step) - rate) ** 2).sum(1).mean()) < 0.02
+    assert np.sqrt(((felt - force) ** 2).sum(1).mean()) < 0.4  # the rotors shake by 1 m/s^2 and more
+    assert np.abs((felt - force).mean(0)).max() < 0.01
+
+
+def test_path_and_velocity_are_continuous(euroc: Recording) -> None:
+    path = euroc.path
+    nodes = path.fit.stamps_ns
+    nodes = nodes[(nodes > path.start_ns) & (nodes < path.end_ns)]
+    before, after = path.poses(nodes - 1), path.poses(nodes)
+    step = se3.log(se3.inverse(before) @ after)
+    assert np.abs(step).max() < 1e-7  # 1 ns of 3 rad/s or m/s
+    assert np.abs(path.velocity(nodes) - path.velocity(nodes - 1)).max() < 1e-6
+    at = path.T_world_fit @ path.fit.T_world_body[np.isin(path.fit.stamps_ns, nodes)]
+    np.testing.assert_allclose(after, at, atol=1e-12)
+    stamps = np.arange(path.start_ns + 2_000_000, path.end_ns - 2_000_000, 11_000_003)
+    moved = (path.poses(stamps + 10**6) - path.poses(stamps - 10**6))[:, :3, 3] / 2e-3
+    assert np.abs(moved - path.velocity(stamps)).max() < 0.01
+
+
+def test_the_fit_is_near_the_mocap_and_in_units_of_noise(euroc: Recording) -> None:
+    left = euroc.path.fit.residuals
+    assert left.position_mm < 4
+    assert left.imu_sigmas.max() < 2.5
+    assert abs(euroc.path.fit.offset_ns) < 2_500_000
+    assert "mm" in euroc.notes[0]
+    assert len(euroc.images_ns) == pytest.approx(12 * 20, abs=2)
+    np.testing.assert_allclose(euroc.T_body_cam0[:3, 3], (-0.0216401, -0.0646770, 0.0098107), atol=1e-6)
+
+
+def test_placed_elsewhere_it_moves_alike(euroc: Recording) -> None:
+    path = euroc.path
+    T = se3.exp(np.array([0, 0, 1.2, 3.0, -2.0, 0.5]))
+    moved = path.placed(T).part(path.start_ns + 10**9, path.end_ns)
+    stamps = np.arange(moved.start_ns, moved.end_ns, 500_000_000)
+    np.testing.assert_allclose(moved.poses(stamps), T @ path.poses(stamps), atol=1e-12)
+    np.testing.assert_array_equal(moved.inertial(stamps), path.inertial(stamps))
+    with pytest.raises(ValueError, match="span"):
+        moved.poses(np.array([path.start_ns]))
+    with pytest.raises(ValueError, match="vertical"):
+        path.placed(se3.exp(np.array([0.1, 0, 0, 0, 0, 0])))
+    with pytest.raises(ValueError, match="not within"):
+        moved.part(path.start_ns, path.end_ns)
+
+
+def test_gaps_of_the_mocap_are_gaps_of_the_path(shared_data: Path) -> None:
+    path = open_recording(shared_data / "motion/tumvi/room2", TUMVI, 30.0, 14.0).path
+    seconds = (path.gaps - path.start_ns) * 1e-9
+    np.testing.assert_allclose(seconds, [(3.41, 5.44), (12.11, 14.0)], atol=0.1)
+    inside = np.arange(path.gaps[0, 0], path.gaps[0, 1], 20_000_000)
+    assert np.isfinite(path.poses(inside)).all()
+    speed = np.linalg.norm(path.velocity(inside), axis=1)
+    assert speed.max() < 3
+
+
+def test_an_asl_folder_gives_the_same(euroc: Recording, shared_data: Path, tmp_path: Path) -> None:
+    plain, root = shared_data / "motion/euroc/V1_02_medium", tmp_path / "V1_02/mav0"
+    for name, file in (
+        ("imu0", "imu0.csv"),
+        ("state_groundtruth_estimate0", "groundtruth.csv"),
+        ("cam0", "cam_timestamps.txt"),
+    ):
+        (root / name).mkdir(parents=True)
+        shutil.copy(plain / file, root / name / "data.csv")
+    T = euroc.T_body_cam0
+    (root / "cam0/sensor.yaml").write_text(f"T_BS:\n  rows: 4\n  cols: 4\n  data: {T.ravel().tolist()}\n")
+    n = euroc.noise
+    (root / "imu0/sensor.yaml").write_text(
+        f"T_BS: {np.eye(4).tolist()}\nrate_hz: 200\n"
+        f"gyroscope_noise_density: {n.gyro_density}\naccelerometer_noise_density: {n.accel_density}\n"
+        f"gyroscope_random_walk: {n.gyro_walk}\naccelerometer_random_walk: {n.accel_walk}\n"
+    )
+    same = open_recording(tmp_path / "V1_02", EUROC, 10.0, 12.0)
+    np.testing.assert_array_equal(same.path.fit.T_world_body, euroc.path.fit.T_world_body)
+    np.testing.assert_array_equal(same.images_ns, euroc.images_ns)
+    np.testing.assert_allclose(same.T_body_cam0, T, atol=1e-12)
+    assert same.noise == n
+
+
+@pytest.mark.parametrize(
+    ("start", "seconds", "says"),
+    [(200.0, None, "last 83"), (80.0, 10.0, "asked for"), (-1.0, 5.0, "asked for"), (10.0, 0.1, "asked for")],
+)
+def test_a_span_that_is_not_there(shared_data: Path, start: float, seconds: float | None, says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        open_recording(shared_data / "motion/euroc/V1_02_medium", EUROC, start, seconds)
+
+
+def broken(folder: Path, how: str) -> None:
+    truth = folder / "groundtruth.csv"
+    lines = truth.read_text().splitlines()
+    if how == "order":
+        lines[100], lines[101] = lines[101], lines[100]
+    elif how == "nan":
+        lines[100] = lines[100].replace(lines[100].split(",")[2], "nan")
+    elif how == "zero":
+        fields = lines[100].split(",")
+        lines[100] = ",".join([*fields[:4], "0", "0", "0", "0", *fields[8:]])
+    elif how == "apart":
+        lines = [lines[0]] + [
+            f"{int(line.split(',')[0]) + 10**13},{line.split(',', 1)[1]}" for line in lines[1:]
+        ]
+    elif how == "gone":
+        truth.unlink()
+        return
+    elif how == "no calibration":
+        shutil.rmtree(folder.parent / "calib")
+    truth.write_text("\n".join(lines))
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ("order", "line 102: .*sort"),
+        ("nan", "line 101: 'nan' is not finite"),
+        ("zero", "pose 100: quaternion has length 0"),
+        ("apart", "do not overlap"),
+        ("gone", "no recorded motion is here"),
+        ("no calibration", "no such file"),
+    ],
+)
+def test_bad_folders_say_what_is_wrong(shared_data: Path, tmp_path: Path, how: str, says: str) -> None:
+    folder = tmp_path / "V1_02"
+    shutil.copytree(shared_data / "motion/euroc/V1_02_medium", folder)
+    shutil.copytree(shared_data / "motion/euroc/calib", tmp_path / "calib")
+    broken(folder, how)
+    with pytest.raises(ShareError, match=says) as caught:
+        open_recording(folder, EUROC, 0.0, 10.0)
+    assert "\n" not in str(caught.value)
+    assert not isinstance(caught.value, DataError) or str(folder) in str(caught.value)
