@@ -25,8 +25,8 @@ _PROFILE = "d435i"
 _DEPTH = "rgbd"
 
 
-def prepare(recipe: Recipe, work: Path, progress: Progress) -> tuple[Stage, tuple[str, ...]]:
-    """The stage, its room kept in `work`, and notes for a person. Raises UsageError, ConfigError, DataError
+def prepare(recipe: Recipe, work: Path, progress: Progress) -> tuple[Stage, Layout, tuple[str, ...]]:
+    """The stage, its room kept in `work`, what stands in it, and notes for a person. Raises UsageError, ConfigError, DataError
     for what cannot be made."""
     progress("planning", 0, 1)
     planned = plan(recipe.motions, furnish(recipe), recipe.seconds, recipe.seed)
@@ -36,7 +36,7 @@ def prepare(recipe: Recipe, work: Path, progress: Progress) -> tuple[Stage, tupl
     room = work / _ROOM
     room_file.keep(planned.layout, {a.name: a.avatar.shapes for a in actors}, room)
     notes = planned.notes + tuple(f"{a.name}: {note}" for a in planned.agents for note in a.notes)
-    return Stage(room, actors), notes
+    return Stage(room, actors), planned.layout, notes
 
 
 def furnish(recipe: Recipe) -> Layout:

@@ -17,6 +17,7 @@ import numpy as np
 from share import __version__
 from share.emulate import shooting
 from share.emulate.asl import check_asl, to_asl
+from share.emulate.plan_picture import draw_plan
 from share.emulate.pool import Pool
 from share.emulate.preparation import prepare
 from share.emulate.progress import Progress, silent
@@ -30,6 +31,7 @@ from share.io.files import atomic_write, writable_dir, writing
 from share.io.kalibr import to_kalibr
 from share.io.session import SCHEMA, SESSION
 
+PLAN = "plan.png"
 START_NS = 1_750_000_000 * 10**9  # session time 0 in the clock of an agent whose IMU is simulated
 _FRAMES = 24  # of a chunk: what a break costs a process
 _METERED = 200  # frames of a metering job
@@ -75,7 +77,7 @@ def _make(recipe: Recipe, out: Path, workers: int, progress: Progress, asl: bool
         (partial / "truth").mkdir(parents=True, exist_ok=True)
         work = partial / "work"
         work.mkdir(exist_ok=True)
-        stage, notes = prepare(recipe, work, progress)
+        stage, layout, notes = prepare(recipe, work, progress)
         if asl:
             check_asl(stage)
         _check_space(partial, stage, recipe)
@@ -86,6 +88,7 @@ def _make(recipe: Recipe, out: Path, workers: int, progress: Progress, asl: bool
             progress("writing recordings", k, len(stage.actors))
             write_recording(actor, files, partial / f"{actor.name}.mcap")
             write_truth(actor, partial / "truth" / f"{actor.name}.tum")
+        draw_plan(partial / PLAN, layout, stage.actors)
         atomic_write(partial / SESSION, _description(recipe, stage, notes))
         if asl:
             to_asl(partial, [actor.name for actor in stage.actors], progress)
