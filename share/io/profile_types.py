@@ -199,18 +199,18 @@ class DepthModel:
     """Errors of stereo matching, as block matching has them. sigma_px: of disparity where texture is
     plenty. window_px: side of the matcher's window. hole_snr: gradient over noise at which half of the
     pixels find no match; hole_spread: sigma of that limit. smooth_px: sigma of the blur over which errors
-    agree. fattening_px: by how much near things grow."""
+    agree. edge_px: how far edges of things wander."""
 
     sigma_px: float
     window_px: int
     hole_snr: float
     hole_spread: float
     smooth_px: float
-    fattening_px: int
+    edge_px: int
 
     def __post_init__(self) -> None:
         _positive(self, "window_px")
-        _not_negative(self, "sigma_px", "hole_snr", "hole_spread", "smooth_px", "fattening_px")
+        _not_negative(self, "sigma_px", "hole_snr", "hole_spread", "smooth_px", "edge_px")
 
 
 @dataclass(frozen=True)

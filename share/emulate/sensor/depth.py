@@ -6,7 +6,7 @@ horizontal gradient g^2 and gray noise s in both pictures gives disparity to
     sigma^2 = floor^2 + 2 s^2 / (n g^2)          (least squares; Gruen 1985)
 
 Nothing is found where g / s is small, where the right camera does not see the point (behind an edge, left of
-its picture), and outside the range. A near thing grows by what the window reaches over its edge.
+its picture), and outside the range. Edges of things are uncertain by what the window reaches over them.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from share.io.profile_types import CameraModel, Profile
 from share.types import F32, U8
 
 _MARGIN = 512  # the bank of noise is larger than a picture by this
+_EDGE_PX = 1.5  # of disparity, within the reach of an edge; a slope has less
 _ROUNDING = 1 / 12  # variance of a gray level that was rounded
 
 
@@ -47,8 +48,8 @@ class DepthSensor:
         if not self._noise:
             return np.where((depth < near) | (depth > far), 0, depth * 1000 + 0.5).astype(np.uint16)
         first, second = self._read_bank(depth.shape, frame)
-        exact = cv2.divide(self._focal_baseline, depth)  # 0 where depth is 0
-        seen = self._grown(exact)
+        exact = np.where(depth > 0, self._focal_baseline / np.maximum(depth, 1e-3), np.float32(0))
+        seen = self._matched(exact, second)
         inverse_snr = self._inverse_snr(left, gain)
         sigma = cv2.sqrt(self._model.sigma_px**2 + (2 / self._model.window_px**2) * inverse_snr)
         step = self._facts.step_px
@@ -72,10 +73,12 @@ class DepthSensor:
         out: F32 = variance / np.maximum(clean, 0.01 * variance)
         return out
 
-    def _grown(self, disparity: F32) -> F32:
-        """What the window takes for its middle's: near things are larger by `fattening_px` on each side."""
-        size = 2 * self._model.fattening_px + 1
-        out: F32 = cv2.dilate(disparity, np.ones((size, size), np.uint8))
+    def _matched(self, disparity: F32, chance: F32) -> F32:
+        """Disparity of what fills the window: near an edge the thing before it or what is behind, by the
+        texture of both, here by chance; so edges wander by `edge_px` to either side."""
+        kernel = np.ones((2 * self._model.edge_px + 1,) * 2, np.uint8)
+        front, back = cv2.dilate(disparity, kernel), cv2.erode(disparity, kernel)
+        out: F32 = np.where(front - back > _EDGE_PX, np.where(chance > 0, front, back), disparity)
         return out
 
     def _hidden(self, disparity: F32) -> np.ndarray:
@@ -92,9 +95,11 @@ class DepthSensor:
 
 
 def noise_variance(gray: U8, model: CameraModel, gain: float) -> F32:
-    """Of a picture's gray levels (H, W): shot, read and rounding (see `share.emulate.sensor.photometry`)."""
-    K = 255 * gain / model.full_well_e
-    table = K * np.arange(256) + (K * model.read_e) ** 2 + _ROUNDING
+    """Of a picture's gray levels (H, W) against another camera's: shot, read, fixed pattern and rounding
+    (see `share.emulate.sensor.photometry`)."""
+    K, level = 255 * gain / model.full_well_e, np.arange(256)
+    fixed = (model.pixel_gain * level) ** 2 + (K * model.pixel_offset_e) ** 2
+    table = K * level + (K * model.read_e) ** 2 + fixed + _ROUNDING
     out: F32 = table.astype(np.float32)[gray]
     return out
 

@@ -18,19 +18,26 @@ SENSORS = {
 }
 
 
-@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "BMI055 gyro",
+        pytest.param("BMI055 accel", marks=pytest.mark.slow),
+        pytest.param("ADIS gyro", marks=pytest.mark.slow),
+        "ADIS accel",
+    ],
+)
 def test_allan_deviation_of_rest_is_that_of_the_profile(name: str):
-    """1 h at rest, four times: sigma^2 = N^2 / tau + K^2 tau / 3 within 5 % of the root mean square over
-    axes and runs, from 1 ms-averages up to where an hour still holds enough spans to tell (tau = 100 s)."""
+    """1 h at rest, eight times three axes: root mean square within 5 % of sigma^2 = N^2 / tau + K^2 tau / 3,
+    from single samples up to 70 s; the walk outweighs white noise from 2 s (ADIS accel) to 42 s (BMI055
+    gyro) on. One axis of one hour scatters by 13 % there: 50 spans of 70 s do not tell more."""
     sensor = replace(SENSORS[name], step=0.0)
-    hour = int(3600 * sensor.rate_hz)
-    curves = [
-        allan_deviation(measured(np.zeros((hour, 3)), sensor, (seed,)), sensor.rate_hz) for seed in range(4)
-    ]
+    rest = np.zeros((int(3600 * sensor.rate_hz), 3))
+    curves = [allan_deviation(measured(rest, sensor, (seed,)), sensor.rate_hz, 1) for seed in range(8)]
     taus = curves[0].taus
     seen = np.sqrt(np.mean([curve.deviation**2 for curve in curves], axis=(0, 2)))
     stated = np.sqrt(sensor.density**2 / taus + sensor.walk**2 * taus / 3)
-    assert np.abs(seen / stated - 1)[taus < 100].max() < 0.05
+    assert np.abs(seen / stated - 1)[taus < 70].max() < 0.05
     found = [fit(curve) for curve in curves]
     assert np.abs(np.mean([f.density for f in found]) / sensor.density - 1) < 0.01
     assert np.abs(np.mean([f.walk for f in found]) / sensor.walk - 1) < 0.08

@@ -1,0 +1,126 @@
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from share.errors import ConfigError
+from share.io import profile as profiles
+from share.io.calibration import read_calibration
+from share.io.profile import profile, shipped
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def changed(tmp_path: Path):
+    """A copy of d435i.yaml with one text replaced."""
+
+    def write(old: str, new: str) -> str:
+        text = (ROOT / "firmware_profiles" / "d435i.yaml").read_text()
+        assert old in text
+        (tmp_path / "mine.yaml").write_text(text.replace(old, new, 1))
+        return str(tmp_path / "mine.yaml")
+
+    return write
+
+
+def test_every_shipped_profile_reads_in_every_mode():
+    assert set(shipped()) == {"d435i", "euroc"}
+    for name in shipped():
+        for mode in profile(name).device.modes:
+            for hz in mode.rates_hz:
+                chosen = profile(name, f"{mode.width}x{mode.height}@{hz:g}")
+                assert (chosen.rig().cam0.width, chosen.rate_hz) == (mode.width, hz)
+
+
+def test_the_d435i_has_its_baseline_field_of_view_and_rates():
+    p = profile("d435i")
+    assert p.baseline_m == pytest.approx(0.05)
+    assert (p.mode.width, p.mode.height, p.rate_hz) == (640, 480, 30)
+    wide = profile("d435i", "848x480").rig().cam0
+    assert 2 * np.rad2deg(np.arctan(424 / wide.fx)) == pytest.approx(90, abs=1)  # data sheet: 87 +- 3
+    assert 2 * np.rad2deg(np.arctan(240 / wide.fy)) == pytest.approx(58.9, abs=1)  # 58 +- 1
+    imu = p.device.imu
+    assert not imu.joined and set(imu.gyro.rates_hz) == {200, 400} and {100, 250} < set(imu.accel.rates_hz)
+    assert profile("d435i", gyro_hz=200, accel_hz=100).device.imu.gyro.rate_hz == 200
+
+
+def test_the_d435i_agrees_with_the_example_calibration():
+    rig, example = profile("d435i", "848x480").rig(), read_calibration(ROOT / "calib" / "d435i").rig
+    assert rig.cam0 == example.cam0 and rig.cam1 == example.cam1
+    assert np.allclose(rig.T_body_cam0, example.T_body_cam0)
+    assert np.allclose(rig.T_cam1_cam0, example.T_cam1_cam0)
+
+
+def test_the_euroc_rig_is_that_of_its_calibration(shared_data: Path):
+    real = read_calibration(shared_data / "motion" / "euroc" / "calib").rig
+    rig = profile("euroc").rig()
+    assert rig.cam0 == real.cam0 and rig.cam1 == real.cam1
+    assert np.allclose(rig.T_body_cam0, real.T_body_cam0, atol=1e-9)
+    assert np.allclose(rig.T_cam1_cam0, real.T_cam1_cam0, atol=1e-9)
+    assert rig.imu.gyro_density == pytest.approx(2 * real.imu.gyro_density, rel=1e-3)
+    assert rig.imu.accel_density == pytest.approx(2 * real.imu.accel_density, rel=1e-3)
+
+
+def test_with_depth_the_rig_is_the_left_camera_with_depth_registered_to_it():
+    rig = profile("d435i").rig(depth=True)
+    assert rig.kind == "rgbd+imu" and rig.cam1 is None
+    assert rig.depth == rig.cam0 and np.array_equal(rig.T_depth_cam0, np.eye(4))
+    with pytest.raises(ConfigError, match="profile 'euroc': its device measures no depth"):
+        profile("euroc").rig(depth=True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("d455",), "profile 'd455' is not known; known: d435i, euroc, or give a .yaml file"),
+        (("no/such.yaml",), "no/such.yaml: no such profile file"),
+        (("d435i", "640x400"), "mode '640x400' is not known; known: 640x480@30/15/60/90, 848x480@"),
+        (("d435i", "640x480@25"), "mode '640x480@25' is not known"),
+        (("d435i", None, 300.0), "gyro: rate_hz: 300 is not one of 200, 400"),
+    ],
+)
+def test_what_is_not_known_is_refused_with_what_is(arguments: tuple, says: str):
+    with pytest.raises(ConfigError) as refused:
+        profile(*arguments)
+    assert says in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("emitter:", "emiter:", "mine.yaml: device: unknown key 'emiter'; did you mean 'emitter'?"),
+        ('emitter: "off"', "emitter: off", "device: emitter: expected a word"),
+        ('emitter: "off"', "emitter: dim", "device: emitter: 'dim' is not one of off, on"),
+        ("full_well_e: 16000", "full_well_e: -1", "emulation: camera: full_well_e: -1.0 must be positive"),
+        ("rate_hz: 400", "rate_hz: 300", "device: imu: gyro: rate_hz: 300 is not one of"),
+        (
+            "range_m: [0.28, 10.0]",
+            "range_m: [10.0, 0.28]",
+            "device: depth: range_m: 10, 0.28 is not near < far",
+        ),
+        ("width: 640", "width: 0", "device: modes[0]: resolution: 0x480 is not positive"),
+        ("default_mode: 640x480@30", "default_mode: 9x9", "mine.yaml: mode '9x9' is not known"),
+        ("[[1, 0, 0, -0.00552]", "[[2, 0, 0, -0.00552]", "device: T_imu_cam0: is not a rigid transform"),
+    ],
+)
+def test_a_file_with_a_mistake_is_refused_by_its_key(changed, old: str, new: str, says: str):
+    with pytest.raises(ConfigError) as refused:
+        profile(changed(old, new))
+    assert says in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_file_of_ones_own_is_read(changed):
+    assert profile(changed("model: Bosch BMI055", "model: Bosch BMI085")).device.imu.model == "Bosch BMI085"
+
+
+def test_the_folder_is_found_in_a_frozen_bundle_and_its_absence_is_said(monkeypatch, tmp_path: Path):
+    monkeypatch.setattr(profiles, "__file__", str(tmp_path / "lib" / "share" / "io" / "profile.py"))
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "nowhere"))
+    with pytest.raises(ConfigError, match="firmware_profiles is missing from this installation"):
+        shipped()
+    (tmp_path / "bundle" / "firmware_profiles").mkdir(parents=True)
+    (tmp_path / "bundle" / "firmware_profiles" / "x.yaml").write_text("name: x")
+    monkeypatch.setattr(sys, "_MEIPASS", str(tmp_path / "bundle"), raising=False)
+    assert set(shipped()) == {"x"}
