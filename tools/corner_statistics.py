@@ -1,7 +1,7 @@
 """Corner statistics of images in folders: `python tools/corner_statistics.py FOLDER ...`
 
-For every folder: the mean over its images (PNG or JPEG, in all sub-folders), each cut to the middle 4:3 and, where
-it is not 480 high, shrunk to 640 x 480 by areas. Compare a rendered room with real recordings only so.
+For every folder: the mean over its images (PNG or JPEG, in all sub-folders), each cut to the middle 4:3 and,
+where it is not 480 high, shrunk to 640 x 480 by areas. Compare a rendered room with real recordings only so.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import numpy as np
 from share.emulate.types import Mesh, Room
 from share.emulate.world.layout import Layout
 from share.emulate.world.light import FULL, bake
-from share.emulate.world.materials import Material
+from share.emulate.world.materials import Given, Material
 from share.emulate.world.mesh import Shape, concat
 from share.emulate.world.pictures import draw_all, mean_albedo
 
@@ -43,7 +43,7 @@ def build(layout: Layout, movers: Movers | None = None) -> Room:
     )
 
 
-def _numbered(shape: Shape, materials: tuple[Material, ...]) -> Mesh:
+def _numbered(shape: Shape, materials: tuple[Material | Given, ...]) -> Mesh:
     """The mesh of a shape, its layers counting into `materials`."""
     number = np.array([materials.index(m) for m in shape.materials], np.int32)
     return replace(shape.mesh, layer=number[shape.mesh.layer])

@@ -7,6 +7,9 @@ put on; its picture holds cells x cells different ones.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
+
+from share.types import U8
 
 
 @dataclass(frozen=True)
@@ -117,3 +120,14 @@ class Material:
     def glows(self) -> bool:
         """Whether it shines by itself: it casts no shadow and is not lit."""
         return self.kind == "lamp"
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """A picture that somebody else has drawn: pixels (P, P) uint8. One extent of it is 1 in uv."""
+
+    pixels: U8
+    fitted: ClassVar[bool] = False
+    cells: ClassVar[int] = 1
+    extent: ClassVar[float] = 1.0
+    glows: ClassVar[bool] = False

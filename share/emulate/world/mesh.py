@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from share.emulate.types import Mesh
-from share.emulate.world.materials import Material
+from share.emulate.world.materials import Given, Material
 from share.types import F64
 
 Rng = np.random.Generator
@@ -32,7 +32,7 @@ class Shape:
     """A mesh whose `layer` counts into `materials`: its pictures are not drawn yet."""
 
     mesh: Mesh
-    materials: tuple[Material, ...]
+    materials: tuple[Material | Given, ...]
 
     def moved(self, T: F64) -> Shape:
         """The same elsewhere: rigid transform T (4, 4)."""

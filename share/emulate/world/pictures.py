@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from share.emulate.world.materials import KINDS, Material
+from share.emulate.world.materials import KINDS, Given, Material
 from share.emulate.world.noise import P
 from share.emulate.world.prints import PRINTS
 from share.emulate.world.surfaces import SURFACES
@@ -16,8 +16,10 @@ from share.types import F32, U8
 DARKEST, BRIGHTEST = 4, 250  # albedo; nothing is black or white
 
 
-def draw(material: Material, seed: int) -> U8:
+def draw(material: Material | Given, seed: int) -> U8:
     """The picture of one material in the room `seed`."""
+    if isinstance(material, Given):
+        return material.pixels
     rng = np.random.default_rng(
         (seed, zlib.crc32(material.kind.encode()), material.variant, len(material.text))
     )
@@ -34,7 +36,7 @@ def draw(material: Material, seed: int) -> U8:
     return picture
 
 
-def draw_all(materials: Sequence[Material], seed: int) -> U8:
+def draw_all(materials: Sequence[Material | Given], seed: int) -> U8:
     """Pictures (L, P, P), one for each material."""
     return np.stack([draw(material, seed) for material in materials])
 

@@ -20,6 +20,7 @@ class Scene:
         except ImportError:
             raise UsageError("light needs the package embreex: pip install 'share-slam[emulate]'") from None
         corners = np.ascontiguousarray(triangles.reshape(-1, 3), np.float32)
+        self.triangles = triangles
         self._scene = EmbreeScene()
         self._mesh = TriangleMesh(
             self._scene, corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3)

@@ -35,7 +35,7 @@ def statistics(image: U8) -> ImageStatistics:
 
     if image.shape != (HEIGHT, WIDTH):
         raise ValueError(f"image: shape {image.shape}, expected {(HEIGHT, WIDTH)}")
-    found = cv2.FastFeatureDetector_create(20).detect(image)
+    found = cv2.FastFeatureDetector.create(20).detect(image)
     at = np.array([k.pt for k in found]).reshape(-1, 2)
     corners = cv2.goodFeaturesToTrack(image, 0, 0.01, 10)
     gx, gy = (cv2.Sobel(image, cv2.CV_32F, *d, scale=1 / 8) for d in ((1, 0), (0, 1)))
