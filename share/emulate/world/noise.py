@@ -102,10 +102,10 @@ def courses(
         shift = rng.integers(P) if offset < 0 else round(row * offset * P / columns)
         out[top:foot] = np.roll(line, shift)
         out[top : top + width] = joint
-    return _soften(out)
+    return softened(out)
 
 
-def _soften(picture: F32, sigma: float = 0.6) -> F32:
+def softened(picture: F32, sigma: float = 0.6) -> F32:
     """A Gaussian blur across the borders."""
     pad = 4
     wide = np.pad(picture, pad, mode="wrap")

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from share.emulate.world.noise import P, cloud, courses, grain, scattered, scratches, single, spots
+from share.emulate.world.noise import P, cloud, courses, grain, scattered, scratches, single, softened, spots
 from share.types import F32, U8
 
 Rng = np.random.Generator
@@ -133,7 +133,7 @@ def lacquer(rng: Rng, m: float) -> F32:
 
 def galvanised(rng: Rng, m: float) -> F32:
     flakes = np.sign(cloud(rng, 0.3, 8, 60)) * 4 + np.sign(cloud(rng, 0.3, 8, 60)) * 3
-    return single(_wear(rng, m, 4, 1.5) + cv2.GaussianBlur(flakes, (0, 0), 0.8).astype(np.float32))
+    return single(_wear(rng, m, 4, 1.5) + softened(flakes, 0.8).astype(np.float32))
 
 
 def perforated(rng: Rng, m: float) -> F32:
@@ -209,7 +209,7 @@ def lamp(rng: Rng, m: float) -> F32:
         for x in range(P // 2, 2 * P, P // 8):
             cv2.line(canvas, (x, 0), (x, 2 * P), 108.0, 3)
 
-    return scattered(bars)
+    return scattered(bars) + _wear(rng, m, 3, 1)
 
 
 SURFACES: dict[str, Recipe] = {

@@ -1,0 +1,18 @@
+"""What the tests of rooms share."""
+
+import pytest
+from smallroom import small_room
+
+from share.emulate.types import Room
+from share.emulate.world.build import build
+from share.emulate.world.layout import Layout
+
+
+@pytest.fixture(scope="session")
+def small_layout() -> Layout:
+    return small_room()
+
+
+@pytest.fixture(scope="session")
+def built(small_layout: Layout) -> Room:
+    return build(small_layout)
