@@ -1,0 +1,77 @@
+"""Calibration targets in YAML, under Kalibr's names.
+
+target_type: aprilgrid          target_type: charuco     (ours: Kalibr knows none)
+tagCols: 6                      squaresX: 9
+tagRows: 6                      squaresY: 7
+tagSize: 0.088    # m           squareSize: 0.08         # m
+tagSpacing: 0.3                 markerSize: 0.06         # m
+                                dictionary: DICT_5X5_100
+"""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+from typing import Any
+
+from share.errors import ConfigError
+from share.geometry.target import AprilGrid, CharucoBoard, Target
+from share.io.section import Section, read_yaml
+
+_KEYS: dict[str, tuple[type[Target], dict[str, str]]] = {
+    "aprilgrid": (
+        AprilGrid,
+        {"tagRows": "rows", "tagCols": "cols", "tagSize": "tag_size", "tagSpacing": "tag_spacing"},
+    ),
+    "charuco": (
+        CharucoBoard,
+        {
+            "squaresX": "squares_x",
+            "squaresY": "squares_y",
+            "squareSize": "square",
+            "markerSize": "marker",
+            "dictionary": "dictionary",
+        },
+    ),
+}
+_TYPE = "target_type"
+
+
+def read_target(path: Path) -> Target:
+    """Raises ConfigError naming file and key."""
+    return target_of(read_yaml(path))
+
+
+def target_of(section: Section) -> Target:
+    """The target of one mapping. Raises ConfigError naming where it stands and the key."""
+    kind = section.text(_TYPE)
+    if kind not in _KEYS:
+        raise ConfigError(f"{section.where}: {_TYPE}: '{kind}' is not known; known: {', '.join(_KEYS)}")
+    cls, names = _KEYS[kind]
+    for key in section.data:
+        if key not in names and key not in (_TYPE, "T_world_target"):
+            near = difflib.get_close_matches(str(key), names, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(names)}"
+            raise ConfigError(f"{section.where}: unknown key '{key}'; {hint}")
+    values = {name: _value(section, key, name) for key, name in names.items()}
+    try:
+        return cls(**values)
+    except ValueError as error:
+        raise ConfigError(f"{section.where}: {error}") from None
+
+
+def to_plain(target: Target) -> dict[str, Any]:
+    """As plain data for a YAML file, which `target_of` reads again."""
+    kind = next(kind for kind, (cls, _) in _KEYS.items() if isinstance(target, cls))
+    return {_TYPE: kind} | {key: getattr(target, name) for key, name in _KEYS[kind][1].items()}
+
+
+def _value(section: Section, key: str, name: str) -> Any:
+    if name == "dictionary":
+        return section.text(key)
+    if name not in ("rows", "cols", "squares_x", "squares_y"):
+        return section.number(key, positive=True)
+    value = section.get(key)
+    if type(value) is not int or value <= 0:
+        raise ConfigError(f"{section.where}: {key}: expected a positive whole number, found {value!r}")
+    return value
