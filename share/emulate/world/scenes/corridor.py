@@ -15,7 +15,7 @@ import numpy as np
 from share.emulate.world.furniture import barrels, doors, hoses, lockers, pipes, shelving, signs, tables
 from share.emulate.world.layout import Layout, Light, Piece
 from share.emulate.world.materials import Material
-from share.emulate.world.mesh import decal, quad
+from share.emulate.world.mesh import Shape, concat, decal, quad
 from share.emulate.world.scenes import fill
 from share.emulate.world.scenes.fill import Maker
 from share.emulate.world.scenes.plan import Plan, Size, Wall, Walls, outer_walls
@@ -77,13 +77,22 @@ def _shell(plan: Plan, outer: Walls, inner: Walls) -> None:
     rng, (x, y, z), T = plan.rng, plan.size, twins(plan.size)[2]
     paint = [(z, Material("plaster"))]
     floor = Material(str(rng.choice(["tiles", "planks", "carpet"])))
-    half = [surface(wall, paint, rng) for wall in (*outer[:2], *inner[:2])]
+    half = [surface(wall, paint, rng) for wall in outer[:2]]
     half.append(quad((0, y / 2, 0), (x, 0, 0), (0, y / 2, 0), floor, rng))
     half.append(quad((0, y, z), (x, 0, 0), (0, -y / 2, 0), Material("ceiling"), rng))
     for shape in half:
         plan.build("shell", shape)
         plan.build("shell", shape.moved(T))
+    sides = [surface(wall, paint, rng) for wall in inner[:2]]
+    plan.build("core", concat([*sides, *(s.moved(T) for s in sides), *_caps(plan)]))
     skirting(plan, (*outer, *inner))
+
+
+def _caps(plan: Plan) -> list[Shape]:
+    """Bottom and top of the core: nobody sees them, but with them it is closed, hence solid."""
+    (x, y, z), (wide, end) = plan.size, widths(plan.size)
+    skin, long, short = Material("plaster"), (x - 2 * end, 0, 0), (0, y - 2 * wide, 0)
+    return [quad((end, wide, z), long, short, skin), quad((end, wide, 0), short, long, skin)]
 
 
 def _threshold(plan: Plan) -> None:
@@ -135,7 +144,7 @@ def _passage(plan: Plan, outer: Wall, core: Wall) -> None:
     """An end of the ring: a window or a door, furniture of its own, a lamp."""
     rng = plan.rng
     if rng.random() < 0.5:
-        fill.daylight(plan, outer, outer.length / 2, 1.0, doors.window(rng, 1.5, 1.1), rng.uniform(1, 2))
+        fill.daylight(plan, outer, outer.length / 2, 1.0, doors.window(rng, 1.5, 1.1), rng.uniform(0.2, 0.4))
     else:
         fill.centred(plan, outer, "door", doors.door(rng), outer.length / 2, 0.8)
     fill.along(plan, outer, _FURNITURE, (0.4, 1.6))

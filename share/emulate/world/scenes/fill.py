@@ -77,6 +77,8 @@ def hang(plan: Plan, wall: Wall, makers: Mapping[str, tuple[float, Maker]], coun
         name = choose(rng, weights)
         shape = makers[name][1](rng)
         tall, wide = float(shape.bounds[1, 2]), float(shape.bounds[1, 0])
+        if 2 * wide + 0.1 > wall.length:
+            continue
         for _try in range(8):
             z = rng.uniform(1.2, max(top, 1.3)) - tall / 2
             at = rng.uniform(wide + 0.05, wall.length - wide - 0.05)

@@ -38,8 +38,8 @@ def firestation(seed: int, size: Size) -> Layout:
     _vehicles(plan, lanes)
     fill.centred(plan, walls[3], "door", doors.door(rng), rng.uniform(1.2, size[1] - 1.2), 1.2)
     for wall in (walls[0], walls[2], walls[3]):
-        fill.along(plan, wall, _GEAR, (0.5, 2.2))
-        fill.hang(plan, wall, _HANGINGS, max(1, int(0.35 * wall.length)), 2.4)
+        fill.along(plan, wall, _GEAR, (0.4, 1.7))
+        fill.hang(plan, wall, _HANGINGS, max(1, int(0.45 * wall.length)), 2.4)
     _light(plan, walls)
     return plan.done(ambient=0.3)
 
@@ -47,11 +47,11 @@ def firestation(seed: int, size: Size) -> Layout:
 def _shell(plan: Plan, walls: tuple[Wall, ...]) -> None:
     """Paint, darker up to the height of a shoulder; a smooth floor."""
     rng = plan.rng
-    dado = Material("paint", 0, gray=float(rng.uniform(95, 140)))
-    wall = Material("paint", 1, gray=float(rng.uniform(165, 195)))
-    floor = Material("screed", 0, gray=float(rng.uniform(100, 135)), contrast=0.5)
+    dado = Material("paint", 0, gray=float(rng.uniform(85, 125)))
+    wall = Material("paint", 1, gray=float(rng.uniform(145, 170)))
+    floor = Material("screed", 0, gray=float(rng.uniform(100, 135)), contrast=0.65)
     enclose(
-        plan, [(rng.uniform(1.1, 1.5), dado), (plan.size[2], wall)], floor, Material("paint", 0, gray=190)
+        plan, [(rng.uniform(1.1, 1.5), dado), (plan.size[2], wall)], floor, Material("paint", 0, gray=165)
     )
     joints(plan)
     skirting(plan, walls)
@@ -126,4 +126,4 @@ def _light(plan: Plan, walls: tuple[Wall, ...]) -> None:
         for k in range(int(wall.length / 3)):
             if rng.random() < 0.5:
                 shape = doors.window(rng, 1.6, 0.7)
-                fill.daylight(plan, wall, 1.5 + 3 * k, z - 1.15, shape, rng.uniform(1, 2.5))
+                fill.daylight(plan, wall, 1.5 + 3 * k, z - 1.15, shape, rng.uniform(0.5, 1.3))

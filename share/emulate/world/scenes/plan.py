@@ -93,7 +93,7 @@ class Plan:
         """Keep a box (2, 3) m free of whatever comes later."""
         self.taken.append(bounds)
 
-    def done(self, ambient: float = 0.15) -> Layout:
+    def done(self, ambient: float, brightness: float = 1.0) -> Layout:
         """The room as data."""
         parts = tuple(self.shell), tuple(self.pieces), tuple(self.lights)
-        return Layout(self.name, self.seed, self.size, *parts, ambient=ambient)
+        return Layout(self.name, self.seed, self.size, *parts, ambient, brightness)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from share.emulate.world.layout import Layout
+from share.emulate.world.scenes.board import april_grid, charuco
 from share.emulate.world.scenes.corridor import corridor_twins
 from share.emulate.world.scenes.firestation import firestation
 from share.emulate.world.scenes.plan import Size
@@ -45,6 +46,8 @@ SCENES = {
         (40, 14, 4),
     ),
     "whitewall": Scene("white walls, next to nothing to see", whitewall, (9, 6, 4), (6, 5, 2.7), (15, 12, 6)),
+    "board": Scene("an AprilGrid on a stand: to calibrate with", april_grid, (5, 5, 3), (4, 4, 2.6), (9, 9, 4)),
+    "charuco-board": Scene("the same with a ChArUco board", charuco, (5, 5, 3), (4, 4, 2.6), (9, 9, 4)),
 }
 
 

@@ -45,7 +45,7 @@ def warehouse(seed: int, size: Size) -> Layout:
     _overhead(plan)
     for wall in walls:
         fill.hang(plan, wall, _HANGINGS, int(1.5 * wall.length), min(size[2] - 0.5, 3.3))
-    return plan.done(ambient=0.12)
+    return plan.done(ambient=0.12, brightness=0.9)
 
 
 def _shell(plan: Plan, walls: tuple[Wall, ...]) -> None:
@@ -53,7 +53,11 @@ def _shell(plan: Plan, walls: tuple[Wall, ...]) -> None:
     lower = pick(rng, str(rng.choice(["block", "brick", "concrete"])))
     upper = pick(rng, str(rng.choice(["corrugated", "panel", "block", "plaster"])))
     enclose(
-        plan, [(rng.uniform(1.8, 2.6), lower), (z, upper)], Material("screed"), Material("corrugated", 0), BAY
+        plan,
+        [(rng.uniform(1.8, 2.6), lower), (z, upper)],
+        Material("screed", contrast=0.9),
+        Material("corrugated", 0),
+        BAY,
     )
     joints(plan)
     columns(plan, walls)
@@ -73,7 +77,7 @@ def _openings(plan: Plan, walls: tuple[Wall, ...]) -> None:
             if rng.random() < 0.45:
                 tall = min(0.8, z - _GIRDER - 2.75)
                 shape = doors.window(rng, rng.uniform(1.0, 1.8), tall)
-                fill.daylight(plan, walls[k], at, z - _GIRDER - tall - 0.15, shape, rng.uniform(0.8, 2.2))
+                fill.daylight(plan, walls[k], at, z - _GIRDER - tall - 0.15, shape, rng.uniform(0.5, 1.4))
 
 
 def _bay(wall: Wall) -> float:
@@ -97,7 +101,7 @@ def _belt(plan: Plan, walls: tuple[Wall, ...]) -> None:
     deep = _belt_depth(plan.size)
     makers = {n: (w, m) for n, (w, m) in _standing(plan.size).items() if _depth(m) <= deep}
     for wall in walls:
-        fill.along(plan, wall, makers, (0.03, 0.45))
+        fill.along(plan, wall, makers, (0.03, 0.35))
 
 
 def _depth(maker: Maker) -> float:
@@ -161,20 +165,23 @@ def _rows(plan: Plan) -> None:
 
 
 def _row(plan: Plan, y: float, left: float, right: float, longest: float) -> None:
+    """Islands from `left` to `right`, each in its frame of floor paint, some behind a pillar."""
     rng, x = plan.rng, left
     while right - x > 1.2:
         end = min(x + rng.uniform(1.25, longest), right)
         start = x
         if rng.random() < 0.5:
-            side = rng.uniform(0.28, 0.4)
-            pillar = pillars.concrete(rng, side, plan.size[2] - _GIRDER) if rng.random() < 0.5 else None
-            plan.build(
-                "pillar", (pillar or pillars.steel(rng, 0.24, plan.size[2])).at(x + 0.25, y), keeps_off=True
-            )
+            plan.build("pillar", _pillar(rng, plan.size[2]).at(x + 0.25, y), keeps_off=True)
             x += 0.5
         x = _island(plan, x, end, y)
         fill.frame(plan, (start - 0.12, y - _ROW / 2 - 0.1), (max(x, end) + 0.12, y + _ROW / 2 + 0.1))
         x = max(x, end) + rng.uniform(1.5, 1.9)
+
+
+def _pillar(rng: Rng, height: float) -> Shape:
+    if rng.random() < 0.5:
+        return pillars.concrete(rng, rng.uniform(0.28, 0.4), height)
+    return pillars.steel(rng, 0.24, height)
 
 
 def _island(plan: Plan, left: float, right: float, y: float) -> float:
@@ -186,32 +193,28 @@ def _island(plan: Plan, left: float, right: float, y: float) -> float:
             name, shape = "rack", _double_rack(plan, min(right - left, rng.uniform(1.6, 2.6)))
         else:
             name, shape = _goods(rng, right - left)
-        wide, deep = (float(v) for v in np.ptp(shape.bounds, axis=0)[:2])
+        wide = float(np.ptp(shape.bounds[:, 0]))
         if wide > right - left + 1e-6:
             break
-        turned = np.pi * rng.integers(2)
-        middle = y + (deep / 2 if turned == 0 else -deep / 2)
-        plan.add(name, shape.at(left + wide / 2 - _centre(shape, turned), middle, 0, turned))
+        facing = int(rng.choice([-1, 1]))
+        x_own, y_own = (float(v) for v in facing * shape.bounds.mean(0)[:2])
+        middle = left + wide / 2
+        plan.add(name, shape.at(middle - x_own, y - y_own, 0, 0.0 if facing > 0 else np.pi))
         left += wide + rng.uniform(0.02, 0.15)
     return left
 
 
-def _centre(shape: Shape, turned: float) -> float:
-    """Where along x the middle of a shape is, which need not be 0."""
-    return float(shape.bounds[:, 0].mean()) * (1 if turned == 0 else -1)
-
-
 def _double_rack(plan: Plan, width: float) -> Shape:
-    height = (
-        min(plan.rng.uniform(1.5, 2.4), _rack_height(plan.size))
-        if plan.size[2] < 5
-        else _rack_height(plan.size)
-    )
-    return shelving.rack(plan.rng, width, plan.rng.uniform(0.6, _ROW), height, plan.rng.uniform(0.5, 0.9))
+    """A rack in the middle: low under a low roof, that one sees over it."""
+    rng, highest = plan.rng, _rack_height(plan.size)
+    height = rng.uniform(1.5, min(2.4, highest)) if plan.size[2] < 5 else rng.uniform(0.6, 1) * highest
+    return shelving.rack(rng, width, rng.uniform(0.6, _ROW), height, rng.uniform(0.5, 0.9))
 
 
 def _goods(rng: Rng, room: float) -> tuple[str, Shape]:
     """Something that stands in the middle of a warehouse and is narrower than `room` m."""
+    if room > 4 and rng.random() < 0.3:
+        return "forklift", forklift.forklift(rng).at(0, 0, 0, -np.pi / 2)
     kind = str(rng.choice(["loaded pallet", "pallets", "table", "crate", "drums", "cartons", "pallet truck"]))
     if room < 1.25 or kind == "crate":
         return "crate", small.crate(rng)

@@ -1,0 +1,77 @@
+"""A calibration board: its target printed exactly, in tiles whose seams nobody can see.
+
+The texels of all tiles lie on one lattice, and tiles begin at multiples of 32 of them: then the texels of
+the first five mip levels lie on one lattice too, and two tiles show the same at their seam. What a tile
+shows goes on beyond its edges, so that nothing is interpolated with the other end of its picture.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from share.emulate.types import Mesh
+from share.emulate.world.furniture.parts import block, pick
+from share.emulate.world.materials import Given
+from share.emulate.world.mesh import Rng, Shape, box, concat
+from share.emulate.world.noise import P
+from share.geometry.target import AprilGrid, Target
+from share.types import F64, U8
+from share.vision.target_picture import darkness, ink
+
+WHITE, BLACK = 205, 22  # albedo of paper and toner
+MARGIN = 0.025  # m of white around what is printed, at least
+_GUARD = 32  # texels of a tile's picture that lie beyond the tile, on each side
+_TILE = P - 2 * _GUARD
+_COARSEST = 0.0008  # m a texel
+_THICK = 0.012
+
+
+def sheet(target: Target) -> tuple[Shape, F64]:
+    """The printed sheet in the target's own frame, and its extent (2, 2) m."""
+    texel = _texel(target)
+    low, high = target.extent
+    tiles = np.ceil((high - low + 2 * MARGIN) / (_TILE * texel) - 1e-9).astype(int)
+    spare = np.floor((tiles * _TILE - (high - low) / texel) / 2 + 1e-6)  # whole texels: edges stay on the lattice
+    start = low - spare * texel
+    rectangles = ink(target)
+    parts = [
+        _tile(rectangles, start + texel * _TILE * np.array([i, j]), texel)
+        for j in range(tiles[1])
+        for i in range(tiles[0])
+    ]
+    return concat(parts), np.stack([start, start + tiles * _TILE * texel])
+
+
+def on_stand(target: Target, T_stand_target: F64, rng: Rng) -> Shape:
+    """The sheet on a plate on a post; the floor is z = 0 of the stand's frame."""
+    paper, extent = sheet(target)
+    plate = box((*(extent[0] - 0.006), -_THICK), (*(extent[1] + 0.006), -0.001), pick(rng, "plywood"), rng)
+    middle = T_stand_target[:3, :3] @ [*extent.mean(axis=0), -0.08] + T_stand_target[:3, 3]
+    steel = pick(rng, "steel")
+    post = block((*middle[:2], 0.0), (0.04, 0.04, middle[2]), steel, rng)
+    foot = block((*middle[:2], 0.0), (0.5, 0.5, 0.03), steel, rng)
+    return concat([paper.moved(T_stand_target), plate.moved(T_stand_target), post, foot])
+
+
+def _texel(target: Target) -> float:
+    """m; an edge of a marker's cells is a whole number of texels, and of an AprilGrid's gaps too, where
+    its spacing is a multiple of 0.1."""
+    cell = target.tag_size / 10 if isinstance(target, AprilGrid) else target.square / 16
+    return float(cell / np.ceil(cell / _COARSEST))
+
+
+def _tile(rectangles: F64, low: F64, texel: float) -> Shape:
+    """The tile with its lower left corner at `low` (2,) m."""
+    steps = (np.arange(P + 1) - _GUARD) * texel
+    xs, ys = low[0] + steps, low[1] + _TILE * texel - steps
+    pixels: U8 = (WHITE + (BLACK - WHITE) * darkness(rectangles, xs, ys)).round().astype(np.uint8)
+    a, b = _GUARD / P, 1 - _GUARD / P
+    square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])
+    mesh = Mesh(
+        vertices=np.column_stack([low + square * _TILE * texel, np.zeros(4)]).astype(np.float32),
+        normals=np.tile(np.array([0, 0, 1], np.float32), (4, 1)),
+        uv=np.array([(a, b), (b, b), (b, a), (a, a)], np.float32),
+        layer=np.zeros(4, np.int32),
+        faces=np.array([(0, 1, 2), (0, 2, 3)], np.int32),
+    )
+    return Shape(mesh, (Given(pixels),))
