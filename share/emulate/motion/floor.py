@@ -6,21 +6,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from share.emulate.world.occupancy import Occupancy
 from share.types import F64
+
+_LOW, _HIGH = 0.10, 1.95  # m: a step of less is walked over, a beam above is walked under
+_EVERY = 2  # voxels of the occupancy to one cell here
 
 
 @dataclass(frozen=True, eq=False)
 class Floor:
-    """clearance (X, Y) m at the corners (i, j) * step m of a grid that begins at the world's origin:
-    distance to the nearest obstacle between floor and head, negative or 0 inside one."""
+    """clearance (X, Y) m at the places origin + (i, j) * step m: distance to the nearest obstacle between
+    floor and head, 0 inside one."""
 
     clearance: F64
     step: float
-
-    @property
-    def extent(self) -> F64:
-        """The far corner (2,) m."""
-        return (np.array(self.clearance.shape) - 1) * self.step
+    origin: float = 0.0
 
     def at(self, xy: F64) -> F64:
         """Clearance (N,) m at places (N, 2) m, bilinear; outside the grid as at its edge."""
@@ -38,6 +38,13 @@ class Floor:
 
     def _cells(self, xy: F64) -> tuple[np.ndarray, F64]:
         most = np.array(self.clearance.shape) - 1
-        place = (np.asarray(xy) / self.step).clip(0, most - 1e-9)
+        place = ((np.asarray(xy) - self.origin) / self.step).clip(0, most - 1e-9)
         cell = place.astype(int)
         return cell, place - cell
+
+
+def floor_of(occupancy: Occupancy) -> Floor:
+    """The floor of a room, for people and robots alike: under a table nobody goes."""
+    clearance, origin, step = occupancy.floor_clearance(_LOW, _HIGH)
+    grid = clearance[::_EVERY, ::_EVERY].astype(np.float64)
+    return Floor(grid, step * _EVERY, float(origin[0]))

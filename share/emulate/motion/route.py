@@ -51,7 +51,7 @@ class Network:
     @property
     def places(self) -> F64:
         """(N, 2) m, where a body may be."""
-        return self._cells * self.floor.step
+        return self._cells * self.floor.step + self.floor.origin
 
     def tour(self, length: float, rng: Rng, start: F64 | None = None) -> list[F64]:
         """Legs (n, 2) m, end to end, from the place nearest to `start` (2,) m, at least `length` m in all;

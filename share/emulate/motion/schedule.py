@@ -16,7 +16,7 @@ from share.emulate.motion.route import Way
 from share.types import F64
 
 STEP_S = 0.2
-_SPEEDS = 20  # that the search tells apart, besides standing
+_SPEEDS = 14  # that the search tells apart, besides standing
 _SUB = 2  # times within a step at which the others are looked at
 _FINE_S = 0.05
 _SMOOTH_S = 0.4  # sigma of the smoothing in time: a step of 1 m/s becomes 1 m/s^2 at most
