@@ -119,11 +119,13 @@ class ClockFacts:
 
 @dataclass(frozen=True, eq=False)
 class DeviceFacts:
-    """The sensor itself. exposure_ms and gain: least and most. emitter: how infrared dots are to be set.
-    T_imu_cam0, T_imu_cam1 (4, 4)."""
+    """The sensor itself. firmware: known to be good; firmware_oldest: below it the device is not to be
+    trusted (none where there is no such thing). exposure_ms and gain: least and most. emitter: how
+    infrared dots are to be set. T_imu_cam0, T_imu_cam1 (4, 4)."""
 
     model: str
     firmware: tuple[str, ...]
+    firmware_oldest: str | None
     emitter: str
     default_mode: str
     modes: tuple[Mode, ...]

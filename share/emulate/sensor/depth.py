@@ -78,7 +78,9 @@ class DepthSensor:
         texture of both, here by chance; so edges wander by `edge_px` to either side."""
         kernel = np.ones((2 * self._model.edge_px + 1,) * 2, np.uint8)
         front, back = cv2.dilate(disparity, kernel), cv2.erode(disparity, kernel)
-        out: F32 = np.where(front - back > _EDGE_PX, np.where(chance > 0, front, back), disparity)
+        edge = cv2.subtract(front, back) > _EDGE_PX
+        out = disparity.copy()
+        out[edge] = np.where(chance[edge] > 0, front[edge], back[edge])
         return out
 
     def _hidden(self, disparity: F32) -> np.ndarray:
@@ -100,7 +102,7 @@ def noise_variance(gray: U8, model: CameraModel, gain: float) -> F32:
     K, level = 255 * gain / model.full_well_e, np.arange(256)
     fixed = (model.pixel_gain * level) ** 2 + (K * model.pixel_offset_e) ** 2
     table = K * level + (K * model.read_e) ** 2 + fixed + _ROUNDING
-    out: F32 = table.astype(np.float32)[gray]
+    out: F32 = cv2.LUT(gray, table.astype(np.float32))
     return out
 
 
