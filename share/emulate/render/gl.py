@@ -16,6 +16,7 @@ from share.geometry.camera import Camera
 from share.types import F32, F64
 
 _SIDE = 2  # samples a side of a pixel
+_DEPTH_ZOOM = 3.0  # of the view in which a lens finds its triangles: fewer slivers are missed
 _lens = lru_cache(maxsize=16)(lens)
 
 
@@ -49,7 +50,7 @@ class GlRenderer:
         """Exact depth (H, W) m, 0 where nothing is; see `Renderer`."""
         if not camera.distortion:
             return self._stage.depth(camera, moment)
-        optics = _lens(camera)
+        optics = _lens(camera, _DEPTH_ZOOM)
         return optics.depth(*self._stage.faces(optics.wide, moment))
 
     def _supersampled(self, camera: Camera, moment: Moment) -> U16:

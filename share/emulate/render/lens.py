@@ -58,18 +58,19 @@ class Lens:
         return depth.reshape(self.camera.height, self.camera.width).astype(np.float32)
 
 
-def lens(camera: Camera) -> Lens:
-    """The lens of `camera`. Raises ValueError if its distortion has no inverse over the image."""
+def lens(camera: Camera, zoom: float = 1.0) -> Lens:
+    """The lens of `camera`; the wide view has `zoom` times its pixels a radian, or more. Raises ValueError
+    if the distortion has no inverse over the image."""
     px = pixels(camera).reshape(-1, 2)
     uv = camera.normalise(px)
     if not np.isfinite(uv).all() or np.abs(camera.distort(uv) - px).max() > 1e-3:
         raise ValueError("camera: its distortion cannot be undone over the whole image")
-    zoom = max(1.0, _magnification(camera, uv))
+    zoom *= max(1.0, _magnification(camera, uv))
     fx, fy = camera.fx * zoom, camera.fy * zoom
     flat = uv * (fx, fy)
     low, high = np.floor(flat.min(axis=0)) - _MARGIN, np.ceil(flat.max(axis=0)) + _MARGIN
     width, height = (int(n) for n in high - low + 1)
-    if width * height > _WIDEST**2 * camera.width * camera.height:
+    if width * height > (_WIDEST * zoom) ** 2 * camera.width * camera.height:
         raise ValueError(f"camera: its distortion asks for {width}x{height} pixels to be drawn")
     wide = Camera(width, height, fx, fy, float(-low[0]), float(-low[1]))
     place = (flat - low).astype(np.float32).reshape(camera.height, camera.width, 2)

@@ -70,24 +70,26 @@ void main() {{ radiance = gain * {_picture(lod_bias)} * shade; }}
 """
 
 
-# On a plane, inverse depth is affine in normalised coordinates: nothing interpolated is as exact.
+# On a plane, inverse depth is affine in normalised coordinates: nothing interpolated is as exact. Doubles,
+# because on a surface seen almost edge-on the last bit of u and v is worth 1e-5 m.
 DEPTH_FRAGMENT = """
 #version 430
-layout(std430, binding = 0) readonly buffer Slopes { vec4 slopes[]; };
-uniform vec2 focal;
-uniform vec2 centre;
+layout(std430, binding = 0) readonly buffer Slopes { dvec4 slopes[]; };
+uniform dvec2 focal;
+uniform dvec2 centre;
 out float depth;
 void main() {
-    vec2 uv = (gl_FragCoord.xy - 0.5 - centre) / focal;
-    depth = 1.0 / dot(slopes[gl_PrimitiveID].xyz, vec3(uv, 1.0));
+    dvec2 uv = (dvec2(gl_FragCoord.xy) - 0.5 - centre) / focal;
+    depth = float(1.0 / dot(slopes[gl_PrimitiveID].xyz, dvec3(uv, 1.0)));
 }
 """
 
+# Numbers of triangles as floats: exact below 2^24.
 FACE_FRAGMENT = """
 #version 430
-uniform int first;
-out int face;
-void main() { face = first + gl_PrimitiveID; }
+uniform float first;
+out float face;
+void main() { face = first + float(gl_PrimitiveID); }
 """
 
 

@@ -16,7 +16,7 @@ from share.emulate.render.view import U16, projection
 from share.emulate.types import I32, Mesh, Moment, Room
 from share.geometry.camera import Camera
 from share.geometry.se3 import inverse
-from share.types import F32, F64
+from share.types import F32, F64, I64
 
 STEPS = 64.0  # stored steps in a gray level: 16 bits hold up to 1023 gray levels
 FINER = -1.0  # level of detail of a sample that is a quarter of a pixel
@@ -47,55 +47,59 @@ class Stage:
 
     def image(self, camera: Camera, moment: Moment, lod_bias: float) -> U16:
         """(H, W) in 1 / STEPS gray levels; pictures are low-passed to a pixel, times 2 ** lod_bias."""
-        target = self._target(camera, "nu2")
         room, mover = self._images[lod_bias]
         lamp = _LAMP @ moment.T_world_cam[:3, :3]
-        for piece, T in self._pieces(moment):
-            program = room if piece is self._room else mover
-            if program is mover:
-                program["lamp"] = tuple(T[:3, :3] @ lamp)
-            self._draw(piece, program, camera, T, piece.surface.visible(camera, T))
-        out: U16 = _read(target, camera, "nu2", np.uint16)
+        with self._gl:
+            target = self._target(camera, "nu2")
+            for piece, T, chunks in self._seen(camera, moment):
+                program = room if piece is self._room else mover
+                if program is mover:
+                    program["lamp"] = tuple(T[:3, :3] @ lamp)
+                self._draw(piece, program, camera, T, chunks)
+            out: U16 = _read(target, camera, "nu2", np.uint16)
         return out
 
     def depth(self, camera: Camera, moment: Moment) -> F32:
         """(H, W) m along the optical axis, 0 where nothing is."""
-        target = self._target(camera, "f4")
-        self._depth["focal"], self._depth["centre"] = (camera.fx, camera.fy), (camera.cx, camera.cy)
-        for piece, T in self._pieces(moment):
-            chunks = piece.surface.visible(camera, T)
-            slopes = piece.surface.slopes(chunks, T)
-            piece.slopes.orphan()
-            piece.slopes.write(np.pad(slopes, ((0, 0), (0, 1))).astype(np.float32))
-            piece.slopes.bind_to_storage_buffer(0)
-            self._draw(piece, self._depth, camera, T, chunks)
-        out: F32 = _read(target, camera, "f4", np.float32)
+        with self._gl:
+            self._depth["focal"], self._depth["centre"] = (camera.fx, camera.fy), (camera.cx, camera.cy)
+            target = self._target(camera, "f4")
+            for piece, T, chunks in self._seen(camera, moment):
+                piece.slopes.orphan()
+                piece.slopes.write(np.pad(piece.surface.slopes(chunks, T), ((0, 0), (0, 1))))
+                piece.slopes.bind_to_storage_buffer(0)
+                self._draw(piece, self._depth, camera, T, chunks)
+            out: F32 = _read(target, camera, "f4", np.float32)
         return out
 
     def faces(self, camera: Camera, moment: Moment) -> tuple[I32, F64, F64]:
         """Which triangle is seen (H, W), 0 for none; then of each triangle slopes (T, 3), see `Surface`,
         and corners (T, 3, 3) m in the camera frame."""
-        target = self._target(camera, "i4")
         slopes, corners, count = [np.zeros((1, 3))], [np.zeros((1, 3, 3))], 1
-        for piece, T in self._pieces(moment):
+        with self._gl:
+            target = self._target(camera, "f4")
+            for piece, T, chunks in self._seen(camera, moment):
+                self._face["first"] = float(count)
+                self._draw(piece, self._face, camera, T, chunks)
+                slopes.append(piece.surface.slopes(chunks, T))
+                corners.append((piece.surface.corners[chunks].reshape(-1, 3, 3) - T[:3, 3]) @ T[:3, :3])
+                count += len(slopes[-1])
+            seen = _read(target, camera, "f4", np.float32).astype(np.int32)
+        return seen, np.concatenate(slopes), np.concatenate(corners)
+
+    def _seen(self, camera: Camera, moment: Moment) -> Iterator[tuple[_Piece, F64, I64]]:
+        """What may be in the image, with T_piece_cam and its chunks."""
+        everything = [
+            (piece, inverse(T_world_part) @ moment.T_world_cam)
+            for name, poses in moment.movers.items()
+            for piece, T_world_part in zip(self._movers[name], poses, strict=True)
+        ]
+        for piece, T in [*everything, (self._room, moment.T_world_cam)]:
             chunks = piece.surface.visible(camera, T)
-            self._face["first"] = count
-            self._draw(piece, self._face, camera, T, chunks)
-            slopes.append(piece.surface.slopes(chunks, T))
-            corners.append((piece.surface.corners[chunks].reshape(-1, 3, 3) - T[:3, 3]) @ T[:3, :3])
-            count += len(slopes[-1])
-        return _read(target, camera, "i4", np.int32), np.concatenate(slopes), np.concatenate(corners)
+            if len(chunks):
+                yield piece, T, chunks
 
-    def _pieces(self, moment: Moment) -> Iterator[tuple[_Piece, F64]]:
-        """All there is, with T_piece_cam."""
-        for name, poses in moment.movers.items():
-            for piece, T_world_part in zip(self._movers[name], poses, strict=True):
-                yield piece, inverse(T_world_part) @ moment.T_world_cam
-        yield self._room, moment.T_world_cam
-
-    def _draw(self, piece: _Piece, program: Any, camera: Camera, T_piece_cam: F64, chunks: Any) -> None:
-        if not len(chunks):
-            return
+    def _draw(self, piece: _Piece, program: Any, camera: Camera, T_piece_cam: F64, chunks: I64) -> None:
         faces = piece.surface.faces[chunks]
         piece.indices.orphan()
         piece.indices.write(faces)
@@ -138,7 +142,7 @@ class _Piece:
         columns = (mesh.vertices, mesh.normals, mesh.uv, mesh.layer[:, None], light)
         vertices = gl.buffer(np.concatenate(columns, axis=1).astype("f4").tobytes())
         self.indices = gl.buffer(reserve=self.surface.faces.nbytes, dynamic=True)
-        self.slopes = gl.buffer(reserve=self.surface.faces.nbytes // 3 * 4, dynamic=True)
+        self.slopes = gl.buffer(reserve=self.surface.faces.nbytes // 3 * 8, dynamic=True)
         self.arrays = {program: _array(gl, program, vertices, self.indices) for program in programs}
 
 

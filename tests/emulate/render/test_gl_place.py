@@ -21,7 +21,7 @@ def boxes():
 
 def exact_depth(mesh, camera, T_world_cam):
     """Depth of the nearest triangle on every pixel's ray, by brute force in double precision; and whether
-    the ray passes well inside all triangles that it meets."""
+    the ray clears the sides of all triangles by the 1/256 px that OpenGL rounds corners to."""
     px = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1).reshape(-1, 2)
     r = rays(camera.normalise(px.astype(float)))
     best, clear = np.zeros(len(r)), np.ones(len(r), bool)
@@ -34,7 +34,7 @@ def exact_depth(mesh, camera, T_world_cam):
         sides = np.stack([r @ (e / np.linalg.norm(e)) for e in (np.cross(p[i], p[i - 2]) for i in range(3))])
         inner = np.maximum(sides.min(0), -sides.max(0))
         best = np.where((inner > 0) & (q > best), q, best)
-        clear &= np.abs(inner) > 1e-6
+        clear &= np.abs(inner) > 1.5e-5
     return (1 / best).reshape(camera.height, -1), clear.reshape(camera.height, -1)
 
 
@@ -100,8 +100,9 @@ def test_depth_is_exact(camera):
         T = looking(yaw, pitch)
         depth = renderer.depth(camera, Moment(T))
         exact, clear = exact_depth(room.mesh, camera, T)
-        assert clear.mean() > 0.99
-        assert np.abs(depth - exact)[clear].max() < 1e-5
+        wrong = np.abs(depth - exact)[clear] > 1e-5
+        assert clear.mean() > 0.999
+        assert wrong.mean() <= (2e-5 if camera.distortion else 0)  # a lens may miss a sliver of a face
 
 
 def test_nothing_has_no_depth(boxes):
@@ -124,13 +125,13 @@ def test_same_bytes_again(camera, boxes):
 
 
 @pytest.mark.parametrize("camera", [D435I, EUROC], ids=["d435i", "euroc"])
-def test_tracks_follow_the_scene(camera, boxes):
-    errors = []
+def test_tracks_follow_the_scene(camera):
+    renderer, errors = GlRenderer(furnished(60)), []
     for k in range(6):
         T0, T1 = looking(0.9 * k, 0.05), looking(0.9 * k + 0.02, 0.06, (4.53, 3.02, 1.59))
-        before, after = (to_bytes(boxes.radiance(camera, [Moment(T)])) for T in (T0, T1))
+        before, after = (to_bytes(renderer.radiance(camera, [Moment(T)])) for T in (T0, T1))
         px = cv2.goodFeaturesToTrack(before, 200, 0.01, 12).reshape(-1, 2)
-        depth = boxes.depth(camera, Moment(T0))
+        depth = renderer.depth(camera, Moment(T0))
         z = depth[px[:, 1].astype(int), px[:, 0].astype(int)].astype(float)
         points = rays(camera.normalise(px.astype(float))) * z[:, None]
         true = camera.project(transform(inverse(T1) @ T0, points))
@@ -138,7 +139,7 @@ def test_tracks_follow_the_scene(camera, boxes):
         found = track(before, after, px[ok], true[ok])
         errors.append(np.linalg.norm(found - true[ok], axis=1))
     error = np.concatenate(errors)
-    assert len(error) > 300
+    assert len(error) > 400
     assert np.median(error) < 0.03
 
 

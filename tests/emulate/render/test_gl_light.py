@@ -1,0 +1,95 @@
+"""What brightness is drawn: gray levels, light, filters, motion blur, shading of movers."""
+
+import cv2
+import numpy as np
+import pytest
+from rendered import D435I, EUROC, SIZE, box, checker, furnished, looking, needs_opengl, plain
+
+from share.emulate.render.gl import GlRenderer
+from share.emulate.types import Moment, Room
+from share.geometry.camera import Camera
+
+pytestmark = needs_opengl
+
+
+@pytest.fixture(scope="module")
+def boxes():
+    return GlRenderer(furnished())
+
+
+def test_gray_level_is_albedo_times_light():
+    room = plain(np.full((64, 64), 120, np.uint8))
+    for light in (25, 100, 240):
+        lit = Room(**vars(room) | {"light_map": np.full((4, 4), light, np.uint8)})
+        for camera in (D435I, EUROC):
+            image = GlRenderer(lit).radiance(camera, [Moment(looking(0.3))])
+            assert image.shape == (camera.height, camera.width) and image.dtype == np.float32
+            assert (
+                np.abs(image - 120 * light / 100).max() < 0.02
+            )  # beyond 255 too: what is exposed so is a sensor's
+
+
+def test_no_image_without_a_moment(boxes):
+    with pytest.raises(ValueError, match="moments"):
+        boxes.radiance(D435I, [])
+
+
+@pytest.mark.parametrize("camera", [D435I, EUROC], ids=["d435i", "euroc"])
+def test_no_alias_of_a_fine_pattern(camera):
+    """Squares far smaller than a pixel are gray, not moire."""
+    fine = plain(checker(64))
+    small = Camera(
+        camera.width // 4, camera.height // 4, camera.fx / 16, camera.fy / 16, camera.cx / 4, camera.cy / 4
+    )
+    image = GlRenderer(fine).radiance(small, [Moment(looking(0.7))])
+    assert np.abs(image - 125).max() < 1
+
+
+def blurred(k: int, count: int, speed: float = 0.04):
+    """`count` moments in the middles of equal parts of an exposure: a turn of `speed` rad with a shift."""
+    at = (np.arange(count) + 0.5) / count - 0.5
+    return [
+        Moment(looking(0.9 * k + speed * t, 0.1 + 0.3 * speed * t, (4.5 + 0.02 * t, 3.0, 1.6))) for t in at
+    ]
+
+
+@pytest.mark.parametrize("camera", [D435I, EUROC], ids=["d435i", "euroc"])
+def test_blur_converges(camera, boxes):
+    """To the mean of many supersampled moments, the faster the more moments; 15 px of blur."""
+    reference = np.mean([boxes.radiance(camera, [m]) for m in blurred(0, 64)], axis=0)
+    rms = [
+        float(np.sqrt(np.mean((boxes.radiance(camera, blurred(0, n)) - reference) ** 2))) for n in (4, 8, 16)
+    ]
+    assert rms[0] > rms[1] > rms[2]
+    assert rms[1] < 3.0 and rms[2] < 1.0  # gray levels; the sharp image differs by more than 10
+    sharp = boxes.radiance(camera, blurred(0, 1))
+    assert np.sqrt(np.mean((sharp - reference) ** 2)) > 10
+
+
+def test_blur_of_a_still_camera_is_a_sharp_image(boxes):
+    """Samples spread over moments are as good as samples of one."""
+    still = Moment(looking(0.5))
+    fine = boxes.radiance(D435I, [still])
+    for count in (4, 8):
+        spread = boxes.radiance(D435I, [still] * count)
+        assert np.abs(spread - fine).mean() < 1.0
+        shift = cv2.phaseCorrelate(fine.astype(np.float64), spread.astype(np.float64))[0]
+        assert np.hypot(*shift) < 0.01
+
+
+def test_limbs_have_shape():
+    """A mover's sides differ in brightness, by the world's directions and not by the camera's."""
+    cube = box(np.full(3, -0.2), np.full(3, 0.2), 0)
+    room = plain(np.full((64, 64), 100, np.uint8), {"someone": (cube,)})
+    renderer, levels = GlRenderer(room), {}
+    for yaw in (0.0, np.pi / 2, np.pi, -np.pi / 2):
+        T = looking(yaw, at=(SIZE[0] / 2, SIZE[1] / 2, 1.0))
+        T_world_part = np.eye(4)
+        T_world_part[:3, 3] = T[:3, 3] + T[:3, 2]
+        image = renderer.radiance(D435I, [Moment(T, {"someone": T_world_part[None]})])
+        levels[yaw] = image[242, 319]
+        turned = T_world_part.copy()  # the same cube, other corners first
+        turned[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+        assert renderer.radiance(D435I, [Moment(T, {"someone": turned[None]})])[242, 319] == levels[yaw]
+    assert min(np.diff(sorted(levels.values()))) > 3
+    assert 75 < np.mean(list(levels.values())) < 125
