@@ -8,6 +8,7 @@ import numpy as np
 
 from share.emulate.world.mesh import Shape
 from share.emulate.world.proximity import within
+from share.geometry.target import Target
 from share.types import F64
 
 
@@ -38,10 +39,19 @@ class Light:
 
 
 @dataclass(frozen=True, eq=False)
+class PlacedTarget:
+    """A calibration target in a room. T_world_target (4, 4): frame as `share.geometry.target` has it."""
+
+    target: Target
+    T_world_target: F64
+
+
+@dataclass(frozen=True, eq=False)
 class Layout:
     """size: extent (3,) m from the origin. shell: walls, floor, ceiling and what carries them, which
     nothing removes, facing inwards. pieces: everything else. ambient: light that comes from nowhere, as a
-    share of the mean. brightness: mean light, 1 = albedo is the gray level."""
+    share of the mean. brightness: mean light, 1 = albedo is the gray level. target: what cameras are
+    calibrated with, where there is one."""
 
     name: str
     seed: int
@@ -51,6 +61,7 @@ class Layout:
     lights: tuple[Light, ...]
     ambient: float = 0.15
     brightness: float = 1.0
+    target: PlacedTarget | None = None
 
     @property
     def everything(self) -> tuple[Piece, ...]:
