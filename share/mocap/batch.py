@@ -16,7 +16,6 @@ from share.mocap.state import SHARED, State
 from share.types import F64, ImuBatch
 
 _BIAS_SIGMA = np.repeat([0.2, 1.0], 3)  # rad/s, m/s^2: no IMU is worse; only holds what no motion shows
-_OFFSET_SIGMA = 0.02  # s: what the coarse offset may be wrong by
 _TILT_SIGMA = 1.0  # rad: none to speak of
 _CONVERGED = 1e-7  # of the cost
 
@@ -100,7 +99,7 @@ class Batch:
     def _prior(self) -> F64:
         """Information (9,) of the first guess; without one from the user, hardly any."""
         rotation, position = (3.0, 3.0) if self.options.T_body_mocap is None else self.options.guess_sigma
-        sigma = [_TILT_SIGMA] * 2 + [rotation] * 3 + [position] * 3 + [_OFFSET_SIGMA]
+        sigma = [_TILT_SIGMA] * 2 + [rotation] * 3 + [position] * 3 + [self.options.offset_sigma]
         return np.array(sigma) ** -2
 
     def _strayed(self, state: State) -> F64:

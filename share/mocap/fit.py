@@ -73,7 +73,7 @@ def fit(imu: ImuBatch, noise: ImuNoise, mocap: Mocap, options: FitOptions | None
     options = options or FitOptions()
     check_imu(imu, _IMU_HOLE_NS)
     inflated = _inflated(noise, options.imu_inflation)
-    coarse_ns = coarse_offset(imu, mocap, options.within_s)
+    coarse_ns = 0 if options.within_s == 0 else coarse_offset(imu, mocap, options.within_s)
     near = _overlap(imu, mocap.shifted(coarse_ns))
     guess, bias = _mounting(imu, near, options)
     nodes, breaks = _nodes(near, options)

@@ -31,9 +31,13 @@ from share.types import F64, I64, ImuBatch
 _MARGIN_S = 5.0  # fitted before and after what is asked for: the ends of a batch are known least
 _LEAST_S = 1.0
 
-# docs/mocap-fit.md has the figures. EuRoC's truth is itself smoothed with the gyro: good in rotation.
-EUROC = FitOptions(sigma_position=0.0015, sigma_rotation=np.radians(0.1), gravity=GRAVITY)
+# Figures: docs/mocap-fit.md. EuRoC's truth is an estimate from this very IMU and its clock; TUM-VI's, and
+# EuRoC's raw vicon0, are what cameras saw.
+EUROC = FitOptions(
+    sigma_position=0.0015, sigma_rotation=np.radians(0.3), within_s=0, offset_sigma=1e-5, gravity=GRAVITY
+)
 TUMVI = FitOptions(sigma_position=0.0005, sigma_rotation=np.radians(0.3), gravity=GRAVITY, bridge_s=1.0)
+_RAW = ("mocap0", "vicon0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +67,12 @@ def open_recording(
 ) -> Recording:
     """The motion in `folder` from `start` s after IMU and truth both began, for `seconds` or to the end.
 
-    options: EUROC or TUMVI. Raises UsageError for a folder or a span that is not there, DataError or
-    ConfigError for what is damaged or does not fit.
+    options: EUROC or TUMVI; the raw mocap of an ASL folder is fitted as TUM-VI's. Raises UsageError for
+    a folder or a start that is not there, DataError or ConfigError for what is damaged or does not fit.
     """
     files = _files(folder)
+    if files.truth.parent.name in _RAW:
+        options = TUMVI
     T_body_cam0, noise = files.mounting()
     imu, mocap = _read_imu(files.imu), _read_mocap(files.truth)
     first, last = _span(folder, imu, mocap, start, seconds)
@@ -149,12 +155,14 @@ def _span(folder: Path, imu: ImuBatch, mocap: Mocap, start: float, seconds: floa
     if end <= begin:
         raise DataError(f"{folder}: IMU and truth do not overlap; are they of one recording?")
     first = begin + round(start * 1e9)
-    last = end if seconds is None else first + round(seconds * 1e9)
-    if start < 0 or last > end + 1 or last - first < _LEAST_S * 1e9:
-        have = (end - begin) * 1e-9
-        asked = f"{start:g} s to {'its end' if seconds is None else f'{start + seconds:g} s'}"
-        raise UsageError(f"{folder}: {asked} was asked for; IMU and truth together last {have:.1f} s")
-    return first, min(last, end)
+    last = end if seconds is None else min(end, first + round(seconds * 1e9))
+    if start < 0 or last - first < _LEAST_S * 1e9:
+        have, left = (end - begin) * 1e-9, (last - first) * 1e-9
+        raise UsageError(
+            f"{folder}: {left:.1f} s are left from {start:g} s on, of {have:.1f} s of IMU and truth; "
+            f"at least {_LEAST_S:g} s are needed"
+        )
+    return first, last
 
 
 def _imu_between(imu: ImuBatch, start_ns: int, end_ns: int) -> ImuBatch:
@@ -168,6 +176,6 @@ def _said(path: RecordedPath) -> str:
     gaps_s = float(np.diff(path.gaps, axis=1).sum()) * 1e-9
     return (
         f"fitted to {left.position_mm:.1f} mm and {left.rotation_deg:.2f} deg (rms) of the motion capture; "
-        f"its body is {turned:.2f} deg and {arm:.0f} mm from the IMU, its world {found.tilt_deg:.2f} deg from "
+        f"its body is {turned:.2f} deg and {arm:.0f} mm from the IMU, its world {found.tilt_deg:.2f} deg off "
         f"level, its clock {-found.offset_ns * 1e-6:+.1f} ms from the IMU's; {gaps_s:.1f} s have no truth"
     )
