@@ -24,6 +24,7 @@ RADIUS = 0.20  # m: a TurtleBot 4 is 34 cm wide
 STILL_S = 1.3
 PITCH = 0.10  # rad, of the camera: a little upwards
 _ARM = 0.25  # m of way that a radian of turning in place counts as
+_DRIVEN = 0.9  # rad, a corner that it takes in a bend
 _TURN_STEP = 0.02  # rad
 _WHEELS_S = 0.08  # sigma: how slowly the wheels follow
 _DIVE = 0.010  # rad per m/s^2 of speeding up: the castors give
@@ -39,7 +40,7 @@ def way_of(floor: Floor, legs: Sequence[F64]) -> Way:
     """Each leg of a tour as a smooth line; between them the robot turns in place, which goes on for
     _ARM metres of way a radian."""
     parts: list[Way] = []
-    for leg in legs:
+    for leg in _strung(legs):
         xy = smooth(floor, leg, RADIUS)
         heading = headings(xy)
         bend = np.gradient(heading) / np.gradient(arc_length(xy))
@@ -87,6 +88,18 @@ def path_of(track: Track, height: float, vibration: float, start_ns: int, rng: R
     nose = PITCH + pitch + _DIVE * gain
     R = turn(2, track.heading) @ turn(1, -nose) @ turn(0, roll)
     return through(start_ns, track.seconds, p, se3.quat_from_matrix(R @ CAMERA_AXES))
+
+
+def _strung(legs: Sequence[F64]) -> list[F64]:
+    """Legs that go on in nearly the same direction as one: there it drives through."""
+    out = [legs[0]]
+    for leg in legs[1:]:
+        before, after = out[-1][-1] - out[-1][-6:][0], leg[:6][-1] - leg[0]
+        if abs(np.angle(complex(*after) / complex(*before))) < _DRIVEN:
+            out[-1] = np.concatenate([out[-1], leg[1:]])
+        else:
+            out.append(leg)
+    return out
 
 
 def _pivot(xy: F64, before: float, after: float) -> Way:

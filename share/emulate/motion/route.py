@@ -128,8 +128,10 @@ def headings(way: F64) -> F64:
 def _repelled(floor: Floor, p: F64, radius: float) -> F64:
     lack = (radius + 0.05 - floor.at(p)).clip(0, 0.1)
     lack[[0, -1]] = 0
-    out: F64 = p + 0.6 * lack[:, None] * floor.away(p).clip(-1, 1)
-    return out
+    short = np.flatnonzero(lack)
+    if len(short):
+        p[short] += 0.6 * lack[short, None] * floor.away(p[short]).clip(-1, 1)
+    return p
 
 
 def _score(way: F64, ahead: F64 | None) -> float:

@@ -68,31 +68,33 @@ def schedule(
     most (N,) m/s: speed limit at each place of the way; wanted (T - 1,) m/s: the speed one
     would like in each step. end: metres to have gone at the end, as nearly as possible.
     """
-    top = float(most.max())
-    cell = top * STEP_S / _SPEEDS
-    cells = int(way.gone[-1] / cell) + 1
-    place = np.arange(cells) * cell
+    cell = float(most.max()) * STEP_S / _SPEEDS
+    place = np.arange(int(way.gone[-1] / cell) + 1) * cell
     limit = np.interp(place, way.gone, most)
     xy = np.stack([np.interp(place, way.gone, way.xy[:, k]) for k in range(2)], axis=1)
-    shifts = np.arange(_SPEEDS + 1)
-    speeds = shifts * (cell / STEP_S)
-    allowed = speeds[:, None] <= np.maximum(limit, cell / STEP_S + 1e-9)
-    cost, back = np.full(cells, np.inf), np.zeros((len(wanted), cells), np.int8)
-    cost[0] = 0.0
+    speeds = np.arange(_SPEEDS + 1) * (cell / STEP_S)
+    barred = np.where(speeds[:, None] <= np.maximum(limit, speeds[1] + 1e-9), 0.0, np.inf)
+    cost, back = np.full(len(place), np.inf), np.zeros((len(wanted), len(place)), np.int8)
+    cost[0], first, last = 0.0, 0, 1  # where one can be by now: in place[first:last]
     for k, want in enumerate(wanted):
-        paid = np.full((len(shifts), cells), np.inf)
-        aim = np.minimum(want, limit)
-        for j in shifts[: min(len(shifts), cells)]:
-            source = slice(0, cells - j)
-            step = (speeds[j] - aim[source]) ** 2
-            paid[j, j:] = np.where(allowed[j, source], cost[source] + step, np.inf)
-        back[k] = np.argmin(paid, axis=0)
-        cost = np.min(paid, axis=0)
-        cost[_blocked(xy, others, k + 1)] = np.inf
-        if not np.isfinite(cost).any():
+        reach = min(last + _SPEEDS, len(place))
+        paid = np.full((len(speeds), reach - first), np.inf)
+        here = slice(first, last)
+        price = (speeds[:, None] - np.minimum(want, limit[here])) ** 2 + barred[:, here] + cost[here]
+        for j in range(len(speeds)):
+            kept = min(last, reach - j) - first
+            paid[j, j : j + max(kept, 0)] = price[j, : max(kept, 0)]
+        back[k, first:reach] = np.argmin(paid, axis=0)
+        now = np.min(paid, axis=0)
+        now[_blocked(xy[first:reach], others, k + 1)] = np.inf
+        cost[first:reach] = now
+        can = np.flatnonzero(np.isfinite(now))
+        if not len(can):
             return None
-    last = cost + (0 if end is None else 30 * (place - end) ** 2)
-    return _traced(back, int(np.argmin(last))) * cell
+        first, last = first + int(can[0]), first + int(can[-1]) + 1
+        cost[:first] = np.inf
+    total = cost + (0 if end is None else 30 * (place - end) ** 2)
+    return _traced(back, int(np.argmin(total))) * cell
 
 
 def smoothed(steps: F64, seconds: F64) -> F64:

@@ -22,6 +22,7 @@ from share.types import F64
 PEOPLE_M, ROBOT_M = 0.6, 0.5  # no nearer than this at any time
 _SPARE_M = 0.17  # heads lean and schedules are smoothed: plan for this much more
 _TOURS = 12  # that each agent tries before all begin anew
+_TOUCH_M = 0.05  # of the grid's own error
 _BEGIN_S = 0.8  # the smoothing in time lets motion begin this much sooner
 _PAUSE_S = (1.5, 4.5)
 _EASE = 1.08  # bends take their time: hope for this much more than is to be gone
@@ -65,27 +66,50 @@ class Ground:
         return self._networks[look]
 
 
+@dataclass(frozen=True, eq=False)
+class Course:
+    """A way, the speed limit (N,) m/s on it, and the speeds (T,) m/s one would like in each step."""
+
+    look: str
+    way: Way
+    most: F64
+    wanted: F64
+
+    def track(
+        self, ground: Ground, taken: Sequence[Other], duration: float, gone: float | None
+    ) -> Track | None:
+        """The motion on it that keeps off `taken`, and goes `gone` m; None if there is none."""
+        branch = _BRANCHES[self.look]
+        steps = schedule(self.way, self.most, self.wanted, taken, gone)
+        if steps is None:
+            return None
+        track: Track = branch.track_of(self.way, steps, duration)
+        fits = ground.floor.at(track.xy[::20]).min() >= branch.RADIUS - _TOUCH_M
+        return track if fits else None
+
+
 def move(
     ground: Ground, wish: Wish, taken: Sequence[Other], duration: float, seed: tuple[int, ...]
-) -> Track | None:
+) -> tuple[Course, Track] | None:
     """The motion of one that keeps off `taken` for `duration` s; None if no tour does."""
-    branch = _BRANCHES[wish.look]
     for attempt in range(_TOURS):
-        rng = np.random.default_rng((*seed, attempt))
-        wanted = _wanted(wish, branch.STILL_S, duration, rng)
-        longest = 1.15 * max(wanted.sum() * STEP_S, wish.gone or 0.0) + 1.0
-        start = None if wish.near is None else np.array(wish.near)
-        legs = ground.network(wish.look).tour(longest, rng, start)
-        if not legs:
-            return None
-        way: Way = branch.way_of(ground.floor, legs)
-        steps = schedule(way, speed_limit(way, wish.limits), wanted, taken, wish.gone)
-        if steps is None:
-            continue
-        track: Track = branch.track_of(way, steps, duration)
-        if ground.floor.at(track.xy[::20]).min() >= branch.RADIUS - ground.floor.step:
-            return track
+        course = _course(ground, wish, duration, np.random.default_rng((*seed, attempt)))
+        track = course.track(ground, taken, duration, wish.gone) if course else None
+        if course and track:
+            return course, track
     return None
+
+
+def _course(ground: Ground, wish: Wish, duration: float, rng: np.random.Generator) -> Course | None:
+    branch = _BRANCHES[wish.look]
+    wanted = _wanted(wish, branch.STILL_S, duration, rng)
+    longest = 1.3 * max(wanted.sum() * STEP_S, wish.gone or 0.0) + 1.0
+    start = None if wish.near is None else np.array(wish.near)
+    legs = ground.network(wish.look).tour(longest, rng, start)
+    if not legs:
+        return None
+    way: Way = branch.way_of(ground.floor, legs)
+    return Course(wish.look, way, speed_limit(way, wish.limits), wanted)
 
 
 def obstacle(xy: F64, distance: float) -> Other:
