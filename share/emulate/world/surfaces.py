@@ -34,8 +34,15 @@ def _wear(rng: Rng, metres: float, large: float, fine: float) -> F32:
     return large * cloud(rng, 1.4, high=80) + fine * cloud(rng, 0.4, low=40)
 
 
+def _mottle(rng: Rng, metres: float, strength: float) -> F32:
+    """Speckle of 1 to 4 cm with more strong specks than Gaussian noise has: what a corner detector finds on
+    a rough surface from across a room."""
+    band = cloud(rng, 0.5, metres / 0.04, metres / 0.011)
+    return single(strength * np.sign(band) * np.abs(band) ** 1.5)
+
+
 def plaster(rng: Rng, m: float) -> F32:
-    out = _wear(rng, m, 5, 2.5) + spots(rng, _per(rng, m, 6), (1.5, 5), (-38, 14))
+    out = _wear(rng, m, 5, 2.5) + _mottle(rng, m, 3) + spots(rng, _per(rng, m, 6), (1.5, 5), (-38, 14))
     return out + scratches(rng, _per(rng, m, 1.5), 90, (-28, 10))
 
 
@@ -45,17 +52,19 @@ def paint(rng: Rng, m: float) -> F32:
 
 def brick(rng: Rng, m: float) -> F32:
     rows, columns = 2 * round(m / 0.15), round(m / 0.25)
-    return courses(rng, rows, columns, 8, -15, 2) + _wear(rng, m, 6, 4)
+    return courses(rng, rows, columns, 8, -15, 2) + _wear(rng, m, 6, 4) + _mottle(rng, m, 5)
 
 
 def block(rng: Rng, m: float) -> F32:
     rows, columns = 2 * round(m / 0.4), round(m / 0.4)
-    out = courses(rng, rows, columns, 3.5, -14, 2) + _wear(rng, m, 4, 3)
+    out = courses(rng, rows, columns, 3.5, -14, 2) + _wear(rng, m, 5, 3) + _mottle(rng, m, 6)
     return out + spots(rng, _per(rng, m, 12), (1, 3), (-40, 0))
 
 
 def concrete(rng: Rng, m: float) -> F32:
-    out = _wear(rng, m, 8, 2.5) + courses(rng, round(m / 1.5), round(m / 1.5), 4, -16, 2, 0)
+    out = (
+        _wear(rng, m, 8, 3) + _mottle(rng, m, 6) + courses(rng, round(m / 1.5), round(m / 1.5), 4, -16, 2, 0)
+    )
     holes = spots(rng, _per(rng, m, 25), (0.8, 3), (-55, -15), 0.7)
     return out + holes + scratches(rng, _per(rng, m, 1), 160, (-30, -10))
 
@@ -64,28 +73,34 @@ def corrugated(rng: Rng, m: float) -> F32:
     phase = _ramp(round(m / 0.25), 1)
     flank = np.clip(6 * np.abs(phase - 0.5) - 1.5, -1, 1)
     rivets = ((_ramp(round(m / 0.25), 1) < 0.07) & (_ramp(round(m / 0.5), 0) < 0.035)) * -35.0
-    return single(9 * flank + rivets + _wear(rng, m, 4, 1.5) + 4 * grain(rng, 60, 2))
+    return single(9 * flank + rivets + _wear(rng, m, 4, 1.5) + 4 * grain(rng, 60, 2) + _mottle(rng, m, 4))
 
 
 def panel(rng: Rng, m: float) -> F32:
     out = courses(rng, round(m / 1.2), round(m / 0.8), 4, -30, 2, 0)
-    return out + _wear(rng, m, 3, 1.2) + spots(rng, _per(rng, m, 1.5), (1, 3), (-40, 10))
+    return (
+        out + _wear(rng, m, 3, 1.5) + _mottle(rng, m, 2.5) + spots(rng, _per(rng, m, 1.5), (1, 3), (-40, 10))
+    )
 
 
 def ceiling(rng: Rng, m: float) -> F32:
-    out = courses(rng, round(m / 0.6), round(m / 0.6), 3, -26, 2, 0) + _wear(rng, m, 2, 2)
+    out = (
+        courses(rng, round(m / 0.6), round(m / 0.6), 3, -26, 2, 0)
+        + _wear(rng, m, 2, 2)
+        + _mottle(rng, m, 1.5)
+    )
     return out + spots(rng, _per(rng, m, 60), (0.7, 1.6), (-40, -15))
 
 
 def screed(rng: Rng, m: float) -> F32:
     out = _wear(rng, m, 9, 3) + spots(rng, _per(rng, m, 9), (1, 7), (-36, 30))
     arcs = scratches(rng, _per(rng, m, 4), 140, (-26, 24))
-    return out + arcs + 4 * cloud(rng, 0.2, 12, 40)
+    return out + arcs + _mottle(rng, m, 7)
 
 
 def tiles(rng: Rng, m: float) -> F32:
     out = courses(rng, round(m / 0.3333), round(m / 0.3333), 5, -24, 3, 0)
-    return out + _wear(rng, m, 4, 2) + spots(rng, _per(rng, m, 5), (1, 4), (-35, 20))
+    return out + _wear(rng, m, 4, 2) + _mottle(rng, m, 2.5) + spots(rng, _per(rng, m, 5), (1, 4), (-35, 20))
 
 
 def planks(rng: Rng, m: float) -> F32:
@@ -95,11 +110,11 @@ def planks(rng: Rng, m: float) -> F32:
 def _fibre(rng: Rng, m: float) -> F32:
     """Grain of wood, along the rows, with some knots."""
     out = 5 * grain(rng, 1.2, 60) + 4 * grain(rng, 5, 120)
-    return out + _wear(rng, m, 3, 1.5) + spots(rng, _per(rng, m, 3), (2, 5), (-50, -20))
+    return out + _wear(rng, m, 3, 1.5) + _mottle(rng, m, 3) + spots(rng, _per(rng, m, 3), (2, 5), (-50, -20))
 
 
 def asphalt(rng: Rng, m: float) -> F32:
-    return _wear(rng, m, 5, 8) + spots(rng, _per(rng, m, 15), (1, 4), (-25, 35))
+    return _wear(rng, m, 5, 8) + _mottle(rng, m, 4) + spots(rng, _per(rng, m, 15), (1, 4), (-25, 35))
 
 
 def carpet(rng: Rng, m: float) -> F32:
@@ -114,16 +129,37 @@ def plywood(rng: Rng, m: float) -> F32:
     return 0.8 * _fibre(rng, m) + 6 * grain(rng, 14, 60)
 
 
+def _stencils(rng: Rng, m: float) -> F32:
+    """Words, arrows and boxes printed on cardboard."""
+
+    def draw(canvas: U8) -> None:
+        for _ in range(_per(rng, m, 14)):
+            x, y = rng.integers(P // 2, P + P // 2, 2).tolist()
+            size, ink = int(rng.uniform(0.04, 0.1) / m * P), float(128 - rng.uniform(30, 60))
+            what = rng.integers(3)
+            if what == 0:
+                word = "".join(rng.choice(list("ABCDEFHKLMNPRSTUX2345789"), 5))
+                cv2.putText(canvas, word, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size / 40, ink, 2, cv2.LINE_AA)
+            elif what == 1:
+                for k in (0, size):
+                    cv2.arrowedLine(canvas, (x + k, y), (x + k, y - size), ink, 2, cv2.LINE_AA, 0, 0.4)
+            else:
+                cv2.rectangle(canvas, (x, y), (x + size, y + size), ink, 2)
+
+    return scattered(draw)
+
+
 def cardboard(rng: Rng, m: float) -> F32:
-    out = _wear(rng, m, 6, 2) + 1.5 * grain(rng, 60, 1)
+    out = _wear(rng, m, 6, 2) + _mottle(rng, m, 3) + 1.5 * grain(rng, 60, 1)
     seam = np.zeros((P, P), np.float32)
     tape = int(rng.integers(P)), int(0.05 / m * P)
     seam[(np.arange(tape[1]) + tape[0]) % P] = rng.uniform(10, 26)
+    out += _stencils(rng, m)
     return out + seam + scratches(rng, _per(rng, m, 9), 60, (-30, 15))
 
 
 def steel(rng: Rng, m: float) -> F32:
-    out = _wear(rng, m, 4, 1) + scratches(rng, _per(rng, m, 18), 50, (-40, 40))
+    out = _wear(rng, m, 5, 1) + _mottle(rng, m, 2) + scratches(rng, _per(rng, m, 18), 50, (-40, 40))
     return out + spots(rng, _per(rng, m, 14), (1, 4), (-50, 25))
 
 
