@@ -5,17 +5,19 @@ specs -> recorded motions are placed, what stands in their way leaves -> simulat
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as File
 
 import numpy as np
 
-from share.emulate.motion import paper
+from share.emulate.motion import board, paper
 from share.emulate.motion.crowd import Member, Present, crowd, present_of
 from share.emulate.motion.floor import Floor, floor_of
 from share.emulate.motion.place import APART_M, Guest, place
 from share.emulate.motion.spec import (
+    BoardSpec,
     EurocSpec,
     PaperSpec,
     RecordedSpec,
@@ -91,6 +93,7 @@ def plan(specs: Sequence[str], layout: Layout, seconds: float, seed: int) -> Pla
     guests = [Guest(agent.name, agent.look, agent.path) for agent in recorded]
     layout, paths, notes = place(layout, guests, (seed, 71)) if guests else (layout, [], [])
     agents = [replace(agent, path=path) for agent, path in zip(recorded, paths, strict=True)]
+    agents += [_at_board(a, a.spec, layout, seconds, seed) for a in asked if isinstance(a.spec, BoardSpec)]
     agents += _simulated(asked, layout, [_present(agent) for agent in agents], seconds, seed)
     order = [name for a in asked for name in _names(a)]
     return Plan(layout, tuple(sorted(agents, key=lambda a: order.index(a.name))), tuple(notes))
@@ -141,6 +144,13 @@ def _recorded(asked: _Asked, seconds: float) -> Agent:
     return Agent(
         asked.name, kind, spec.look, found.path, asked.text, found.T_body_cam0, found.images_ns, notes
     )
+
+
+def _at_board(asked: _Asked, spec: BoardSpec, layout: Layout, seconds: float, seed: int) -> Agent:
+    """A device in a hand before the room's board; each name's motion is its own."""
+    rng = np.random.default_rng((seed, 74, zlib.crc32(asked.name.encode())))
+    path = board.exercise(layout, spec, min(seconds, spec.seconds or seconds), rng)
+    return Agent(asked.name, AgentKind.AR, "drone", path, asked.text, notes=_short(path, seconds))
 
 
 def _short(path: Path, seconds: float) -> tuple[str, ...]:

@@ -94,13 +94,29 @@ class RobotSpec:
 
 
 @dataclass(frozen=True)
+class BoardSpec:
+    """`board:` a device in a hand before a calibration board. distance: m, the usual one; it comes to a
+    little more than half of it and to nearly twice. vigour: 1 for camera and IMU together; below 0.5 it
+    is slow and pauses, for a camera alone."""
+
+    distance: float = 0.8
+    vigour: float = 1.0
+    seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        _positive(self, "distance", "vigour", "seconds")
+        _within("distance", self.distance, 0.3, 3.0, "m")
+        _within("vigour", self.vigour, 0.1, 2.0, "times the usual speed")
+
+
+@dataclass(frozen=True)
 class PaperSpec:
     """`paper:1` .. `paper:5`: the three agents of one of the paper's experiments, 60 s."""
 
     number: int = 1
 
 
-Spec: TypeAlias = EurocSpec | TumviSpec | TumSpec | WalkSpec | RobotSpec | PaperSpec
+Spec: TypeAlias = EurocSpec | TumviSpec | TumSpec | WalkSpec | RobotSpec | BoardSpec | PaperSpec
 
 KINDS: dict[str, type[Spec]] = {
     "euroc": EurocSpec,
@@ -108,6 +124,7 @@ KINDS: dict[str, type[Spec]] = {
     "tum": TumSpec,
     "walk": WalkSpec,
     "robot": RobotSpec,
+    "board": BoardSpec,
     "paper": PaperSpec,
 }
 _NAME = re.compile(r"([^:=]*)=(.*)", re.DOTALL)

@@ -28,18 +28,18 @@ _THICK = 0.012
 
 def sheet(target: Target) -> tuple[Shape, F64]:
     """The printed sheet in the target's own frame, and its extent (2, 2) m."""
-    texel = _texel(target)
     low, high = target.extent
-    tiles = np.ceil((high - low + 2 * MARGIN) / (_TILE * texel) - 1e-9).astype(int)
-    spare = np.floor((tiles * _TILE - (high - low) / texel) / 2 + 1e-6)  # whole texels: edges stay on the lattice
-    start = low - spare * texel
+    tiles, texel = _division(target)
+    spare = (tiles * _TILE - (high - low) / texel) / 2
+    start = low - np.floor(spare + 1e-6) * texel  # whole texels: edges stay on the lattice
+    paper = np.stack([low - MARGIN, high + MARGIN])
     rectangles = ink(target)
     parts = [
-        _tile(rectangles, start + texel * _TILE * np.array([i, j]), texel)
+        _tile(rectangles, start + texel * _TILE * np.array([i, j]), texel, paper)
         for j in range(tiles[1])
         for i in range(tiles[0])
     ]
-    return concat(parts), np.stack([start, start + tiles * _TILE * texel])
+    return concat(parts), paper
 
 
 def on_stand(target: Target, T_stand_target: F64, rng: Rng) -> Shape:
@@ -53,24 +53,26 @@ def on_stand(target: Target, T_stand_target: F64, rng: Rng) -> Shape:
     return concat([paper.moved(T_stand_target), plate.moved(T_stand_target), post, foot])
 
 
-def _texel(target: Target) -> float:
-    """m; an edge of a marker's cells is a whole number of texels, and of an AprilGrid's gaps too, where
-    its spacing is a multiple of 0.1."""
+def _division(target: Target) -> tuple[np.ndarray, float]:
+    """How many tiles (2,), and m a texel: as small as so many allow. An edge of a chessboard's square or
+    of a tag's cell is a whole number of texels, and of an AprilGrid's gap, if tag_spacing is a tenth."""
     cell = target.tag_size / 10 if isinstance(target, AprilGrid) else target.square / 16
-    return float(cell / np.ceil(cell / _COARSEST))
+    size = np.ptp(target.extent, axis=0) + 2 * MARGIN
+    tiles = np.ceil(size * np.ceil(cell / _COARSEST) / cell / _TILE).astype(int)
+    return tiles, float(cell / np.floor((tiles * _TILE * cell / size).min()))
 
 
-def _tile(rectangles: F64, low: F64, texel: float) -> Shape:
-    """The tile with its lower left corner at `low` (2,) m."""
+def _tile(rectangles: F64, low: F64, texel: float, paper: F64) -> Shape:
+    """What lies on the paper of the tile with its lower left corner at `low` (2,) m."""
     steps = (np.arange(P + 1) - _GUARD) * texel
     xs, ys = low[0] + steps, low[1] + _TILE * texel - steps
     pixels: U8 = (WHITE + (BLACK - WHITE) * darkness(rectangles, xs, ys)).round().astype(np.uint8)
-    a, b = _GUARD / P, 1 - _GUARD / P
-    square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])
+    ends = np.stack([low, low + _TILE * texel]).clip(*paper)
+    corners = np.array([(ends[i, 0], ends[j, 1]) for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
     mesh = Mesh(
-        vertices=np.column_stack([low + square * _TILE * texel, np.zeros(4)]).astype(np.float32),
+        vertices=np.column_stack([corners, np.zeros(4)]).astype(np.float32),
         normals=np.tile(np.array([0, 0, 1], np.float32), (4, 1)),
-        uv=np.array([(a, b), (b, b), (b, a), (a, a)], np.float32),
+        uv=(np.stack([corners[:, 0] - xs[0], ys[0] - corners[:, 1]], 1) / (P * texel)).astype(np.float32),
         layer=np.zeros(4, np.int32),
         faces=np.array([(0, 1, 2), (0, 2, 3)], np.int32),
     )
