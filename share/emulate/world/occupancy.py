@@ -12,6 +12,8 @@ from share.emulate.world.proximity import winding
 from share.types import F32, F64
 
 STEP = 0.05  # m
+_COARSE = 0.1  # m; for rooms of more than
+_MOST = 12_000_000  # voxels
 _SLICE = 200_000  # sample points at a time
 _BEHIND = 1e-4  # m
 
@@ -27,8 +29,9 @@ class Occupancy:
         self.solid, self.step = solid, step
 
     @classmethod
-    def of(cls, layout: Layout, step: float = STEP) -> Occupancy:
-        """The solid pieces of a layout, its shell and its bounds."""
+    def of(cls, layout: Layout, step: float | None = None) -> Occupancy:
+        """The solid pieces of a layout, its shell and its bounds; steps of 0.05 m, in large halls 0.1 m."""
+        step = step or (STEP if np.prod(layout.size) / STEP**3 < _MOST else _COARSE)
         shape = np.maximum(np.ceil(np.asarray(layout.size) / step - 1e-6).astype(int), 1)
         solid = np.zeros(shape, bool)
         for piece in layout.everything:
