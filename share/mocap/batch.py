@@ -97,14 +97,19 @@ class Batch:
         return out
 
     def _prior(self) -> F64:
-        """Information (9,) of the first guess; without one from the user, hardly any."""
+        """Information (10,) of the first guess; without one from the user, hardly any."""
         rotation, position = (3.0, 3.0) if self.options.T_body_mocap is None else self.options.guess_sigma
-        sigma = [_TILT_SIGMA] * 2 + [rotation] * 3 + [position] * 3 + [self.options.offset_sigma]
+        sigma = (
+            [_TILT_SIGMA] * 2
+            + [rotation] * 3
+            + [position] * 3
+            + [self.options.offset_sigma, self.options.drift_sigma]
+        )
         return np.array(sigma) ** -2
 
     def _strayed(self, state: State) -> F64:
-        """How far (9,) the shared unknowns are from the first guess."""
+        """How far (10,) the shared unknowns are from the first guess."""
         out = np.zeros(SHARED)
-        out[:2], out[8] = state.tilt, state.offset_s
+        out[:2], out[8], out[9] = state.tilt, state.offset_s, state.drift
         out[2:8] = se3.log(se3.inverse(self.guess) @ state.T_body_mocap)
         return out

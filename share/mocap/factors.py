@@ -38,7 +38,7 @@ class Chain:
 @dataclass(frozen=True, eq=False)
 class Sightings:
     """Mocap residuals (K, 6), rotation then position, by their sigma; derivatives by the node before
-    (K, 6, 15) and by the shared unknowns (K, 6, 9). node (K,): index of that node."""
+    (K, 6, 15) and by the shared unknowns (K, 6, 10). node (K,): index of that node."""
 
     residual: F64
     by_node: F64
@@ -96,7 +96,7 @@ def sightings(
 ) -> Sightings:
     """Residuals of mocap poses T_mocap (K, 4, 4) at stamps_ns (K,) + the offset, which must lie within
     the nodes. sigma (6,): rad, m. Each is tied to the node before it by the IMU between them."""
-    at = stamps_ns + round(state.offset_s * 1e9)
+    at = state.in_imu_clock(stamps_ns)
     i = np.clip(np.searchsorted(state.stamps_ns, at, "right") - 1, 0, len(state.p) - 2)
     inc = preintegrate(imu, state.stamps_ns[i], at, state.gyro_bias[i], state.accel_bias[i])
     t, g = inc.dt[:, None], gravity_vector(gravity)
@@ -127,6 +127,7 @@ def sightings(
     S[:, 3:, :2] = -R_wl @ se3.hat(marker) @ tilt
     S[:, 3:, 5:8] = R_wl @ R @ R_bm
     S[:, 3:, 8] = (v + _turn(lever, inc.rate_end)) @ R_wl.T
+    S[:, :, 9] = S[:, :, 8] * (stamps_ns - state.middle_ns)[:, None] * 1e-9
     return Sightings(residual / sigma, J / sigma[:, None], S / sigma[:, None], i)
 
 

@@ -39,9 +39,10 @@ class Fit:
     gyro_bias, accel_bias (N, 3). gaps (G, 2) ns, IMU clock: where the mocap says nothing for longer
     than is bridged. breaks (N - 1,) bool: nothing joins this node to the next.
     R_mocap_world (3, 3): from the levelled world to the mocap's; tilt_deg is its angle.
-    T_body_mocap (4, 4). offset_ns: IMU clock minus mocap clock.
-    cov_shared (9, 9): of tilt (2) rad, T_body_mocap (rotation rad, translation m; at the right), offset
-    s. cov_poses (N, 6, 6): of T_world_body, perturbed at the right.
+    T_body_mocap (4, 4). offset_ns: IMU clock minus mocap clock, in the middle of the path; drift_ppm: by
+    how much it grows, microseconds a second.
+    cov_shared (10, 10): of tilt (2) rad, T_body_mocap (rotation rad, translation m; at the right), offset
+    s, drift. cov_poses (N, 6, 6): of T_world_body, perturbed at the right.
     """
 
     stamps_ns: I64
@@ -54,6 +55,7 @@ class Fit:
     R_mocap_world: F64
     T_body_mocap: F64
     offset_ns: int
+    drift_ppm: float
     cov_shared: F64
     cov_poses: F64
     residuals: Residuals
@@ -144,7 +146,7 @@ def _report(batch: Batch, solved: Solved, coarse_ns: int) -> Fit:
     if not left.position_mm < _WORST_MM:
         raise MisfitError(_apart(f"{left.position_mm:.0f} mm rms are left"))
     offset_ns = coarse_ns + round(state.offset_s * 1e9)
-    at = batch.mocap.stamps_ns[trusted] + round(state.offset_s * 1e9)
+    at = state.in_imu_clock(batch.mocap.stamps_ns[trusted])
     covs = node_covariances(solved.normal, solved.cov_shared)
     return Fit(
         stamps_ns=state.stamps_ns,
@@ -157,6 +159,7 @@ def _report(batch: Batch, solved: Solved, coarse_ns: int) -> Fit:
         R_mocap_world=state.R_mocap_world,
         T_body_mocap=state.T_body_mocap,
         offset_ns=offset_ns,
+        drift_ppm=state.drift * 1e6,
         cov_shared=solved.cov_shared,
         cov_poses=_right(state.R, covs[:, :6, :6]),
         residuals=left,

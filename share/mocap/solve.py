@@ -17,8 +17,8 @@ from share.types import F64
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """H dx = -b. diagonal (N, 15, 15), below (N - 1, 15, 15): rows of the later node; border (N, 15, 9);
-    corner (9, 9); b_nodes (N, 15), b_shared (9,)."""
+    """H dx = -b. diagonal (N, 15, 15), below (N - 1, 15, 15): rows of the later node; border (N, 15, 10);
+    corner (10, 10); b_nodes (N, 15), b_shared (10,)."""
 
     diagonal: F64
     below: F64
@@ -31,8 +31,8 @@ class Normal:
 def normal_equations(
     chain: Chain, seen: Sightings, weight: F64, prior: F64, off_prior: F64, n: int
 ) -> Normal:
-    """Of all residuals; weight (K,) for the mocap's; prior (9,): information of the shared unknowns'
-    first guess, off_prior (9,): how far they have moved from it."""
+    """Of all residuals; weight (K,) for the mocap's; prior (10,): information of the shared unknowns'
+    first guess, off_prior (10,): how far they have moved from it."""
     J0, J1, r = chain.by_before, chain.by_after, chain.residual[..., None]
     diagonal, b = np.zeros((n, NODE, NODE)), np.zeros((n, NODE))
     diagonal[:-1] += J0.swapaxes(1, 2) @ J0
@@ -54,7 +54,7 @@ def normal_equations(
 
 
 def solve(normal: Normal, damping: float) -> tuple[F64, F64, F64]:
-    """Steps (N, 15) and (9,), and the covariance (9, 9) of the shared unknowns, with every diagonal
+    """Steps (N, 15) and (10,), and the covariance (10, 10) of the shared unknowns, with every diagonal
     element raised by the factor 1 + damping (Marquardt 1963). Raises LinAlgError if not positive."""
     from scipy.linalg import cho_solve_banded, cholesky_banded
 

@@ -48,10 +48,11 @@ def first_state(nodes_ns: I64, imu: ImuBatch, mocap: Mocap, T_body_mocap: F64, g
     _turn_by_gyro(T_world_body, mocap.known(nodes_ns), imu, nodes_ns, bias)
     tilt = _tilt(T_world_body[:, :3, :3], sampled(imu, nodes_ns, imu.accel))
     R_level = se3.so3_exp(np.append(tilt, 0.0)).T
+    middle = int(nodes_ns[0] + (nodes_ns[-1] - nodes_ns[0]) // 2)
     p = T_world_body[:, :3, 3] @ R_level.T
     v = np.gradient(p, (nodes_ns - nodes_ns[0]) * 1e-9, axis=0)
     R = R_level @ T_world_body[:, :3, :3]
-    return State(nodes_ns, R, p, v, bias, np.zeros((n, 3)), tilt, T_body_mocap)
+    return State(nodes_ns, R, p, v, bias, np.zeros((n, 3)), tilt, T_body_mocap, middle)
 
 
 def _tilt(R_world_body: F64, force: F64) -> F64:

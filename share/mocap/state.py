@@ -10,7 +10,7 @@ from share.geometry import se3
 from share.types import F64, I64
 
 NODE = 15  # rotation, position, velocity, gyro bias, accel bias
-SHARED = 9  # tilt, mocap body's rotation and position, time offset
+SHARED = 10  # tilt, mocap body's rotation and position, time offset and drift
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,8 +19,8 @@ class State:
     levelled world, biases (N, 3).
 
     tilt (2,): R_mocap_world = Exp(tilt_x, tilt_y, 0), so that levelling turns nothing about the
-    vertical. T_body_mocap (4, 4). offset_s: IMU clock minus mocap clock, in addition to what was
-    taken off before.
+    vertical. T_body_mocap (4, 4). offset_s: IMU clock minus mocap clock at middle_ns, in addition to
+    what was taken off before; drift: by how much it grows, seconds a second.
     """
 
     stamps_ns: I64
@@ -31,15 +31,22 @@ class State:
     accel_bias: F64
     tilt: F64
     T_body_mocap: F64
+    middle_ns: int
     offset_s: float = 0.0
+    drift: float = 0.0
+
+    def in_imu_clock(self, stamps_ns: I64) -> I64:
+        """Mocap's stamps (K,), the former offset taken off, as the IMU's clock would have them."""
+        late = self.offset_s * 1e9 + self.drift * (stamps_ns - self.middle_ns)
+        return np.asarray(stamps_ns + np.round(late).astype(np.int64), np.int64)
 
     @property
     def R_mocap_world(self) -> F64:
         return se3.so3_exp(np.append(self.tilt, 0.0))
 
     def moved(self, nodes: F64, shared: F64) -> State:
-        """Nodes (N, 15): rotations at the right, the others added. shared (9,): tilt added, the body's
-        pose perturbed at the right, offset added [s]."""
+        """Nodes (N, 15): rotations at the right, the others added. shared (10,): tilt added, the body's
+        pose perturbed at the right, offset [s] and drift added."""
         return State(
             self.stamps_ns,
             self.R @ se3.so3_exp(nodes[:, :3]),
@@ -49,5 +56,7 @@ class State:
             self.accel_bias + nodes[:, 12:15],
             self.tilt + shared[:2],
             self.T_body_mocap @ se3.exp(shared[2:8]),
+            self.middle_ns,
             self.offset_s + float(shared[8]),
+            self.drift + float(shared[9]),
         )

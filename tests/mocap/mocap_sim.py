@@ -75,9 +75,10 @@ def record_mocap(
     seed: int = 0,
     hz: float = 100.0,
     gaps: tuple[tuple[float, float], ...] = (),
+    drift: float = 0.0,
 ) -> Mocap:
-    """Poses of the mocap's body, stamped with a clock that is `offset_ns` behind the IMU's. sigma: m,
-    rad. gaps: s, where it sees nothing."""
+    """Poses of the mocap's body, stamped with a clock that is `offset_ns` behind the IMU's
+    in the middle, and more so by `drift` s a second. sigma: m, rad. gaps: s, where it sees nothing."""
     t = stamps(seconds - 0.3, hz, 0.3)
     s = (t - START_NS) * 1e-9
     rng = np.random.default_rng((seed, 2))
@@ -85,4 +86,5 @@ def record_mocap(
     T[:, :3, :3] = T[:, :3, :3] @ se3.so3_exp(rng.normal(0, sigma[1], (len(t), 3)))
     T[:, :3, 3] += rng.normal(0, sigma[0], (len(t), 3))
     keep = ~np.any([(s > a) & (s < b) for a, b in gaps], axis=0) if gaps else np.ones(len(t), bool)
-    return Mocap((t - offset_ns)[keep], T[keep])
+    late = offset_ns + np.round(drift * (t - START_NS - seconds * 5e8)).astype(np.int64)
+    return Mocap((t - late)[keep], T[keep])

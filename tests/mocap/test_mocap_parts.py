@@ -28,8 +28,10 @@ def start_state(rng: np.random.Generator) -> State:
     t = (NODES - START_NS) * 1e-9
     T, n = MOTION.pose(t), len(NODES)
     v = (MOTION.pose(t + 1e-4) - MOTION.pose(t - 1e-4))[:, :3, 3] / 2e-4
-    exact = State(NODES, T[:, :3, :3], T[:, :3, 3], v, np.zeros((n, 3)), np.zeros((n, 3)), TILT, BODY)
-    return exact.moved(rng.normal(0, 0.01, (n, NODE)), rng.normal(0, 0.01, SHARED) * ([1] * 8 + [0]))
+    exact = State(
+        NODES, T[:, :3, :3], T[:, :3, 3], v, np.zeros((n, 3)), np.zeros((n, 3)), TILT, BODY, int(NODES[5])
+    )
+    return exact.moved(rng.normal(0, 0.01, (n, NODE)), rng.normal(0, 0.01, SHARED) * ([1] * 8 + [0, 0]))
 
 
 def seen_at(state: State) -> factors.Sightings:

@@ -34,7 +34,12 @@ _LEAST_S = 1.0
 # Figures: docs/mocap-fit.md. EuRoC's truth is an estimate from this very IMU and its clock; TUM-VI's, and
 # EuRoC's raw vicon0, are what cameras saw.
 EUROC = FitOptions(
-    sigma_position=0.0015, sigma_rotation=np.radians(0.3), within_s=0, offset_sigma=1e-5, gravity=GRAVITY
+    sigma_position=0.0015,
+    sigma_rotation=np.radians(0.3),
+    within_s=0,
+    offset_sigma=1e-5,
+    drift_sigma=1e-8,
+    gravity=GRAVITY,
 )
 TUMVI = FitOptions(sigma_position=0.0005, sigma_rotation=np.radians(0.3), gravity=GRAVITY, bridge_s=1.0)
 _RAW = ("mocap0", "vicon0")
