@@ -33,6 +33,7 @@ from share.emulate.types import Path
 from share.emulate.world.layout import Layout
 from share.emulate.world.occupancy import Occupancy
 from share.errors import UsageError
+from share.geometry.camera import ImuNoise
 from share.types import F64, I64, AgentKind
 
 _SHORTEST_S, _LONGEST_S = 3.0, 3600.0
@@ -48,7 +49,7 @@ class Agent:
 
     T_body_cam0 (4, 4): how the camera sits on the body, where a recorded motion brings its own rig, else
     None: the sensor's profile says (a simulated body is the profile's IMU). images_ns (M,): stamps of
-    the recorded images, where there are any. spec: what the user asked for. notes: for a person.
+    the recorded images, where there are any; imu: noise of the recorded IMU. spec: what the user asked for. notes: for a person.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Agent:
     spec: str
     T_body_cam0: F64 | None = None
     images_ns: I64 | None = None
+    imu: ImuNoise | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -141,9 +143,8 @@ def _recorded(asked: _Asked, seconds: float) -> Agent:
     options = sources.EUROC if isinstance(spec, EurocSpec) else sources.TUMVI
     found = sources.open_recording(File(spec.path), options, spec.start, longest)
     notes = (*found.notes, *_short(found.path, seconds))
-    return Agent(
-        asked.name, kind, spec.look, found.path, asked.text, found.T_body_cam0, found.images_ns, notes
-    )
+    mount, stamps = found.T_body_cam0, found.images_ns
+    return Agent(asked.name, kind, spec.look, found.path, asked.text, mount, stamps, found.noise, notes)
 
 
 def _at_board(asked: _Asked, spec: BoardSpec, layout: Layout, seconds: float, seed: int) -> Agent:
