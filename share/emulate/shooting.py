@@ -89,7 +89,7 @@ def _frame(w: _Worker, take: Take, k: int) -> Iterator[Picture]:
     if actor.rig.depth is not None:
         (moment,) = w.stage.moments(take.who, time, _STILL, DEPTH)
         exact = w.renderer.depth(actor.rig.depth, moment)
-        yield _picture(DEPTH, stamp, actor.device.depth_mm(exact, grays[CAM0], frame), "depth")
+        yield _picture(DEPTH, stamp, actor.device.depth_mm(exact, grays[CAM0], frame, shot), "depth")
 
 
 def _picture(stream: str, stamp_ns: int, pixels: np.ndarray, how: str) -> Picture:

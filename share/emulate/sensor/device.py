@@ -23,6 +23,7 @@ from share.emulate.types import Path
 from share.io.profile_types import Inertial, Profile
 from share.types import F32, F64, I64, U8
 
+_READOUT = 0.9  # of a frame's time is what an exposure can take
 _PHASE, _DROPS, _JITTER, _LAMP, _CAMERA, _DEPTH, _GYRO, _ACCEL = range(8)  # streams of random numbers
 
 
@@ -98,7 +99,9 @@ class Device:
         if not self.effects.exposure:
             return Shots(np.full(len(light), reference), np.ones(len(light)), light)
         seen = np.asarray(brightness, np.float64) * light * self._imagers[0].mean_response
-        time, gain = exposures.auto_exposure(seen, model, reference, device.exposure_ms, device.gain)
+        least, most = device.exposure_ms
+        most = min(most, _READOUT * 1000 / self.profile.rate_hz)
+        time, gain = exposures.auto_exposure(seen, model, reference, (least, most), device.gain)
         return Shots(time, gain, light)
 
     def blur_offsets(self, shot: Shot, pixels_of_motion: float) -> F64:

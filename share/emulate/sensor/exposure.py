@@ -53,20 +53,22 @@ def auto_exposure(
 ) -> tuple[F64, F64]:
     """exposure_ms and gain, each (N,), for scenes of mean radiance `brightness` (N,), 0..255.
 
-    exposure_ms, gain: least and most of the device. Frame k sees what frame k - 1 - delay showed, goes
-    `damping` of the way to the target in stops, in steps of a fixed ratio, and holds still where it is within
-    a step. The first picture is well exposed already: the device has been running.
+    exposure_ms, gain: least and most of the device. Frame k follows from the mean of frame k - 1 - delay,
+    which is 255 at most: it goes `damping` of the way to the target in stops, in steps of a fixed ratio, and
+    holds still within a step. The first picture is well exposed already: the device has been running.
     """
     longest = min(model.longest_ms, exposure_ms[1])
     least, most = np.log([exposure_ms[0] * gain[0], longest * gain[1]])
     digit = np.log1p(model.step)
-    wanted = np.log(model.target * reference_ms / np.maximum(brightness, 1e-3))  # of log(exposure * gain)
-    product = np.empty(len(brightness))
-    now = wanted[0] if len(wanted) else 0.0
-    for k in range(len(brightness)):
+    scene = np.log(np.maximum(brightness, 1e-3) / reference_ms)  # of gray = scene * exposure * gain, in logs
+    product = np.empty(len(scene))
+    now = np.log(model.target) - scene[0] if len(scene) else 0.0
+    for k in range(len(scene)):
         seen = k - 1 - model.delay_frames
-        if seen >= 0 and abs(wanted[seen] - now) > digit:
-            now = now + model.damping * (wanted[seen] - now)
+        if seen >= 0:
+            shown = min(scene[seen] + product[seen], np.log(255))
+            error = product[seen] + np.log(model.target) - shown - now
+            now += model.damping * error if abs(error) > digit else 0.0
         now = np.clip(now, least, most)
         product[k] = np.clip(np.rint(now / digit) * digit, least, most)
     total = np.exp(product)

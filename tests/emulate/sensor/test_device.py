@@ -201,6 +201,13 @@ def test_pictures_come_out_at_the_target_brightness():
         assert abs(picture.mean() - 100) < 3
 
 
+def test_an_exposure_ends_before_the_next_picture():
+    dark = Device(profile("d435i", "640x480@90"), Effects(), (4,), START).shots(
+        np.array([START]), np.array([5.0])
+    )
+    assert dark.exposure_ms[0] == pytest.approx(10.0) and dark.gain[0] > 10
+
+
 def test_blur_off_draws_one_sharp_picture():
     sharp = Device(profile("d435i"), parse(["blur=off"]), (4,), START)
     blurred = Device(profile("d435i"), Effects(), (4,), START)
