@@ -55,12 +55,12 @@ def joints(plan: Plan) -> None:
         plan.lay("joint", decal((0, at - 0.006, 0), (x, 0, 0), (0, 0.012, 0), skin, plan.rng, proud=0.001))
 
 
-def columns(plan: Plan, walls: Sequence[Wall]) -> None:
-    """Half columns where the bays of walls meet."""
+def columns(plan: Plan, walls: Sequence[Wall], height: float) -> None:
+    """Half columns of `height` m where the bays of walls meet."""
     skin, wide, deep = pick(plan.rng, "steel"), 0.16, 0.12
     for wall in walls:
         for at in bays(wall.length):
-            post = block((0, -deep / 2, 0), (wide, deep, wall.height), skin, plan.rng)
+            post = block((0, -deep / 2, 0), (wide, deep, height), skin, plan.rng)
             plan.build("column", wall.put(post, at), keeps_off=True)
 
 

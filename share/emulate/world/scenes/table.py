@@ -46,7 +46,9 @@ SCENES = {
         (40, 14, 4),
     ),
     "whitewall": Scene("white walls, next to nothing to see", whitewall, (9, 6, 4), (6, 5, 2.7), (15, 12, 6)),
-    "board": Scene("an AprilGrid on a stand: to calibrate with", april_grid, (5, 5, 3), (4, 4, 2.6), (9, 9, 4)),
+    "board": Scene(
+        "an AprilGrid on a stand: to calibrate with", april_grid, (5, 5, 3), (4, 4, 2.6), (9, 9, 4)
+    ),
     "charuco-board": Scene("the same with a ChArUco board", charuco, (5, 5, 3), (4, 4, 2.6), (9, 9, 4)),
 }
 

@@ -60,7 +60,8 @@ def _shell(plan: Plan, walls: tuple[Wall, ...]) -> None:
         BAY,
     )
     joints(plan)
-    columns(plan, walls)
+    columns(plan, walls[::2], z - _GIRDER)
+    columns(plan, walls[1::2], z)
     girders(plan, _GIRDER)
 
 
@@ -98,15 +99,9 @@ def _belt_depth(size: Size) -> float:
 
 
 def _belt(plan: Plan, walls: tuple[Wall, ...]) -> None:
-    deep = _belt_depth(plan.size)
-    makers = {n: (w, m) for n, (w, m) in _standing(plan.size).items() if _depth(m) <= deep}
+    makers = _standing(plan.size) | (_DEEP if _belt_depth(plan.size) > 1 else {})
     for wall in walls:
         fill.along(plan, wall, makers, (0.03, 0.35))
-
-
-def _depth(maker: Maker) -> float:
-    """Of one example."""
-    return float(np.ptp(maker(np.random.default_rng(0)).bounds[:, 1]))
 
 
 def _rack_height(size: Size) -> float:
@@ -114,7 +109,7 @@ def _rack_height(size: Size) -> float:
 
 
 def _standing(size: Size) -> dict[str, tuple[float, Maker]]:
-    """What stands along walls: how often, and how it is made."""
+    """What stands along walls, not deeper than 0.62 m: how often, and how it is made."""
     top = _rack_height(size)
 
     def rack(rng: Rng) -> Shape:
@@ -137,9 +132,13 @@ def _standing(size: Size) -> dict[str, tuple[float, Maker]]:
         "ladder": (0.5, lambda r: ladders.leaning(r, r.uniform(1.8, 2.1))),
         "extinguisher": (0.8, hoses.extinguisher),
         "conduit": (0.7, lambda r: pipes.conduit(r, size[2])),
-        "loaded pallet": (2, lambda r: pallets.loaded(r, r.uniform(0.7, 1.8))),
-        "pallets": (0.8, lambda r: pallets.pile(r, int(r.integers(3, 9)))),
     }
+
+
+_DEEP: dict[str, tuple[float, Maker]] = {  # only where there is room for it
+    "loaded pallet": (2, lambda r: pallets.loaded(r, r.uniform(0.7, 1.8))),
+    "pallets": (0.8, lambda r: pallets.pile(r, int(r.integers(3, 9)))),
+}
 
 
 _HANGINGS: dict[str, tuple[float, Maker]] = {
