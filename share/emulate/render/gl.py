@@ -30,9 +30,9 @@ class GlRenderer:
     def radiance(self, camera: Camera, moments: Sequence[Moment]) -> F32:
         """Image (H, W) in linear gray levels; see `Renderer`.
 
-        A moment has 2 x 2 samples a pixel. Of four moments or more, each has one sample, elsewhere in
-        the pixel: samples over time and over the pixel are one sum (Cook et al. 1984). A lens would
-        blur single samples, so it always has four.
+        A moment has 2 x 2 samples a pixel. Of four moments or more each has one of these only: samples
+        over time and over the pixel are one sum (Cook, Porter & Carpenter 1984). A lens would blur
+        single samples when it looks between them, so it always has four.
         """
         if not moments:
             raise ValueError("moments: an image needs at least one")
@@ -64,11 +64,9 @@ class GlRenderer:
         return out
 
 
-@lru_cache(maxsize=16)
 def _offsets(count: int) -> F64:
-    """Where in a pixel each of `count` samples lies (count, 2), -0.5 to 0.5, their mean being 0: the R2
-    sequence, of which every stretch is spread evenly (Roberts 2018)."""
-    plastic = 1.32471795724474602596
-    places = (np.arange(count)[:, None] * (1 / plastic, 1 / plastic**2)) % 1.0
-    offsets: F64 = places - places.mean(axis=0)
+    """Where in its pixel each of `count` samples lies (count, 2) px, their mean being 0: the places of 2 x 2
+    samples by turns, opposite ones after each other."""
+    turns = np.array([(-0.25, -0.25), (0.25, 0.25), (0.25, -0.25), (-0.25, 0.25)])[np.arange(count) % 4]
+    offsets: F64 = turns - turns.mean(axis=0)
     return offsets
