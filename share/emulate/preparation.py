@@ -8,10 +8,12 @@ from pathlib import Path
 from share.emulate import room_file
 from share.emulate.motion import avatars
 from share.emulate.motion.plan import Agent, Plan, plan
+from share.emulate.motion.spline import SplinePath
 from share.emulate.progress import Progress
 from share.emulate.recipe import Recipe
 from share.emulate.sensor.device import Device, Pictures
 from share.emulate.stage import Actor, Stage
+from share.emulate.types import Path as Motion
 from share.emulate.world.layout import Layout
 from share.errors import UsageError
 from share.geometry.camera import Rig
@@ -59,12 +61,13 @@ def _actor(agent: Agent, number: int, recipe: Recipe) -> Actor:
     made = _profile(agent, recipe)
     rig = _mounted(made.rig(depth=sensors == _DEPTH), agent)
     seed = (recipe.seed, 7, number)
+    path = _of_imu(agent, rig)
     device = Device(made, recipe.effects, seed, agent.path.start_ns, (recipe.seed, 8))
     pictures = _outside(device.pictures(agent.path.start_ns, agent.path.end_ns), agent.path.gaps)
     if len(pictures) < 2:
         raise UsageError(f"{agent.name}: {agent.spec} leaves {len(pictures)} pictures; give it more time")
     avatar = avatars.make(agent.look, agent.path, (recipe.seed, 9, number))
-    return Actor(agent.name, agent.kind, rig, agent.path, device, avatar, pictures)
+    return Actor(agent.name, agent.kind, rig, path, device, avatar, pictures)
 
 
 def _profile(agent: Agent, recipe: Recipe) -> Profile:
@@ -85,6 +88,13 @@ def _mounted(rig: Rig, agent: Agent) -> Rig:
     if agent.T_body_cam0 is not None:
         rig = replace(rig, T_body_cam0=agent.T_body_cam0)
     return rig if agent.imu is None else replace(rig, imu=agent.imu)
+
+
+def _of_imu(agent: Agent, rig: Rig) -> Motion:
+    """The path of the rig's IMU: where it sits otherwise than a simulated body, the camera still does not."""
+    if agent.like_camera and isinstance(agent.path, SplinePath):
+        return agent.path.turned(rig.T_body_cam0[:3, :3].T)
+    return agent.path
 
 
 def _outside(pictures: Pictures, gaps: I64) -> Pictures:

@@ -26,10 +26,12 @@ from share.emulate.sensor.exposure import Shots
 from share.emulate.shooting import Take
 from share.emulate.stage import Actor, Stage
 from share.emulate.takes import write_recording, write_truth
+from share.emulate.world.layout import Layout
 from share.errors import ShareError, UsageError
 from share.io.files import atomic_write, writable_dir, writing
 from share.io.kalibr import to_kalibr
 from share.io.session import SCHEMA, SESSION
+from share.io.target import T_WORLD_TARGET, TARGET, to_plain
 
 PLAN = "plan.png"
 START_NS = 1_750_000_000 * 10**9  # session time 0 in the clock of an agent whose IMU is simulated
@@ -89,7 +91,7 @@ def _make(recipe: Recipe, out: Path, workers: int, progress: Progress, asl: bool
             write_recording(actor, files, partial / f"{actor.name}.mcap")
             write_truth(actor, partial / "truth" / f"{actor.name}.tum")
         draw_plan(partial / PLAN, layout, stage.actors)
-        atomic_write(partial / SESSION, _description(recipe, stage, notes))
+        atomic_write(partial / SESSION, _description(recipe, stage, layout, notes))
         if asl:
             to_asl(partial, [actor.name for actor in stage.actors], progress)
         shutil.rmtree(work)
@@ -151,7 +153,7 @@ def _check_space(folder: Path, stage: Stage, recipe: Recipe) -> None:
         )
 
 
-def _description(recipe: Recipe, stage: Stage, notes: tuple[str, ...]) -> str:
+def _description(recipe: Recipe, stage: Stage, layout: Layout, notes: tuple[str, ...]) -> str:
     """session.yaml. A stamp in an agent's files is session time + clock_offset_ns."""
     import yaml
 
@@ -172,6 +174,9 @@ def _description(recipe: Recipe, stage: Stage, notes: tuple[str, ...]) -> str:
         "notes": list(notes),
     }
     data = {"schema": SCHEMA, "provenance": provenance, "agents": agents}
+    if layout.target is not None:
+        placed = layout.target
+        data[TARGET] = to_plain(placed.target) | {T_WORLD_TARGET: placed.T_world_target.tolist()}
     return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
 
 

@@ -1,4 +1,4 @@
-"""Calibration targets in YAML, under Kalibr's names.
+"""Calibration targets in YAML, under Kalibr's names; also the `target` of a session.
 
 target_type: aprilgrid          target_type: charuco     (ours: Kalibr knows none)
 tagCols: 6                      squaresX: 9
@@ -17,6 +17,8 @@ from typing import Any
 from share.errors import ConfigError
 from share.geometry.target import AprilGrid, CharucoBoard, Target
 from share.io.section import Section, read_yaml
+from share.io.session import SESSION
+from share.types import F64
 
 _KEYS: dict[str, tuple[type[Target], dict[str, str]]] = {
     "aprilgrid": (
@@ -35,6 +37,8 @@ _KEYS: dict[str, tuple[type[Target], dict[str, str]]] = {
     ),
 }
 _TYPE = "target_type"
+TARGET = "target"  # of a session.yaml: the target that stands in its room, and there beside its keys
+T_WORLD_TARGET = "T_world_target"
 
 
 def read_target(path: Path) -> Target:
@@ -49,7 +53,7 @@ def target_of(section: Section) -> Target:
         raise ConfigError(f"{section.where}: {_TYPE}: '{kind}' is not known; known: {', '.join(_KEYS)}")
     cls, names = _KEYS[kind]
     for key in section.data:
-        if key not in names and key not in (_TYPE, "T_world_target"):
+        if key not in names and key not in (_TYPE, T_WORLD_TARGET):
             near = difflib.get_close_matches(str(key), names, n=1)
             hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(names)}"
             raise ConfigError(f"{section.where}: unknown key '{key}'; {hint}")
@@ -58,6 +62,16 @@ def target_of(section: Section) -> Target:
         return cls(**values)
     except ValueError as error:
         raise ConfigError(f"{section.where}: {error}") from None
+
+
+def session_target(folder: Path) -> tuple[Target, F64] | None:
+    """The target in a session's room and T_world_target (4, 4), None where there is none. Raises
+    ConfigError naming file and key."""
+    top = read_yaml(folder / SESSION)
+    if TARGET not in top:
+        return None
+    section = top.section(TARGET)
+    return target_of(section), section.pose(T_WORLD_TARGET)
 
 
 def to_plain(target: Target) -> dict[str, Any]:

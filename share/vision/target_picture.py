@@ -37,7 +37,8 @@ def darkness(rectangles: F64, xs: F64, ys: F64) -> F64:
 def _overlap(low: F64, high: F64, borders: F64) -> F64:
     """Share of each interval between `borders` (N + 1,) that low..high (M,) covers, (M, N)."""
     reach = np.minimum(high[:, None], borders[1:]) - np.maximum(low[:, None], borders[:-1])
-    return np.maximum(reach, 0) / np.diff(borders)
+    share: F64 = np.maximum(reach, 0) / np.diff(borders)
+    return share
 
 
 def _tags(grid: AprilGrid) -> F64:

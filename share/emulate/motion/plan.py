@@ -49,7 +49,8 @@ class Agent:
 
     T_body_cam0 (4, 4): how the camera sits on the body, where a recorded motion brings its own rig, else
     None: the sensor's profile says (a simulated body is the profile's IMU). images_ns (M,): stamps of
-    the recorded images, where there are any; imu: noise of the recorded IMU. spec: what the user asked for. notes: for a person.
+    the recorded images, where there are any; imu: noise of the recorded IMU. spec: what the user asked
+    for. notes: for a person. like_camera: the body has a camera's axes, x right, y down, z ahead.
     """
 
     name: str
@@ -61,6 +62,7 @@ class Agent:
     images_ns: I64 | None = None
     imu: ImuNoise | None = None
     notes: tuple[str, ...] = ()
+    like_camera: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +153,8 @@ def _at_board(asked: _Asked, spec: BoardSpec, layout: Layout, seconds: float, se
     """A device in a hand before the room's board; each name's motion is its own."""
     rng = np.random.default_rng((seed, 74, zlib.crc32(asked.name.encode())))
     path = board.exercise(layout, spec, min(seconds, spec.seconds or seconds), rng)
-    return Agent(asked.name, AgentKind.AR, "drone", path, asked.text, notes=_short(path, seconds))
+    notes = _short(path, seconds)
+    return Agent(asked.name, AgentKind.AR, "drone", path, asked.text, notes=notes, like_camera=True)
 
 
 def _short(path: Path, seconds: float) -> tuple[str, ...]:
@@ -180,8 +183,9 @@ def _simulated(
     if any(isinstance(a.spec, PaperSpec) for a in asked):
         floor, seconds = _inside(floor, _PAPER_SPACE_M), paper.SECONDS
     paths = crowd(Ground(floor), members, present, _things(layout, rng), seconds, (seed, 73))
+    kinds = {"person": AgentKind.AR, "robot": AgentKind.ROBOT}
     return [
-        Agent(m.name, AgentKind.AR if m.wish.look == "person" else AgentKind.ROBOT, m.wish.look, path, text)
+        Agent(m.name, kinds[m.wish.look], m.wish.look, path, text, like_camera=True)
         for m, path, text in zip(members, paths, texts, strict=True)
     ]
 

@@ -67,6 +67,11 @@ class SplinePath:
             quaternion=_with(self.quaternion, product(turn, self.quaternion.c)),
         )
 
+    def turned(self, R_body_new: F64) -> SplinePath:
+        """The motion of a body at the same place whose axes are turned by R_body_new (3, 3). Exact."""
+        turn = se3.quat_from_matrix(R_body_new)
+        return replace(self, quaternion=_with(self.quaternion, product(self.quaternion.c, turn)))
+
     def part(self, start_ns: int, end_ns: int) -> SplinePath:
         """The same motion between two stamps, which keep their meaning. Raises ValueError outside."""
         if not self.start_ns <= start_ns < end_ns <= self.end_ns:
