@@ -81,18 +81,15 @@ def dropped(seed: Seed, index: I64, share: float, burst: float) -> np.ndarray:
         return np.zeros(len(index), bool)
     reach = np.arange(_LONGEST_BURST)
     survive = (1 - 1 / burst) ** reach  # probability that a burst lasts longer than `reach` frames
-    start = _start_probability(share, survive)
-    lost = np.zeros(len(index), bool)
-    for back, alive in zip(reach, survive, strict=True):
-        if alive < 1e-9:
-            break
-        origin = index - back
-        known = origin >= 0
-        at = np.maximum(origin, 0)
-        begins = uniform((*seed, 0), at) < start
-        lasts = uniform((*seed, 1), at) < alive
-        lost |= known & begins & lasts
-    return lost
+    first = max(0, int(index.min()) - _LONGEST_BURST)
+    frames = np.arange(first, int(index.max()) + 1)
+    begins = uniform((*seed, 0), frames) < _start_probability(share, survive)
+    lasts = uniform((*seed, 1), frames)
+    lost = begins.copy()
+    for back in reach[1:][survive[1:] > 1e-9]:
+        lost[back:] |= begins[:-back] & (lasts[:-back] < survive[back])
+    out: np.ndarray = lost[index - first]
+    return out
 
 
 def _start_probability(share: float, survive: NDArray[Any]) -> float:
