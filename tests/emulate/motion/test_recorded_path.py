@@ -122,6 +122,25 @@ def test_an_asl_folder_gives_the_same(euroc: Recording, shared_data: Path, tmp_p
     assert same.noise == n
 
 
+def test_tumvis_own_folder_is_read_as_raw_mocap(shared_data: Path, tmp_path: Path) -> None:
+    plain, root = shared_data / "motion/tumvi/room1", tmp_path / "dataset-room1"
+    for name, file in (("imu0", "imu0.csv"), ("mocap0", "groundtruth.csv"), ("cam0", "cam_timestamps.txt")):
+        (root / "mav0" / name).mkdir(parents=True)
+        shutil.copy(plain / file, root / "mav0" / name / "data.csv")
+    (root / "dso").mkdir()
+    shutil.copy(plain.parent / "calib/kalibr_imucam_chain.yaml", root / "dso/camchain.yaml")
+    (root / "dso/imu_config.yaml").write_text(
+        "accelerometer_noise_density: 0.0028\naccelerometer_random_walk: 0.00086\n"
+        "gyroscope_noise_density: 0.00016\ngyroscope_random_walk: 2.2e-05\nupdate_rate: 200.0\n"
+    )
+    own = open_recording(root, EUROC, 5.0, 8.0)
+    same = open_recording(plain, TUMVI, 5.0, 8.0)
+    np.testing.assert_array_equal(own.path.fit.T_world_body, same.path.fit.T_world_body)
+    np.testing.assert_array_equal(own.T_body_cam0, same.T_body_cam0)
+    assert own.noise == same.noise
+    assert own.path.fit.residuals.position_mm < 1
+
+
 @pytest.mark.parametrize(("start", "seconds"), [(200.0, None), (-1.0, 5.0), (10.0, 0.1)])
 def test_a_span_that_is_not_there(shared_data: Path, start: float, seconds: float | None) -> None:
     with pytest.raises(UsageError, match=r"of 83\.. s of IMU and truth"):
