@@ -91,10 +91,17 @@ class Path(Protocol):
     recorded: a real IMU's samples, to be used untouched; None where the IMU is to be simulated.
     """
 
-    start_ns: int
-    end_ns: int
-    gaps: I64
-    recorded: ImuBatch | None
+    @property
+    def start_ns(self) -> int: ...
+
+    @property
+    def end_ns(self) -> int: ...
+
+    @property
+    def gaps(self) -> I64: ...
+
+    @property
+    def recorded(self) -> ImuBatch | None: ...
 
     def poses(self, stamps_ns: I64) -> F64:
         """T_world_body (N, 4, 4). Raises ValueError outside the span."""

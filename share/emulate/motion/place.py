@@ -17,7 +17,7 @@ from share.emulate.world.layout import Layout
 from share.emulate.world.occupancy import Occupancy
 from share.errors import UsageError
 from share.geometry import se3
-from share.types import F64
+from share.types import F32, F64
 
 CLEARANCE_M = 0.25
 APART_M = 0.5  # between two at the same time
@@ -121,7 +121,11 @@ def _shifts(p: F64, size: F64, look: str) -> F64:
         for a, b in zip(low[:2], high[:2], strict=True)
     ]
     likes = np.clip(_HEIGHTS[look] - p[:, 2].mean(), low[2], high[2])
-    heights = [likes] if look != "drone" else np.unique(np.clip(likes + [-0.4, 0, 0.4], low[2], high[2]))
+    heights = (
+        [likes]
+        if look != "drone"
+        else np.unique(np.clip(likes + np.array([-0.4, 0.0, 0.4]), low[2], high[2]))
+    )
     return np.array([(x, y, z) for x in axes[0] for y in axes[1] for z in heights])
 
 
@@ -149,10 +153,10 @@ def _body(xyz: F64, look: str) -> F64:
     return np.concatenate([xyz, *lower])
 
 
-def _look_up(grid: F64, points: F64) -> F64:
+def _look_up(grid: F64 | F32, points: F64) -> F64:
     cells = np.floor(points / _VOXEL_M).astype(int)
     i, j, k = np.clip(cells, 0, np.array(grid.shape) - 1).T
-    out: F64 = grid[i, j, k]
+    out: F64 = grid[i, j, k].astype(np.float64)
     return out
 
 
@@ -187,6 +191,7 @@ def _too_large(layout: Layout, guest: Guest, xyz: F64) -> str:
     have = " x ".join(f"{s:g}" for s in layout.size)
     ask = ",".join(f"{np.ceil(v * 2 + 1) / 2:g}" for v in (x, y, need[2]))
     return (
-        f"{guest.name}: its path needs {x:.1f} x {y:.1f} x {need[2]:.1f} m of free room, {layout.name} is {have} m; "
+        f"{guest.name}: its path needs {x:.1f} x {y:.1f} x {need[2]:.1f} m of free room, "
+        f"{layout.name} is {have} m; "
         f"ask for a larger --size, such as {ask}, or a shorter part (start=, seconds=)"
     )

@@ -51,7 +51,7 @@ class Network:
     @property
     def places(self) -> F64:
         """(N, 2) m, where a body may be."""
-        return self._cells * self.floor.step + self.floor.origin
+        return np.asarray(self._cells * self.floor.step + self.floor.origin, np.float64)
 
     def tour(self, length: float, rng: Rng, start: F64 | None = None) -> list[F64]:
         """Legs (n, 2) m, end to end, from the place nearest to `start` (2,) m, at least `length` m in all;
@@ -77,7 +77,7 @@ class Network:
     def _leg(self, at: int, ahead: F64 | None, rng: Rng) -> tuple[F64, int]:
         from scipy.sparse.csgraph import dijkstra
 
-        cost, before = dijkstra(self._graph, indices=at, return_predecessors=True)
+        _, before = dijkstra(self._graph, indices=at, return_predecessors=True)
         ends = rng.integers(len(self._cells), size=_PLACES)
         ends = ends[ends != at]
         ways = [self._way(before, at, int(end)) for end in ends]

@@ -45,7 +45,7 @@ class SplinePath:
         """Angular rate (N, 3) rad/s and specific force (N, 3) m/s^2 in the body frame."""
         t = self._seconds(stamps_ns)
         s, ds = self.quaternion(t), self.quaternion(t, 1)
-        force = self.position(t, 2) + (0.0, 0.0, GRAVITY)
+        force = self.position(t, 2) + np.array([0.0, 0.0, GRAVITY])
         R = se3.matrix_from_quat(s)
         return rate(s, ds), np.einsum("nji,nj->ni", R, force)
 
@@ -93,7 +93,8 @@ class SplinePath:
         stamps = np.asarray(stamps_ns, np.int64)
         if len(stamps) and not self.start_ns <= stamps.min() <= stamps.max() <= self.end_ns:
             raise ValueError(
-                f"stamps {stamps.min()} .. {stamps.max()} ns: the path spans {self.start_ns} .. {self.end_ns} ns"
+                f"stamps {stamps.min()} .. {stamps.max()} ns: "
+                f"the path spans {self.start_ns} .. {self.end_ns} ns"
             )
         return (stamps - self.start_ns) / 1e9
 
@@ -121,14 +122,16 @@ def continuous(q: F64) -> F64:
     """Quaternions (N, 4) of unit length with signs such that neighbours are near each other."""
     q = q / np.linalg.norm(q, axis=1, keepdims=True)
     flips = np.where(np.einsum("ni,ni->n", q[1:], q[:-1]) < 0, -1.0, 1.0)
-    return q * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+    out: F64 = q * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+    return out
 
 
 def rate(s: F64, ds: F64) -> F64:
     """Angular rate (N, 3) rad/s in the body frame, of quaternions s (N, 4) of any length and their
     derivatives."""
     conjugate = s * (-1.0, -1.0, -1.0, 1.0)
-    return 2 * product(conjugate, ds)[..., :3] / np.sum(s * s, axis=-1, keepdims=True)
+    out: F64 = 2 * product(conjugate, ds)[..., :3] / np.sum(s * s, axis=-1, keepdims=True)
+    return out
 
 
 def product(a: F64, b: F64) -> F64:

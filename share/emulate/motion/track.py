@@ -23,7 +23,7 @@ class Track:
 
 def instants(duration: float) -> F64:
     """Seconds (M,) from 0, every KNOT_S, to at least `duration`."""
-    return np.arange(int(np.ceil(duration / KNOT_S - 1e-9)) + 1) * KNOT_S
+    return np.arange(int(np.ceil(duration / KNOT_S - 1e-9)) + 1, dtype=np.float64) * KNOT_S
 
 
 def wander(rng: np.random.Generator, seconds: F64, periods: tuple[float, float], waves: int = 4) -> F64:

@@ -106,13 +106,15 @@ def _check(path: Path, stamps: I64, T: F64) -> None:
     lasts = float(stamps[-1] - stamps[0]) / 1e9
     if len(stamps) < _FEWEST or lasts < _SHORTEST_S:
         raise DataError(
-            f"{path}: {len(stamps)} poses in {lasts:.2f} s are too few; at least {_FEWEST} in {_SHORTEST_S:g} s are needed"
+            f"{path}: {len(stamps)} poses in {lasts:.2f} s are too few; "
+            f"at least {_FEWEST} in {_SHORTEST_S:g} s are needed"
         )
     steps = np.diff(stamps) / 1e9
     usual = float(np.median(steps))
     if usual > _SLOWEST_S:
         raise DataError(
-            f"{path}: a pose every {usual:.2f} s says nothing of accelerations; at most {_SLOWEST_S:g} s are needed"
+            f"{path}: a pose every {usual:.2f} s says nothing of accelerations; "
+            f"give one every {_SLOWEST_S:g} s or more often"
         )
     worst = int(np.argmax(steps))
     if steps[worst] > _LONGEST_GAP_S:
