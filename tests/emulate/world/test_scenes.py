@@ -17,6 +17,7 @@ from share.types import F64
 CLEARANCE = 0.45  # m
 SMALL = (9.0, 6.0, 4.0)  # the paper's room
 SEEDS = range(8)
+ROOMS = ("warehouse", "firestation", "corridor-twins", "whitewall")
 
 
 @cache
@@ -39,7 +40,7 @@ def described(room: Layout) -> list[tuple[str, bytes, bytes, bytes]]:
     ]
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", ROOMS)
 def test_everything_is_inside_the_room(name: str) -> None:
     for room in rooms(name):
         for piece in room.everything:
@@ -51,7 +52,7 @@ def test_everything_is_inside_the_room(name: str) -> None:
             assert (np.array(light.position) < room.size).all()
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", ROOMS)
 def test_the_same_seed_gives_the_same_room_and_another_seed_another(name: str) -> None:
     assert described(layout(name, 3)) == described(rooms(name)[3])
     shapes = {tuple(described(room)) for room in rooms(name)}
@@ -62,7 +63,7 @@ def apart(a: F64, b: F64) -> bool:
     return bool(((a[1] <= b[0] + 1e-3) | (a[0] >= b[1] - 1e-3)).any())
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", ROOMS)
 def test_solid_things_do_not_pass_through_each_other(name: str) -> None:
     for room in rooms(name):
         solid = [p for p in room.pieces if p.solid]
@@ -77,7 +78,7 @@ def touches_wall(piece: Piece, walls: F64) -> bool:
     return any(np.abs(piece.bounds[:, int(axis)] - at).min() < 0.02 for axis, at in walls)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", ROOMS)
 def test_nothing_floats(name: str) -> None:
     """All stands on the floor, hangs on a wall or under the ceiling."""
     for room in rooms(name):
@@ -198,7 +199,7 @@ def test_a_negative_seed() -> None:
         layout("whitewall", -1)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", ROOMS)
 @pytest.mark.parametrize("which", ["smallest", "largest"])
 def test_the_limits_themselves_are_rooms(name: str, which: str) -> None:
     if (name, which) == ("warehouse", "largest"):

@@ -20,7 +20,6 @@ from share.emulate.world.furniture import (
     small,
     tables,
 )
-from share.emulate.world.furniture.parts import pick
 from share.emulate.world.layout import Layout
 from share.emulate.world.materials import Material
 from share.emulate.world.mesh import Rng, Shape
@@ -44,18 +43,18 @@ def warehouse(seed: int, size: Size) -> Layout:
     _belt(plan, walls)
     _overhead(plan)
     for wall in walls:
-        fill.hang(plan, wall, _HANGINGS, int(1.5 * wall.length), min(size[2] - 0.5, 3.3))
+        fill.hang(plan, wall, _HANGINGS, int(1.1 * wall.length), min(size[2] - 0.5, 3.3))
     return plan.done(ambient=0.12, brightness=0.9)
 
 
 def _shell(plan: Plan, walls: tuple[Wall, ...]) -> None:
     rng, z = plan.rng, plan.size[2]
-    lower = pick(rng, str(rng.choice(["block", "brick", "concrete"])))
-    upper = pick(rng, str(rng.choice(["corrugated", "panel", "block", "plaster"])))
+    lower = Material(str(rng.choice(["block", "brick", "concrete"])), 0, contrast=0.8)
+    upper = Material(str(rng.choice(["corrugated", "panel", "block", "plaster"])), 1, contrast=0.8)
     enclose(
         plan,
         [(rng.uniform(1.8, 2.6), lower), (z, upper)],
-        Material("screed", contrast=0.9),
+        Material("screed", contrast=0.75),
         Material("corrugated", 0),
         BAY,
     )
