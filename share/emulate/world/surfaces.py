@@ -17,6 +17,8 @@ from share.types import F32, U8
 Rng = np.random.Generator
 Recipe = Callable[[Rng, float], F32]
 
+_ROUGHNESS = 1.3  # of all speckle: so that a warehouse has the corners of real halls (docs/rooms.md)
+
 
 def _per(rng: Rng, metres: float, density: float) -> int:
     """How many marks lie on a picture at `density` a square metre."""
@@ -38,7 +40,7 @@ def _mottle(rng: Rng, metres: float, strength: float) -> F32:
     """Speckle of 1 to 4 cm with more strong specks than Gaussian noise has: what a corner detector finds on
     a rough surface from across a room."""
     band = cloud(rng, 0.5, metres / 0.04, metres / 0.011)
-    return single(strength * np.sign(band) * np.abs(band) ** 1.5)
+    return single(_ROUGHNESS * strength * np.sign(band) * np.abs(band) ** 1.8)
 
 
 def plaster(rng: Rng, m: float) -> F32:

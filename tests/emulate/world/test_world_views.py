@@ -1,0 +1,32 @@
+"""Views from where one can stand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from share.emulate.world.layout import Layout
+from share.emulate.world.occupancy import Occupancy
+from share.emulate.world.views import looking, standing_views
+
+
+def test_views_are_upright_in_the_open_and_seeded(small_layout: Layout) -> None:
+    occupancy = Occupancy.of(small_layout)
+    views = standing_views(occupancy, 1, 40)
+    assert (occupancy.clearance(views[:, :3, 3]) > 0.25).all()
+    assert views[:, 2, 0] == pytest.approx(0)  # the horizon is level
+    assert np.linalg.det(views[:, :3, :3]) == pytest.approx(1)
+    assert (views[3::4, 2, 3] == 0.35).all() and (np.delete(views, np.s_[3::4], 0)[:, 2, 3] >= 1.5).all()
+    assert np.array_equal(views, standing_views(occupancy, 1, 40))
+    assert not np.array_equal(views, standing_views(occupancy, 2, 40))
+
+
+def test_a_camera_looks_where_it_is_told() -> None:
+    T = looking((1, 2, 3), np.pi / 2, 0.3)
+    assert T[:3, 2] == pytest.approx([0, np.cos(0.3), np.sin(0.3)])
+    assert T[:3, 0] == pytest.approx([1, 0, 0]) and T[2, 1] < 0  # right, and down
+
+
+def test_a_full_room_is_refused() -> None:
+    with pytest.raises(ValueError, match="nobody 1.9 m tall can stand"):
+        standing_views(Occupancy(np.ones((20, 20, 40), bool), 0.1), 1, 1)
