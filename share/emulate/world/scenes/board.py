@@ -18,6 +18,7 @@ from share.types import F64
 
 _FROM_WALL, _HEIGHT = 1.3, 1.35  # m, of the board's middle
 _TURN, _LEAN = 0.25, 0.12  # rad, at most
+_BRIGHT = 1.7  # so that exposures are short
 
 
 def april_grid(seed: int, size: Size) -> Layout:
@@ -41,7 +42,7 @@ def board_room(target: Target, seed: int, size: Size) -> Layout:
     plan.lay("board", board.on_stand(target, T, rng), solid=True)
     xs, ys = [size[0] * f for f in (0.3, 0.55, 0.8)], [size[1] * f for f in (0.2, 0.5, 0.8)]
     fill.light_tubes(plan, xs, ys, 1.2, 0.0)
-    return replace(plan.done(ambient=0.6), target=PlacedTarget(target, T))
+    return replace(plan.done(ambient=0.6), brightness=_BRIGHT, target=PlacedTarget(target, T))
 
 
 def _pose(target: Target, size: Size, rng: np.random.Generator) -> F64:

@@ -1,0 +1,70 @@
+"""Targets in YAML under Kalibr's names."""
+
+import re
+
+import numpy as np
+import pytest
+import yaml
+
+from share.errors import ConfigError
+from share.geometry.target import AprilGrid, CharucoBoard
+from share.io.target import read_target, session_target, to_plain
+
+KALIBR = """
+target_type: 'aprilgrid' #gridtype
+tagCols: 6               #number of apriltags
+tagRows: 5               #number of apriltags
+tagSize: 0.088           #size of apriltag, edge to edge [m]
+tagSpacing: 0.3          #ratio of space between tags to tagSize
+"""
+
+
+def written(tmp_path, text):
+    path = tmp_path / "target.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_kalibrs_file_is_read(tmp_path):
+    assert read_target(written(tmp_path, KALIBR)) == AprilGrid(
+        rows=5, cols=6, tag_size=0.088, tag_spacing=0.3
+    )
+
+
+@pytest.mark.parametrize(
+    "target", [AprilGrid(3, 4, 0.05, 0.2), CharucoBoard(5, 4, 0.1, 0.07, "DICT_6X6_250")]
+)
+def test_what_is_written_is_read_again(tmp_path, target):
+    assert read_target(written(tmp_path, yaml.safe_dump(to_plain(target)))) == target
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (KALIBR.replace("'aprilgrid'", "circles"), "target_type: 'circles' is not known; known: aprilgrid"),
+        (KALIBR.replace("tagSpacing", "tagSpace"), "unknown key 'tagSpace'; did you mean 'tagSpacing'?"),
+        (KALIBR.replace("tagSize: 0.088", ""), "key 'tagSize' is missing"),
+        (KALIBR.replace("tagCols: 6", "tagCols: 6.5"), "tagCols: expected a positive whole number"),
+        (KALIBR.replace("0.088", "-1"), "tagSize: -1 must be positive"),
+        (KALIBR.replace("0.3", "3"), "tag_spacing: 3 is a share of the tag's size"),
+        (KALIBR.replace("0.3", "wide"), "tagSpacing: expected numbers, found ['wide']"),
+        ("- 1", "expected keys and values"),
+    ],
+)  # fmt: skip
+def test_a_bad_file_is_refused_in_one_line(tmp_path, text, said):
+    with pytest.raises(ConfigError, match=re.escape(said)) as caught:
+        read_target(written(tmp_path, text))
+    assert str(caught.value).startswith(str(tmp_path / "target.yaml"))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_session_says_where_its_target_stands(tmp_path):
+    T = np.eye(4)
+    T[:3, 3] = 1, 2, 3
+    session = {"schema": 1, "target": to_plain(AprilGrid()) | {"T_world_target": T.tolist()}}
+    (tmp_path / "session.yaml").write_text(yaml.safe_dump(session))
+    target, T_world_target = session_target(tmp_path)
+    assert target == AprilGrid()
+    np.testing.assert_array_equal(T_world_target, T)
+    (tmp_path / "session.yaml").write_text("schema: 1")
+    assert session_target(tmp_path) is None
