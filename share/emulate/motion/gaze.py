@@ -20,8 +20,8 @@ _SIDE, _UP = 1.1, 0.6  # rad, how far the head turns off the trunk, and up or do
 _PEAK = 1.875
 _QUICKEST_S = 0.25
 _SLOWER = 8  # times that a turn is made a quarter longer
+_CLOSE_M = 0.7  # what is nearer than about this is not followed
 _NEAR, _FAR = 1.0, 8.0  # m, between which things are looked at
-_HEADSET_Z, _ROBOT_Z = 1.65, 0.35
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +105,9 @@ def _ahead(track: Track) -> tuple[F64, F64]:
 
 def _towards(track: Track, eye: float, xy: F64, z: F64 | float) -> tuple[F64, F64]:
     d = xy - track.xy
-    far = np.maximum(np.linalg.norm(d, axis=1), 0.8)
+    near = np.linalg.norm(d, axis=1) / _CLOSE_M
     off = np.angle(np.exp(1j * (np.arctan2(d[:, 1], d[:, 0]) - track.heading)))
-    side = _SIDE * np.sin(off)  # comes back to 0 straight behind, where left and right meet
-    up = _UP * np.tanh(np.arctan2(z - eye, far) / _UP)
+    # 0 straight behind, where left and right meet, and at what one walks over: nothing jumps there
+    side = _SIDE * np.sin(off) * (1 - np.exp(-(near**2)))
+    up = _UP * np.tanh(np.arctan2(z - eye, _CLOSE_M * np.hypot(near, 1)) / _UP)
     return track.heading + side, up

@@ -22,7 +22,7 @@ LENGTHS_M: dict[int, tuple[float, float, float]] = {
 _HEIGHTS_M = (1.70, 1.62, 0.35)
 _STROLL, _DRIVE = 0.80, 0.32  # m/s; who has less far to go stands more, not slower
 _BENDS = {"person": 1.1, "robot": 1.3}  # times the mean speed: what bends cost must be made good
-_BEGIN_S = 2.0
+_BEGIN_S = 2.4
 
 
 def members(number: int) -> list[Member]:
