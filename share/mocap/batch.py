@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from share.errors import MisfitError
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
 from share.mocap.factors import Chain, Sightings, imu_chain, sightings
@@ -17,7 +18,7 @@ from share.types import F64, ImuBatch
 
 _BIAS_SIGMA = np.repeat([0.2, 1.0], 3)  # rad/s, m/s^2: no IMU is worse; only holds what no motion shows
 _TILT_SIGMA = 1.0  # rad: none to speak of
-_CONVERGED = 1e-7  # of the cost
+_CONVERGED = 1e-6  # of the cost: far below what one sigma of anything costs
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ class Batch:
     options: FitOptions
 
     def minimise(self, state: State) -> Solved:
-        """From `state` downhill until the cost stands still."""
+        """From `state` downhill until the cost stands still. Raises MisfitError if it never does."""
         chain, seen, cost = self._measure(state)
         damping = 1e-4
         for _ in range(self.options.max_iterations):
@@ -54,7 +55,7 @@ class Batch:
             moved = state.moved(nodes, shared)
             tried = self._measure(moved)
             if not tried[2] < cost:
-                if damping > 1e6:
+                if damping > 1e6 or tried[2] - cost < _CONVERGED * cost:
                     break
                 damping *= 10
                 continue
@@ -63,6 +64,11 @@ class Batch:
             damping = max(damping / 10, 1e-12)
             if done:
                 break
+        else:
+            raise MisfitError(
+                f"mocap and IMU: no solution after {self.options.max_iterations} steps; check that both "
+                "are of one body, in metres and radians"
+            )
         normal = self._normal(state, chain, seen)
         weight = self._weight(seen)
         return Solved(state, chain, seen, weight, normal, solve(normal, 0.0)[2])

@@ -114,12 +114,19 @@ def _mounting(imu: ImuBatch, mocap: Mocap, options: FitOptions) -> tuple[F64, F6
 
 
 def _nodes(mocap: Mocap, options: FitOptions) -> tuple[I64, np.ndarray]:
-    """Nodes (N,) ns at even times, none in holes that break the chain; (N - 1,) bool: where it breaks."""
+    """Nodes (N,) ns at even times, none in holes that break the chain or in parts
+    too short to stand alone; (N - 1,) bool: where it breaks."""
     step = round(options.node_s * 1e9)
     nodes = np.arange(mocap.stamps_ns[0], mocap.stamps_ns[-1] + 1, step)
-    for start, end in holes(mocap.stamps_ns, round(options.break_s * 1e9)):
+    longest = round(options.break_s * 1e9)
+    for start, end in holes(mocap.stamps_ns, longest):
         nodes = nodes[(nodes <= start) | (nodes >= end)]
-    return nodes, np.diff(nodes) > options.break_s * 1e9
+    parts = np.split(nodes, np.flatnonzero(np.diff(nodes) > longest) + 1)
+    parts = [part for part in parts if len(part) * step > _LEAST_S * 1e9]
+    if not parts:
+        raise DataError(f"mocap: nowhere sees the body for {_LEAST_S:.0f} s; record again")
+    nodes = np.concatenate(parts)
+    return nodes, np.diff(nodes) > longest
 
 
 def _inner(mocap: Mocap, nodes: I64, breaks: np.ndarray) -> Mocap:
