@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from share.cli.progress import LiveLine, progress
+from share.cli.progress import LiveLine, Stages
 from share.config import POLICIES
 
 if TYPE_CHECKING:
@@ -29,11 +28,12 @@ class _Seconds(click.FloatRange):
 
 
 @click.command()
-@click.option("--seconds", type=_Seconds(2, 600), default=20, show_default=True)
+@click.option("--seconds", type=_Seconds(3, 600), default=20, show_default=True)
 @click.option("--policy", type=click.Choice(POLICIES), default=POLICIES[0], show_default=True)
 @click.option("--out", metavar="DIR", default="share-demo", show_default=True, help="Everything it leaves.")
+@click.option("--scene", help="Which kind of room (see share emulate --help).  [default: warehouse]")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Which room.")
-def demo(seconds: float, policy: str, out: str, seed: int) -> None:
+def demo(seconds: float, policy: str, out: str, scene: str | None, seed: int) -> None:
     """The whole system on this machine, nothing else needed.
 
     Makes a room with two headset wearers and a robot (kept for the next time), plays it in real
@@ -44,16 +44,16 @@ def demo(seconds: float, policy: str, out: str, seed: int) -> None:
     Example:  share demo --seconds 30 --out /tmp/demo
     """
     folder = Path(out)
-    from share.emulate.plain.session import cached_session
+    from share.emulate.demo import recipe
+    from share.emulate.session import cached_session
     from share.io.files import writable_dir
     from share.io.session import read_session
     from share.run.demo import play
     from share.run.score import score
 
     writable_dir(folder)
-    with progress(100, "making the room") as bar:
-        share_done = _Percent(bar)
-        session = read_session(cached_session(seconds=seconds, seed=seed, progress=share_done))
+    with Stages() as stages:
+        session = read_session(cached_session(recipe(_drawable(scene), seconds, seed), progress=stages))
     live = LiveLine()
     folders = play(session, seconds, policy, folder, lambda now: live.write(_line(now)))
     live.end()
@@ -69,16 +69,17 @@ def demo(seconds: float, policy: str, out: str, seed: int) -> None:
         click.echo(f"\npicture: {picture}   decisions of the edge: {folder / 'edge' / 'events.jsonl'}")
 
 
-class _Percent:
-    """Frames done of all, as steps of a bar of 100."""
+def _drawable(scene: str | None) -> str:
+    """The scene asked for; else the usual one, or the plain one where there is no OpenGL."""
+    from share.emulate.demo import FALLBACK, SCENE
+    from share.emulate.render.context import missing
 
-    def __init__(self, bar: Callable[[int], None]) -> None:
-        self._bar, self._done = bar, 0
-
-    def __call__(self, done: int, total: int) -> None:
-        percent = 100 * done // max(total, 1)
-        self._bar(percent - self._done)
-        self._done = percent
+    if scene is not None:
+        return scene
+    reason = missing()
+    if reason is not None:
+        click.echo(f"share: the plain room, because {reason}", err=True)
+    return SCENE if reason is None else FALLBACK
 
 
 def _line(now: Progress) -> str:

@@ -121,11 +121,8 @@ def emulate(
         effects=parse(effects),
         images=images or ("png" if euroc else "jpeg"),
     )
-    stages = Stages()
-    try:
+    with Stages() as stages:
         folder = make_session(recipe, Path(out), workers, stages, asl=euroc)
-    finally:
-        stages.end()
     made = _described(folder, euroc)
     click.echo(json.dumps(made) if as_json else _text(made))
 

@@ -38,7 +38,8 @@ class LiveLine:
 
 
 class Stages:
-    """A bar for each stage of a longer task, one after the other. Call it with (stage, done, total)."""
+    """A bar for each stage of a longer task, one after the other. Call it with (stage, done, total)
+    inside its block."""
 
     def __init__(self) -> None:
         self._stage, self._done = "", 0
@@ -47,13 +48,18 @@ class Stages:
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         if stage != self._stage:
-            self.end()
+            self._end()
             self._stage = stage
             self._bar = self._stack.enter_context(progress(total, f"{stage:24}"))
         self._bar(done - self._done)
         self._done = done
 
-    def end(self) -> None:
-        """Ends the bar that is shown, if any."""
+    def __enter__(self) -> Stages:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._end()
+
+    def _end(self) -> None:
         self._stack.close()
         self._stage, self._done = "", 0

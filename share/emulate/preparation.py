@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from share.emulate import room_file
-from share.emulate.motion import avatars
+from share.emulate.motion.avatars import Avatar, shapes
 from share.emulate.motion.plan import Agent, Plan, plan
 from share.emulate.motion.spline import SplinePath
 from share.emulate.progress import Progress
@@ -28,15 +28,16 @@ _DEPTH = "rgbd"
 
 
 def prepare(recipe: Recipe, work: Path, progress: Progress) -> tuple[Stage, Layout, tuple[str, ...]]:
-    """The stage, its room kept in `work`, what stands in it, and notes for a person. Raises UsageError, ConfigError, DataError
-    for what cannot be made."""
+    """The stage, its room kept in `work`, what stands in it, and notes for a person.
+
+    Raises UsageError, ConfigError or DataError for what cannot be made."""
     progress("planning", 0, 1)
     planned = plan(recipe.motions, furnish(recipe), recipe.seconds, recipe.seed)
     _check_names(recipe, planned)
     actors = tuple(_actor(agent, k, recipe) for k, agent in enumerate(planned.agents))
     progress("making the room", 0, 1)
     room = work / _ROOM
-    room_file.keep(planned.layout, {a.name: a.avatar.shapes for a in actors}, room)
+    room_file.keep(planned.layout, {a.name: a.shapes for a in actors}, room)
     notes = planned.notes + tuple(f"{a.name}: {note}" for a in planned.agents for note in a.notes)
     return Stage(room, actors), planned.layout, notes
 
@@ -66,8 +67,9 @@ def _actor(agent: Agent, number: int, recipe: Recipe) -> Actor:
     pictures = _outside(device.pictures(agent.path.start_ns, agent.path.end_ns), agent.path.gaps)
     if len(pictures) < 2:
         raise UsageError(f"{agent.name}: {agent.spec} leaves {len(pictures)} pictures; give it more time")
-    avatar = avatars.make(agent.look, agent.path, (recipe.seed, 9, number))
-    return Actor(agent.name, agent.kind, rig, path, device, avatar, pictures)
+    avatar = Avatar(agent.look, agent.path, agent.T_body_cam0)
+    look = shapes(agent.look, agent.path, (recipe.seed, 9, number))
+    return Actor(agent.name, agent.kind, rig, path, device, avatar, look, pictures)
 
 
 def _profile(agent: Agent, recipe: Recipe) -> Profile:

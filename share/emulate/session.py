@@ -26,6 +26,7 @@ from share.emulate.sensor.exposure import Shots
 from share.emulate.shooting import Take
 from share.emulate.stage import Actor, Stage
 from share.emulate.takes import write_recording, write_truth
+from share.emulate.types import START_NS
 from share.emulate.world.layout import Layout
 from share.errors import ShareError, UsageError
 from share.io.files import atomic_write, writable_dir, writing
@@ -34,7 +35,6 @@ from share.io.session import SCHEMA, SESSION
 from share.io.target import T_WORLD_TARGET, TARGET, to_plain
 
 PLAN = "plan.png"
-START_NS = 1_750_000_000 * 10**9  # session time 0 in the clock of an agent whose IMU is simulated
 _FRAMES = 24  # of a chunk: what a break costs a process
 _METERED = 200  # frames of a metering job
 _BYTES = {"jpeg": 130_000, "png": 330_000}  # of an image, about; to see beforehand whether the disk will do

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
-from typing import Protocol
 
 import numpy as np
 
+from share.emulate.motion.avatars import Avatar
 from share.emulate.sensor.device import Device, Pictures
 from share.emulate.sensor.exposure import Shot
 from share.emulate.types import Moment, Path
@@ -19,22 +19,10 @@ from share.types import F64, I64, AgentKind
 _NEAR_M = 1.5  # what motion blur is reckoned for; nearer things blur more than their samples show
 
 
-class Avatar(Protocol):
-    """What others see of an agent: rigid parts that move as its path does."""
-
-    @property
-    def shapes(self) -> tuple[Shape, ...]:
-        """The parts, each in a frame of its own."""
-        ...
-
-    def poses(self, stamps_ns: I64) -> F64:
-        """T_world_part (N, P, 4, 4) at stamps (N,) of the agent's own clock."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Actor:
-    """One agent of the session. pictures: all frames that it records, in true time (its path's)."""
+    """One agent of the session. avatar, shapes: what others see of it, where and what. pictures: all
+    frames that it records, in true time (its path's)."""
 
     name: str
     kind: AgentKind
@@ -42,6 +30,7 @@ class Actor:
     path: Path
     device: Device
     avatar: Avatar
+    shapes: tuple[Shape, ...]
     pictures: Pictures
 
     @property
@@ -84,7 +73,7 @@ class Stage:
         for k, actor in enumerate(self.actors):
             if k != who:
                 there = session_ns + actor.clock_offset_ns
-                out[actor.name] = actor.avatar.poses(np.clip(there, actor.path.start_ns, actor.path.end_ns))
+                out[actor.name] = actor.avatar.parts(np.clip(there, actor.path.start_ns, actor.path.end_ns))
         return out
 
 

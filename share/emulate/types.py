@@ -118,3 +118,4 @@ class Path(Protocol):
 
 
 GRAVITY = 9.81  # m/s^2
+START_NS = 1_750_000_000 * 10**9  # of simulated paths: session time 0, any moment that stays the same

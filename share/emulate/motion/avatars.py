@@ -40,11 +40,15 @@ def shapes(look: str, path: Path, seed: tuple[int, ...]) -> tuple[Shape, ...]:
 
 def stature(look: str, path: Path) -> float:
     """Height (m) of a person whose head is carried so high; of a robot's camera."""
-    stamps = np.linspace(path.start_ns, path.end_ns, 200).astype(np.int64)
-    z = path.poses(stamps)[:, 2, 3]
+    z = path.poses(_spread(path))[:, 2, 3]
     if look != "person":
         return float(np.median(z))
     return float(np.clip(np.percentile(z, 90) / figures.EYE, *_HEIGHT_M))
+
+
+def _spread(path: Path) -> I64:
+    """Some stamps (200,) over a path; in integers, for a float does not hold them."""
+    return path.start_ns + np.linspace(0, path.end_ns - path.start_ns, 200).astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +79,7 @@ def _robot(avatar: Avatar, stamps: I64) -> F64:
 
 def _drone(avatar: Avatar, stamps: I64) -> F64:
     """Upright on average, and tilted as the body tilts."""
-    whole = np.linspace(avatar.path.start_ns, avatar.path.end_ns, 200).astype(np.int64)
-    up = avatar.facing(whole)[:, 2, :3].mean(0)
+    up = avatar.facing(_spread(avatar.path))[:, 2, :3].mean(0)
     up /= np.linalg.norm(up)
     ahead = np.cross((0.0, 1.0, 0.0), up)
     ahead /= np.linalg.norm(ahead)

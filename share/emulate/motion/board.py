@@ -12,10 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from share.emulate.motion.crowd import START_NS
 from share.emulate.motion.spec import BoardSpec
 from share.emulate.motion.spline import SplinePath, through
 from share.emulate.motion.track import instants
+from share.emulate.types import START_NS
 from share.emulate.world.layout import Layout, PlacedTarget
 from share.errors import UsageError
 from share.geometry import se3

@@ -13,7 +13,7 @@ from share.emulate.motion.schedule import Other
 from share.emulate.motion.spline import SplinePath
 from share.emulate.motion.together import Course, Ground, Wish, move, nearest, obstacle
 from share.emulate.motion.track import Track, instants
-from share.emulate.types import Path
+from share.emulate.types import START_NS, Path
 from share.errors import UsageError
 from share.types import F64
 
@@ -22,7 +22,6 @@ _ROUNDS = 6  # of bringing lengths to what they shall be
 _BETTER = 0.7  # times what a length was off by; otherwise another attempt is worth more
 _LENGTH = 0.010  # relative; the paper's are asked to 2 %
 _COUNT_S = 1 / 30  # a length is that of the line through poses at 30 Hz
-START_NS = 1_000_000_000  # of a simulated path: 0 means "no stamp" to ROS
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,14 @@
+"""What `share demo` plays: two headset wearers and a robot in one room."""
+
+from __future__ import annotations
+
+from share.emulate.recipe import Recipe
+
+MOTIONS = ("ar1=walk:speed=0.65", "ar2=walk:speed=0.55", "robot=robot:speed=0.3")
+PROFILE = "d435i:640x480@15"  # four processes share two cores: half of what the device can do
+SCENE, FALLBACK = "warehouse", "plain"
+
+
+def recipe(scene: str, seconds: float, seed: int) -> Recipe:
+    """The same three for every scene."""
+    return Recipe(scene, MOTIONS, seconds, seed, profiles={"": PROFILE})
