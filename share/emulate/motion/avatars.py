@@ -16,14 +16,13 @@ from share.emulate.motion import figures
 from share.emulate.motion.figures import FIGURES
 from share.emulate.motion.gait import WALK_RATIO
 from share.emulate.motion.track import min_jerk
-from share.emulate.motion.walk import LEVER, turn
+from share.emulate.motion.walk import CAMERA_AXES, LEVER, turn
 from share.emulate.types import Path
 from share.emulate.world.mesh import Shape
 from share.geometry import se3
 from share.types import F64, I64
 
 _RATE_HZ = 50
-_CAMERA_FLU = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # (ahead, left, up) in camera axes, as columns
 _SLOW_S = 0.35  # sigma of the trunk's smoothing
 _LOOKS = 0.35  # m/s: walking faster than this, the trunk rather follows the way than the eyes
 _STEP_HZ = (0.8, 3.0)
@@ -68,7 +67,7 @@ class Avatar:
         """T_world_camera-place (N, 4, 4): where the body is, its axes ahead, left, up of its camera."""
         T = self.path.poses(stamps_ns)
         mount = np.eye(3) if self.T_body_cam0 is None else self.T_body_cam0[:3, :3]
-        return se3.compose(T[:, :3, :3] @ mount @ _CAMERA_FLU.T, T[:, :3, 3])
+        return se3.compose(T[:, :3, :3] @ mount @ CAMERA_AXES.T, T[:, :3, 3])
 
 
 def _robot(avatar: Avatar, stamps: I64) -> F64:

@@ -189,7 +189,9 @@ def _too_large(layout: Layout, guest: Guest, xyz: F64) -> str:
     need = min(extents, key=lambda e: e[0] * e[1]) + 2 * CLEARANCE_M
     x, y = sorted(need[:2], reverse=True)
     have = " x ".join(f"{s:g}" for s in layout.size)
-    ask = ",".join(f"{np.ceil(v * 2 + 1) / 2:g}" for v in (x, y, need[2]))
+    wide, deep = sorted(layout.size[:2], reverse=True)
+    sizes = zip((x, y, need[2]), (wide, deep, layout.size[2]), strict=True)
+    ask = ",".join(f"{max(np.ceil(v * 2 + 1) / 2, s):g}" for v, s in sizes)
     return (
         f"{guest.name}: its path needs {x:.1f} x {y:.1f} x {need[2]:.1f} m of free room, "
         f"{layout.name} is {have} m; "

@@ -87,8 +87,8 @@ def test_a_seed_is_a_motion():
 
 
 def test_looks_at_others():
-    from share.emulate.motion.crowd import START_NS
     from share.emulate.motion.gaze import Seen
+    from share.emulate.types import START_NS
 
     own = track("person", 1)
     other = Seen(own.xy + 2.0 * np.stack([np.cos(own.heading + 0.6), np.sin(own.heading + 0.6)], axis=1), 1.6)

@@ -37,6 +37,6 @@ def test_specs_are_read(text, name, spec):
     ],
 )
 def test_what_is_wrong_is_named(text, says):
-    with pytest.raises(UsageError, match=".*") as caught:
+    with pytest.raises(UsageError) as caught:
         parse(text)
     assert says in str(caught.value) and "\n" not in str(caught.value)

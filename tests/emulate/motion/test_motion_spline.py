@@ -32,7 +32,7 @@ def test_derivatives_are_those_of_the_poses(path):
     turned = se3.so3_log(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3]) / 2e-3
     assert np.abs(rate - turned).max() < 1e-4
     acceleration = (before + after - 2 * here)[:, :3, 3] / 1e-6
-    felt = np.einsum("nji,nj->ni", here[:, :3, :3], acceleration + (0, 0, GRAVITY))
+    felt = np.einsum("nji,nj->ni", here[:, :3, :3], acceleration + np.array([0, 0, GRAVITY]))
     assert np.abs(force - felt).max() < 1e-3
     assert np.abs(path.velocity(stamps) - (after - before)[:, :3, 3] / 2e-3).max() < 1e-5
 

@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from motion_sim import SECONDS, every, floor
@@ -19,7 +21,7 @@ def straight(length=10.0):
 def test_tours_keep_off_things_and_are_smooth(seed):
     ground = floor()
     legs = Network(ground, 0.3).tour(40.0, np.random.default_rng(seed))
-    assert all(np.allclose(a[-1], b[0]) for a, b in zip(legs[:-1], legs[1:], strict=True))
+    assert all(np.allclose(a[-1], b[0]) for a, b in pairwise(legs))
     way = smooth(ground, np.concatenate(legs), 0.3)
     assert arc_length(way)[-1] > 30 and ground.at(way).min() > 0.25
     assert np.linalg.norm(np.diff(way, 2, axis=0), axis=1).max() < 0.7 * SPACING

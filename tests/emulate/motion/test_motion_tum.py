@@ -73,7 +73,6 @@ def test_poses_that_are_none_are_refused(tmp_path, bad):
     file.write_text("0.5 0 0 0 0 0 0 1\n" + bad + "\n")
     with pytest.raises(DataError, match=r"bad\.tum"):
         read_path(file)
+    file.write_text("0.5 0 0 0 0 0 0 1\n")
     with pytest.raises(DataError, match="nothing is left"):
-        good = tmp_path / "good.tum"
-        good.write_text("0.5 0 0 0 0 0 0 1\n")
-        read_path(good, start=5)
+        read_path(file, start=5)
