@@ -8,7 +8,7 @@ from share.emulate.world.scenes import layout
 from share.geometry import se3
 from share.geometry.target import AprilGrid, CharucoBoard
 
-TARGETS = [AprilGrid(), AprilGrid(3, 4, 0.055, 0.28), CharucoBoard()]
+TARGETS = [AprilGrid(), AprilGrid(5, 7, 0.08, 0.28), CharucoBoard()]
 
 
 def tiles(target):
