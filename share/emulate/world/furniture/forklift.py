@@ -23,12 +23,10 @@ def forklift(rng: Rng) -> Shape:
     for x in (-0.46, 0.46):
         out.append(strut((x, -1.65, 1.0), (x, -1.45, 2.05), 0.05, bar, rng))
         out.append(strut((x, -0.35, 1.05), (x, -0.45, 2.05), 0.05, bar, rng))
-        out += [
-            cylinder(
-                (x * 1.04 - 0.1, y, r), r, 0.2, dark, pick(rng, "galvanised"), axis="x", sides=18, rng=rng
-            )
-            for y, r in ((-1.45, 0.3), (-0.35, 0.24))
-        ]
+        for y, r in ((-1.45, 0.3), (-0.35, 0.24)):
+            hub, low = pick(rng, "galvanised"), x * 1.04 - 0.1
+            out.append(cylinder((low, y, r), r, 0.2, dark, dark, axis="x", sides=18, rng=rng))
+            out.append(cylinder((low - 0.01, y, r), 0.55 * r, 0.22, hub, hub, axis="x", sides=14, rng=rng))
         out.append(block((x * 0.7, -1.84, 0.06), (0.09, 0.12, 2.0), bar, rng))
         out.append(block((x * 0.55, -2.4, 0.05), (0.12, 0.98, 0.04), bar, rng))
     for z in (0.1, 0.45, 1.2, 1.95):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from share.emulate.world.furniture.parts import block, pick
 from share.emulate.world.layout import Light
 from share.emulate.world.materials import Material
-from share.emulate.world.mesh import Rng, Shape, box, concat, cylinder
+from share.emulate.world.mesh import Rng, Shape, concat, cylinder
 
 _GLOW = Material("lamp")
 _DROP = 0.02  # m; the light starts below the lamp that it comes from
@@ -48,14 +48,3 @@ def bell(rng: Rng, drop: float) -> Shape:
 def bell_light(x: float, y: float, ceiling: float, drop: float, power: float) -> Light:
     """What `bell` at (x, y) under `ceiling` m shines."""
     return Light((x, y, ceiling - drop - 0.35 - _DROP), power, (0.4, 0.4))
-
-
-def wall_lamp(rng: Rng) -> Shape:
-    """A bulkhead lamp on a wall; its middle at z = 0."""
-    body = pick(rng, "steel")
-    return concat(
-        [
-            box((-0.16, -0.06, -0.08), (0.16, 0, 0.08), body, rng),
-            box((-0.13, -0.1, -0.05), (0.13, -0.06, 0.05), _GLOW, rng),
-        ]
-    )

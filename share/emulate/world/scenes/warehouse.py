@@ -137,6 +137,7 @@ def _standing(size: Size) -> dict[str, tuple[float, Maker]]:
 _DEEP: dict[str, tuple[float, Maker]] = {  # only where there is room for it
     "loaded pallet": (2, lambda r: pallets.loaded(r, r.uniform(0.7, 1.8))),
     "pallets": (0.8, lambda r: pallets.pile(r, int(r.integers(3, 9)))),
+    "step ladder": (0.4, lambda r: ladders.step(r, r.uniform(0.9, 1.7))),
 }
 
 
