@@ -14,7 +14,7 @@ import numpy as np
 
 from share.emulate.motion import robot, walk
 from share.emulate.motion.floor import Floor
-from share.emulate.motion.route import Network, Way
+from share.emulate.motion.route import Network, Way, arc_length
 from share.emulate.motion.schedule import STEP_S, Limits, Other, schedule, speed_limit
 from share.emulate.motion.track import KNOT_S, Track
 from share.types import F64
@@ -25,6 +25,7 @@ _TOURS = 12  # that each agent tries before all begin anew
 _TOUCH_M = 0.05  # of the grid's own error
 _BEGIN_S = 1.2  # the smoothing in time lets motion begin this much sooner
 _PAUSE_S = (1.5, 4.5)
+_NEARLY = 0.15  # relative; the rest is made good afterwards
 _EASE = 1.08  # bends take their time: hope for this much more than is to be gone
 _BRANCHES: dict[str, ModuleType] = {"person": walk, "robot": robot}
 
@@ -95,9 +96,14 @@ def move(
     for attempt in range(_TOURS):
         course = _course(ground, wish, duration, np.random.default_rng((*seed, attempt)))
         track = course.track(ground, taken, duration, wish.gone) if course else None
-        if course and track:
+        if course and track and _far_enough(track, wish.gone):
             return course, track
     return None
+
+
+def _far_enough(track: Track, gone: float | None) -> bool:
+    """Whether a track comes near to the length asked for: others may push one on or hold one up."""
+    return gone is None or abs(arc_length(track.xy[::10])[-1] / gone - 1) < _NEARLY
 
 
 def _course(ground: Ground, wish: Wish, duration: float, rng: np.random.Generator) -> Course | None:
