@@ -32,19 +32,22 @@ class GlRenderer:
 
         A moment has 2 x 2 samples a pixel. Of four moments or more each has one of these only: samples
         over time and over the pixel are one sum (Cook, Porter & Carpenter 1984). A lens would blur
-        single samples when it looks between them, so it always has four.
+        single samples when it looks between them, so with one they are always four.
         """
         if not moments:
             raise ValueError("moments: an image needs at least one")
-        total = np.zeros((camera.height, camera.width), np.float32)
-        spread = len(moments) >= _SIDE**2 and not camera.distortion
-        for offset, moment in zip(_offsets(len(moments)), moments, strict=True):
-            if spread:
-                cv2.accumulate(self._stage.image(shifted(camera, offset), moment, FINER), total)
-            else:
-                cv2.accumulate(self._supersampled(camera, moment), total)
-        total *= np.float32(1 / (STEPS * len(moments)))
-        return total
+        fine = finer(camera, _SIDE)
+        if camera.distortion:
+            optics: Lens = _lens(fine)
+            samples = optics.image(self._sum([(optics.wide, 0.0)] * len(moments), moments))
+        elif len(moments) < _SIDE**2:
+            samples = self._sum([(fine, 0.0)] * len(moments), moments)
+        else:
+            places = [(shifted(camera, offset), FINER) for offset in _offsets(len(moments))]
+            samples = self._sum(places, moments)
+        total = cv2.resize(samples, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        out: F32 = np.multiply(total, np.float32(1 / (STEPS * len(moments))), dtype=np.float32)
+        return out
 
     def depth(self, camera: Camera, moment: Moment) -> F32:
         """Exact depth (H, W) m, 0 where nothing is; see `Renderer`."""
@@ -53,15 +56,16 @@ class GlRenderer:
         optics = _lens(camera, _DEPTH_ZOOM)
         return optics.depth(*self._stage.faces(optics.wide, moment))
 
-    def _supersampled(self, camera: Camera, moment: Moment) -> U16:
-        fine = finer(camera, _SIDE)
-        if camera.distortion:
-            optics: Lens = _lens(fine)
-            samples = optics.image(self._stage.image(optics.wide, moment, 0.0))
-        else:
-            samples = self._stage.image(fine, moment, 0.0)
-        out: U16 = cv2.resize(samples, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        return out
+    def _sum(self, views: Sequence[tuple[Camera, float]], moments: Sequence[Moment]) -> U16 | F32:
+        """All moments, each by its camera and level of detail, added up."""
+        images = (self._stage.image(c, m, lod) for (c, lod), m in zip(views, moments, strict=True))
+        first = next(images)
+        if len(moments) == 1:
+            return first
+        total: F32 = first.astype(np.float32)
+        for image in images:
+            cv2.accumulate(image, total)
+        return total
 
 
 def _offsets(count: int) -> F64:

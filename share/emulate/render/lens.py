@@ -33,9 +33,9 @@ class Lens:
     uv: F64
     place: tuple[F32, F32]
 
-    def image(self, wide: U16) -> U16:
+    def image(self, wide: U16 | F32) -> U16 | F32:
         """(H, W) as the lens shows it, interpolated bilinearly."""
-        out: U16 = cv2.remap(wide, *self.place, cv2.INTER_LINEAR)
+        out: U16 | F32 = cv2.remap(wide, *self.place, cv2.INTER_LINEAR)
         return out
 
     def depth(self, faces: I32, slopes: F64, corners: F64) -> F32:
