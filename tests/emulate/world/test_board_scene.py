@@ -54,7 +54,7 @@ def test_edges_of_the_usual_grid_lie_between_texels():
 def test_the_board_stands_where_the_layout_says(name, target):
     room = layout(name, 3)
     assert room.target.target == target
-    board = next(piece for piece in room.pieces if piece.name.startswith("board"))
+    board = next(piece for piece in room.shell if piece.name.startswith("board"))
     low, high = target.extent
     ends = np.array([(*low, 0), (*high, 0), (low[0], high[1], 0), (high[0], low[1], 0)])
     inside = se3.transform(room.target.T_world_target, ends)
@@ -68,3 +68,9 @@ def test_another_seed_places_it_otherwise():
     poses = [layout("board", seed).target.T_world_target for seed in (1, 1, 2)]
     np.testing.assert_array_equal(poses[0], poses[1])
     assert np.degrees(se3.angle(se3.inverse(poses[0]) @ poses[2])) > 0.5
+
+
+def test_no_path_removes_the_board():
+    room = layout("board", 1)
+    left, _ = room.without(room.target.T_world_target[None, :3, 3], 0.5)
+    assert any(piece.name.startswith("board") for piece in left.everything)

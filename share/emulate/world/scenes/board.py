@@ -39,7 +39,7 @@ def board_room(target: Target, seed: int, size: Size) -> Layout:
     dull = Material("plaster", 0, gray=120, contrast=0.5)
     enclose(plan, [(size[2], dull)], Material("screed", 0, contrast=0.5), Material("paint", 1, gray=185))
     T = _pose(target, size, rng)
-    plan.lay("board", board.on_stand(target, T, rng), solid=True)
+    plan.build("board", board.on_stand(target, T, rng), keeps_off=True)  # no path may remove it
     xs, ys = [size[0] * f for f in (0.3, 0.55, 0.8)], [size[1] * f for f in (0.2, 0.5, 0.8)]
     fill.light_tubes(plan, xs, ys, 1.2, 0.0)
     return replace(plan.done(ambient=0.6), brightness=_BRIGHT, target=PlacedTarget(target, T))
