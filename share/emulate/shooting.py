@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -16,13 +17,12 @@ import numpy as np
 from share.core.measurement import CAM0, CAM1, DEPTH
 from share.emulate.chunks import Picture, write_chunk
 from share.emulate.room_file import open_renderer
-from share.emulate.sensor.exposure import Shots
-from share.emulate.stage import Stage, smaller
+from share.emulate.sensor.exposure import Shot, Shots
+from share.emulate.stage import Sight, Stage, T_body, smaller
 from share.emulate.types import Renderer
 from share.types import F64, U8
 
 _METER = 8  # times smaller than the picture
-_STILL = np.zeros(1)
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95]
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 _DEPTH_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
@@ -60,36 +60,58 @@ def meter(take: Take) -> F64:
     """Mean radiance of each frame of cam0."""
     w = _ready()
     actor = w.stage.actors[take.who]
-    camera = smaller(actor.rig.cam0, _METER)
-    times = actor.pictures.true_ns[take.first : take.last].tolist()
-    moments = (w.stage.moments(take.who, time, _STILL) for time in times)
-    return np.array([float(w.renderer.radiance(camera, moment).mean()) for moment in moments])
+    camera, T_body_cam = smaller(actor.rig.cam0, _METER), T_body(actor.rig, CAM0)
+    sights = w.stage.sights(take.who, actor.pictures.true_ns[take.first : take.last])
+    return np.array([float(w.renderer.radiance(camera, [sight.by(T_body_cam)]).mean()) for sight in sights])
 
 
 def shoot(take: Take) -> int:
     """Draw the frames and write the chunk. How many bytes it has."""
     assert take.file is not None
-    pictures = [picture for k in range(take.first, take.last) for picture in _frame(_ready(), take, k)]
+    pictures = [picture for frame in _frames(_ready(), take) for picture in _developed(_ready(), take, frame)]
     write_chunk(take.file, pictures)
     return sum(len(picture.data) for picture in pictures)
 
 
-def _frame(w: _Worker, take: Take, k: int) -> Iterator[Picture]:
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """One frame to be drawn: the sights over its exposure, and the one in the middle of it."""
+
+    index: int
+    stamp_ns: int
+    shot: Shot
+    exposed: list[Sight]
+    middle: Sight
+
+
+def _frames(w: _Worker, take: Take) -> Iterator[_Frame]:
     assert take.shots is not None
-    actor, shot = w.stage.actors[take.who], take.shots[k - take.first]
-    frame, time = int(actor.pictures.index[k]), int(actor.pictures.true_ns[k])
-    stamp = int(actor.pictures.stamp_ns[k])
-    offsets = actor.device.blur_offsets(shot, w.stage.motion_px(take.who, time, shot))
+    actor, here = w.stage.actors[take.who], slice(take.first, take.last)
+    index, stamps, true = (
+        a[here] for a in (actor.pictures.index, actor.pictures.stamp_ns, actor.pictures.true_ns)
+    )
+    moved = w.stage.motion_px(take.who, true, take.shots.exposure_ms)
+    shots = [take.shots[k] for k in range(len(true))]
+    offsets = [actor.device.blur_offsets(shot, px) for shot, px in zip(shots, moved.tolist(), strict=True)]
+    times = [t + np.rint(dt * 1e9).astype(np.int64) for t, dt in zip(true, offsets, strict=True)]
+    exposed = iter(w.stage.sights(take.who, np.concatenate(times)))
+    for k, middle in enumerate(w.stage.sights(take.who, true)):
+        yield _Frame(int(index[k]), int(stamps[k]), shots[k], list(islice(exposed, len(times[k]))), middle)
+
+
+def _developed(w: _Worker, take: Take, frame: _Frame) -> Iterator[Picture]:
+    actor = w.stage.actors[take.who]
     grays: dict[str, U8] = {}
     for number, (stream, camera) in enumerate(((CAM0, actor.rig.cam0), (CAM1, actor.rig.cam1))):
         if camera is not None:
-            radiance = w.renderer.radiance(camera, w.stage.moments(take.who, time, offsets, stream))
-            grays[stream] = actor.device.develop(radiance, frame, number, shot)
-            yield _picture(stream, stamp, grays[stream], w.images)
+            T_body_cam = T_body(actor.rig, stream)
+            radiance = w.renderer.radiance(camera, [sight.by(T_body_cam) for sight in frame.exposed])
+            grays[stream] = actor.device.develop(radiance, frame.index, number, frame.shot)
+            yield _picture(stream, frame.stamp_ns, grays[stream], w.images)
     if actor.rig.depth is not None:
-        (moment,) = w.stage.moments(take.who, time, _STILL, DEPTH)
-        exact = w.renderer.depth(actor.rig.depth, moment)
-        yield _picture(DEPTH, stamp, actor.device.depth_mm(exact, grays[CAM0], frame, shot), "depth")
+        exact = w.renderer.depth(actor.rig.depth, frame.middle.by(T_body(actor.rig, DEPTH)))
+        measured = actor.device.depth_mm(exact, grays[CAM0], frame.index, frame.shot)
+        yield _picture(DEPTH, frame.stamp_ns, measured, "depth")
 
 
 def _picture(stream: str, stamp_ns: int, pixels: np.ndarray, how: str) -> Picture:

@@ -9,7 +9,6 @@ import numpy as np
 
 from share.emulate.motion.avatars import Avatar
 from share.emulate.sensor.device import Device, Pictures
-from share.emulate.sensor.exposure import Shot
 from share.emulate.types import Moment, Path
 from share.emulate.world.mesh import Shape
 from share.geometry import se3
@@ -40,35 +39,49 @@ class Actor:
 
 
 @dataclass(frozen=True, eq=False)
+class Sight:
+    """One instant: where the body is (4, 4), and the parts of all others (P, 4, 4) by name."""
+
+    T_world_body: F64
+    movers: dict[str, F64]
+
+    def by(self, T_body_cam: F64) -> Moment:
+        """What one of the body's cameras sees of it."""
+        return Moment(self.T_world_body @ T_body_cam, self.movers)
+
+
+@dataclass(frozen=True, eq=False)
 class Stage:
     """room: where it is kept, for `share.emulate.shooting` to open."""
 
     room: FilePath
     actors: tuple[Actor, ...]
 
-    def moments(self, who: int, true_ns: int, offsets_s: F64, camera: str = "cam0") -> list[Moment]:
-        """What camera `camera` of actor number `who` sees at true_ns + offsets_s (S,)."""
+    def sights(self, who: int, true_ns: I64) -> list[Sight]:
+        """All that actor number `who` may see at true times (N,), which are clipped to its path. Ask for
+        many at once: most of what it costs is paid once a call."""
         actor = self.actors[who]
-        times = true_ns + np.rint(offsets_s * 1e9).astype(np.int64)
-        times = np.clip(times, actor.path.start_ns, actor.path.end_ns)
-        T_world_cam = actor.path.poses(times) @ T_body(actor.rig, camera)
+        times = np.clip(true_ns, actor.path.start_ns, actor.path.end_ns)
         others = self._others(who, times - actor.clock_offset_ns)
         return [
-            Moment(T, {name: poses[k] for name, poses in others.items()}) for k, T in enumerate(T_world_cam)
+            Sight(T, {name: parts[k] for name, parts in others.items()})
+            for k, T in enumerate(actor.path.poses(times))
         ]
 
-    def motion_px(self, who: int, true_ns: int, shot: Shot) -> float:
-        """How far things at _NEAR_M move in the picture during the exposure, px."""
+    def motion_px(self, who: int, true_ns: I64, exposure_ms: F64) -> F64:
+        """How far things at _NEAR_M move in each picture (N,) during its exposure, px."""
         actor = self.actors[who]
-        half = int(shot.exposure_ms * 5e5)
-        ends = np.array([true_ns - half, true_ns + half])
-        T = actor.path.poses(np.clip(ends, actor.path.start_ns, actor.path.end_ns))
-        turned = float(se3.angle(T[0, :3, :3].T @ T[1, :3, :3]))
-        gone = float(np.linalg.norm(T[1, :3, 3] - T[0, :3, 3]))
+        half = (exposure_ms * 5e5).astype(np.int64)
+        first, last = (
+            actor.path.poses(np.clip(times, actor.path.start_ns, actor.path.end_ns))
+            for times in (true_ns - half, true_ns + half)
+        )
+        turned = se3.angle(np.swapaxes(first[:, :3, :3], 1, 2) @ last[:, :3, :3])
+        gone: F64 = np.linalg.norm(last[:, :3, 3] - first[:, :3, 3], axis=1)
         return actor.rig.cam0.focal * (turned + gone / _NEAR_M)
 
     def _others(self, who: int, session_ns: I64) -> dict[str, F64]:
-        """Poses (S, P, 4, 4) of all but `who`; before its path begins and after it ends, one stands still."""
+        """Parts (N, P, 4, 4) of all but `who`; before its path begins and after it ends, one stands still."""
         out = {}
         for k, actor in enumerate(self.actors):
             if k != who:
