@@ -23,7 +23,7 @@ from share.emulate.preparation import prepare
 from share.emulate.progress import Progress, silent
 from share.emulate.recipe import Recipe
 from share.emulate.sensor.exposure import Shots
-from share.emulate.shooting import Take
+from share.emulate.shooting import Look, Take
 from share.emulate.stage import Actor, Stage
 from share.emulate.takes import write_recording, write_truth
 from share.emulate.types import START_NS
@@ -33,10 +33,11 @@ from share.io.files import atomic_write, writable_dir, writing
 from share.io.kalibr import to_kalibr
 from share.io.session import SCHEMA, SESSION
 from share.io.target import T_WORLD_TARGET, TARGET, to_plain
+from share.types import F64
 
 PLAN = "plan.png"
 _FRAMES = 24  # of a chunk: what a break costs a process
-_METERED = 200  # frames of a metering job
+_METERED_NS, _METERED = 125_000_000, 50  # light is metered so often, by so many looks a job
 _BYTES = {"jpeg": 130_000, "png": 330_000}  # of an image, about; to see beforehand whether the disk will do
 
 
@@ -99,19 +100,21 @@ def _make(recipe: Recipe, out: Path, workers: int, progress: Progress, asl: bool
 
 
 def _exposures(pool: Pool, stage: Stage, who: int, work: Path, progress: Progress) -> Shots:
-    """How each of the actor's frames is exposed, from a quick look at all of them."""
+    """How each of the actor's frames is exposed, from a quick look at some of them."""
     actor, kept = stage.actors[who], work / f"{stage.actors[who].name}.brightness.npy"
+    true_ns = actor.pictures.true_ns
+    looks = np.append(np.arange(true_ns[0], true_ns[-1], _METERED_NS), true_ns[-1])
     if kept.exists():
         brightness = np.load(kept)
     else:
-        count = len(actor.pictures)
-        jobs = [Take(who, k, min(k + _METERED, count)) for k in range(0, count, _METERED)]
-        brightness = np.zeros(count)
-        for done, (job, values) in enumerate(pool.run(shooting.meter, jobs)):
-            brightness[job.first : job.last] = values
-            progress(f"metering {actor.name}", done + 1, len(jobs))
+        jobs = [Look(who, looks[k : k + _METERED]) for k in range(0, len(looks), _METERED)]
+        values: dict[int, F64] = {}
+        for job, seen in pool.run(shooting.meter, jobs):
+            values[int(job.true_ns[0])] = seen
+            progress(f"metering {actor.name}", len(values), len(jobs))
+        brightness = np.concatenate([values[key] for key in sorted(values)])
         np.save(kept, brightness)
-    return actor.device.shots(actor.pictures.true_ns, brightness)
+    return actor.device.shots(true_ns, np.interp(true_ns - looks[0], looks - looks[0], brightness))
 
 
 def _shoot(
@@ -119,14 +122,14 @@ def _shoot(
 ) -> list[list[Path]]:
     """The chunks of each actor, in order; those that are there already are not drawn again."""
     takes = [_takes(stage.actors[who], who, exposures[who], work) for who in range(len(stage.actors))]
-    todo = [take for them in takes for take in them if not _file(take).exists()]
+    todo = [take for them in takes for take in them if not take.file.exists()]
     total = sum(len(actor.pictures) for actor in stage.actors)
     done = total - sum(take.last - take.first for take in todo)
     progress("drawing images", done, total)
     for take, _ in pool.run(shooting.shoot, todo):
         done += take.last - take.first
         progress("drawing images", done, total)
-    return [[_file(take) for take in them] for them in takes]
+    return [[take.file for take in them] for them in takes]
 
 
 def _takes(actor: Actor, who: int, shots: Shots, work: Path) -> list[Take]:
@@ -135,11 +138,6 @@ def _takes(actor: Actor, who: int, shots: Shots, work: Path) -> list[Take]:
     count = len(actor.pictures)
     spans = [(k, min(k + _FRAMES, count)) for k in range(0, count, _FRAMES)]
     return [Take(who, a, b, folder / f"{a:06d}.chunk", shots.part(a, b)) for a, b in spans]
-
-
-def _file(take: Take) -> Path:
-    assert take.file is not None
-    return take.file
 
 
 def _check_space(folder: Path, stage: Stage, recipe: Recipe) -> None:

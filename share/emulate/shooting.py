@@ -1,7 +1,7 @@
 """What a worker process does: it opens the room once, and then draws the frames that it is given.
 
-First every actor's frames are metered, at an eighth of the size; from that the device decides how each
-is exposed; then they are drawn, developed and encoded.
+First every actor's light is metered, at an eighth of the size; from that the device decides how each
+frame is exposed; then they are drawn, developed and encoded.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from share.emulate.room_file import open_renderer
 from share.emulate.sensor.exposure import Shot, Shots
 from share.emulate.stage import Sight, Stage, T_body, smaller
 from share.emulate.types import Renderer
-from share.types import F64, U8
+from share.types import F64, I64, U8
 
 _METER = 8  # times smaller than the picture
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95]
@@ -31,13 +31,21 @@ _DEPTH_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRIT
 @dataclass(frozen=True, eq=False)
 class Take:
     """Frames first .. last - 1 (places in the actor's `pictures`) of actor number `who`. file: the chunk
-    to write; shots: how they are exposed, one a frame. Both None where they are only metered."""
+    to write; shots: how they are exposed, one a frame."""
 
     who: int
     first: int
     last: int
-    file: Path | None = None
-    shots: Shots | None = None
+    file: Path
+    shots: Shots
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """Actor number `who` looks about at true times (N,)."""
+
+    who: int
+    true_ns: I64
 
 
 class _Worker:
@@ -56,18 +64,17 @@ def begin(stage: Stage, images: str) -> None:
     _worker = _Worker(stage, images)
 
 
-def meter(take: Take) -> F64:
-    """Mean radiance of each frame of cam0."""
+def meter(look: Look) -> F64:
+    """Mean radiance of each (N,) image of cam0."""
     w = _ready()
-    actor = w.stage.actors[take.who]
-    camera, T_body_cam = smaller(actor.rig.cam0, _METER), T_body(actor.rig, CAM0)
-    sights = w.stage.sights(take.who, actor.pictures.true_ns[take.first : take.last])
+    rig = w.stage.actors[look.who].rig
+    camera, T_body_cam = smaller(rig.cam0, _METER), T_body(rig, CAM0)
+    sights = w.stage.sights(look.who, look.true_ns)
     return np.array([float(w.renderer.radiance(camera, [sight.by(T_body_cam)]).mean()) for sight in sights])
 
 
 def shoot(take: Take) -> int:
     """Draw the frames and write the chunk. How many bytes it has."""
-    assert take.file is not None
     pictures = [picture for frame in _frames(_ready(), take) for picture in _developed(_ready(), take, frame)]
     write_chunk(take.file, pictures)
     return sum(len(picture.data) for picture in pictures)
@@ -85,7 +92,6 @@ class _Frame:
 
 
 def _frames(w: _Worker, take: Take) -> Iterator[_Frame]:
-    assert take.shots is not None
     actor, here = w.stage.actors[take.who], slice(take.first, take.last)
     index, stamps, true = (
         a[here] for a in (actor.pictures.index, actor.pictures.stamp_ns, actor.pictures.true_ns)

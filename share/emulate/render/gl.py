@@ -1,21 +1,21 @@
-"""The renderer on OpenGL: samples, filters and the lens, over the passes of `Stage`."""
+"""The renderer on OpenGL: samples over the pixel and over time, and the lens, over the passes of `Stage`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
 
-import cv2
 import numpy as np
+from scipy.stats import qmc
 
 from share.emulate.render.lens import Lens, lens
-from share.emulate.render.stage import FINER, STEPS, Stage
-from share.emulate.render.view import U16, finer, shifted
+from share.emulate.render.stage import Stage
+from share.emulate.render.view import shifted
 from share.emulate.types import Moment, Room
 from share.geometry.camera import Camera
 from share.types import F32, F64
 
-_SIDE = 2  # samples a side of a pixel
+_SAMPLES = 3  # of a pixel, at least
 _DEPTH_ZOOM = 3.0  # of the view in which a lens finds its triangles: fewer slivers are missed
 _lens = lru_cache(maxsize=16)(lens)
 
@@ -30,24 +30,19 @@ class GlRenderer:
     def radiance(self, camera: Camera, moments: Sequence[Moment]) -> F32:
         """Image (H, W) in linear gray levels; see `Renderer`.
 
-        A moment has 2 x 2 samples a pixel. Of four moments or more each has one of these only: samples
-        over time and over the pixel are one sum (Cook, Porter & Carpenter 1984). A lens would blur
-        single samples when it looks between them, so with one they are always four.
+        Samples over time and over the pixel are one sum (Cook, Porter & Carpenter 1984): every moment
+        has one sample of each pixel, at another place in it, or more where there are fewer than _SAMPLES.
         """
         if not moments:
             raise ValueError("moments: an image needs at least one")
-        fine = finer(camera, _SIDE)
-        if camera.distortion:
-            optics: Lens = _lens(fine)
-            samples = optics.image(self._sum([(optics.wide, 0.0)] * len(moments), moments))
-        elif len(moments) < _SIDE**2:
-            samples = self._sum([(fine, 0.0)] * len(moments), moments)
-        else:
-            places = [(shifted(camera, offset), FINER) for offset in _offsets(len(moments))]
-            samples = self._sum(places, moments)
-        total = cv2.resize(samples, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        out: F32 = np.multiply(total, np.float32(1 / (STEPS * len(moments))), dtype=np.float32)
-        return out
+        count = max(_SAMPLES, len(moments))
+        optics: Lens | None = _lens(camera) if camera.distortion else None
+        view = optics.wide if optics else camera
+        total = np.zeros((view.height, view.width), np.float32)
+        for k, place in enumerate(_places(count)):
+            total += self._stage.image(shifted(view, place), moments[k * len(moments) // count])
+        total /= count
+        return optics.image(total) if optics else total
 
     def depth(self, camera: Camera, moment: Moment) -> F32:
         """Exact depth (H, W) m, 0 where nothing is; see `Renderer`."""
@@ -56,21 +51,12 @@ class GlRenderer:
         optics = _lens(camera, _DEPTH_ZOOM)
         return optics.depth(*self._stage.faces(optics.wide, moment))
 
-    def _sum(self, views: Sequence[tuple[Camera, float]], moments: Sequence[Moment]) -> U16 | F32:
-        """All moments, each by its camera and level of detail, added up."""
-        images = (self._stage.image(c, m, lod) for (c, lod), m in zip(views, moments, strict=True))
-        first = next(images)
-        if len(moments) == 1:
-            return first
-        total: F32 = first.astype(np.float32)
-        for image in images:
-            cv2.accumulate(image, total)
-        return total
 
-
-def _offsets(count: int) -> F64:
-    """Where in its pixel each of `count` samples lies (count, 2) px, their mean being 0: the places of 2 x 2
-    samples by turns, opposite ones after each other."""
-    turns = np.array([(-0.25, -0.25), (0.25, 0.25), (0.25, -0.25), (-0.25, 0.25)])[np.arange(count) % 4]
-    offsets: F64 = turns - turns.mean(axis=0)
-    return offsets
+@lru_cache
+def _places(count: int) -> F64:
+    """Where in its pixel each of `count` samples lies (count, 2) px, their mean being 0: spread evenly for
+    any count, not in rows, and going back and forth, so that motion in between neither shrinks nor
+    stretches them (Halton 1960)."""
+    places = qmc.Halton(2, scramble=False).random(count)
+    out: F64 = places - places.mean(axis=0)
+    return out

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from share.emulate.render.view import U16, pixels
+from share.emulate.render.view import pixels
 from share.emulate.types import I32
 from share.geometry.camera import Camera, rays
 from share.types import F32, F64
@@ -33,9 +33,10 @@ class Lens:
     uv: F64
     place: tuple[F32, F32]
 
-    def image(self, wide: U16 | F32) -> U16 | F32:
-        """(H, W) as the lens shows it, interpolated bilinearly."""
-        out: U16 | F32 = cv2.remap(wide, *self.place, cv2.INTER_LINEAR)
+    def image(self, wide: F32) -> F32:
+        """(H, W) as the lens shows it: by cubic interpolation, which hardly blurs what is drawn at least as
+        finely as it is seen."""
+        out: F32 = np.maximum(cv2.remap(wide, *self.place, cv2.INTER_CUBIC), 0)
         return out
 
     def depth(self, faces: I32, slopes: F64, corners: F64) -> F32:

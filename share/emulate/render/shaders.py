@@ -1,11 +1,13 @@
 """The shaders. All is drawn in the camera's frame: x right, y down, z ahead, metres.
 
 `origin` is the camera in the frame of what is drawn and `turn` the rotation into the camera's frame, so
-that large coordinates cancel before they are rounded. An unbiased picture look-up is a third cheaper
-than a biased one, so there are programs of both kinds.
+that large coordinates cancel before they are rounded. Pictures are low-passed to half a pixel
+(Williams 1983): an image is the mean of at least three samples, which does the rest.
 """
 
 from __future__ import annotations
+
+_LEVEL = -1.0  # of detail, against a sample as large as a pixel
 
 _PLACE = """
 #version 430
@@ -43,9 +45,8 @@ void main() {{
 FACE_VERTEX = f"{_PLACE}void main() {{ gl_Position = place(); }}"
 
 
-def room_fragment(lod_bias: float) -> str:
-    """Picture times light."""
-    return f"""
+# Picture times light.
+ROOM_FRAGMENT = f"""
 #version 430
 uniform sampler2DArray pictures;
 uniform sampler2D light_map;
@@ -53,22 +54,21 @@ uniform float gain;
 in vec3 picture_at;
 in vec2 light_at;
 out float radiance;
-void main() {{ radiance = gain * {_picture(lod_bias)} * texture(light_map, light_at).r; }}
+void main() {{
+    radiance = gain * texture(pictures, picture_at, {_LEVEL}).r * texture(light_map, light_at).r;
+}}
 """
 
-
-def mover_fragment(lod_bias: float) -> str:
-    """Picture times one light, shaded by the normal."""
-    return f"""
+# Picture times one light, shaded by the normal.
+MOVER_FRAGMENT = f"""
 #version 430
 uniform sampler2DArray pictures;
 uniform float gain;
 in vec3 picture_at;
 in float shade;
 out float radiance;
-void main() {{ radiance = gain * {_picture(lod_bias)} * shade; }}
+void main() {{ radiance = gain * texture(pictures, picture_at, {_LEVEL}).r * shade; }}
 """
-
 
 # On a plane, inverse depth is affine in normalised coordinates: nothing interpolated is as exact. Doubles,
 # because on a surface seen almost edge-on the last bit of u and v is worth 1e-5 m.
@@ -91,8 +91,3 @@ uniform float first;
 out float face;
 void main() { face = first + float(gl_PrimitiveID); }
 """
-
-
-def _picture(lod_bias: float) -> str:
-    bias = f", {lod_bias:.1f}" if lod_bias else ""
-    return f"texture(pictures, picture_at{bias}).r"

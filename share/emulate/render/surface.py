@@ -6,12 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from share.emulate.render.view import sides
 from share.emulate.types import I32, Mesh
-from share.geometry.camera import Camera
 from share.types import F64, I64
 
-CHUNK = 64  # triangles that are drawn or left out together
+CHUNK = 16  # triangles that are drawn or left out together
 _CELLS = 1023  # a side of the grid that the Z-order curve runs through
 
 
@@ -27,11 +25,19 @@ class Surface:
     centre: F64
     radius: F64
 
-    def visible(self, camera: Camera, T_surface_cam: F64) -> I64:
-        """Chunks that may be in an undistorted image, nearest first: what is hidden costs less then."""
+    @property
+    def sphere(self) -> tuple[F64, float]:
+        """Around all of it: centre (3,), radius m."""
+        low, high = self.corners.min(axis=(0, 1, 2)), self.corners.max(axis=(0, 1, 2))
+        return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+
+    def visible(self, planes: F64, T_surface_cam: F64) -> I64:
+        """Chunks that may be within `sides` (S, 3) of a view. Those whose far end is nearest come first:
+        what they hide costs less then."""
         centre = (self.centre - T_surface_cam[:3, 3]) @ T_surface_cam[:3, :3]
-        chunks = np.flatnonzero((centre @ sides(camera).T > -self.radius[:, None]).all(axis=1))
-        return chunks[np.argsort((centre[chunks] ** 2).sum(axis=1), kind="stable")]
+        chunks = np.flatnonzero((centre @ planes.T > -self.radius[:, None]).all(axis=1))
+        far = np.sqrt((centre[chunks] ** 2).sum(axis=1)) + self.radius[chunks]
+        return chunks[np.argsort(far, kind="stable")]
 
     def slopes(self, chunks: I64, T_surface_cam: F64) -> F64:
         """Of these chunks' triangles, (T, 3): inverse depth at normalised (u, v) is slope . (u, v, 1)."""

@@ -1,16 +1,14 @@
-"""Pinhole views: the matrix that OpenGL wants, the sides of what is seen, finer and shifted pixel grids."""
+"""Pinhole views: the matrix that OpenGL wants, the sides of what is seen, shifted pixel grids."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from share.geometry.camera import Camera
 from share.types import F64
 
-U16 = NDArray[np.uint16]
 NEAR = 0.05  # m; what is nearer is not drawn
 
 
@@ -35,19 +33,6 @@ def sides(camera: Camera) -> F64:
     inward = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom], [0, 0, 1.0]])
     inward /= np.linalg.norm(inward, axis=1, keepdims=True)
     return inward
-
-
-def finer(camera: Camera, n: int) -> Camera:
-    """The same view with n x n pixels for each."""
-    return Camera(
-        camera.width * n,
-        camera.height * n,
-        camera.fx * n,
-        camera.fy * n,
-        (camera.cx + 0.5) * n - 0.5,
-        (camera.cy + 0.5) * n - 0.5,
-        camera.distortion,
-    )
 
 
 def shifted(camera: Camera, offset: F64) -> Camera:

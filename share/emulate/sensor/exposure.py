@@ -10,10 +10,9 @@ from share.emulate.sensor.draws import Seed
 from share.io.profile_types import ExposureModel
 from share.types import F64, I64
 
-_MOST_SAMPLES = 16  # of one blurred picture
+_FEWEST_SAMPLES, _MOST_SAMPLES = 3, 16  # of one blurred picture
 _SHARP_PX = 0.3  # motion during the exposure that nobody sees
 _STEP_PX = 1.0  # motion between two samples of a blurred picture, each a pixel wide itself
-_GROUP = 4  # samples that share a pixel's area out among them: whole groups are drawn best
 
 
 @dataclass(frozen=True)
@@ -96,11 +95,9 @@ def blur_offsets(exposure_ms: float, pixels_of_motion: float) -> F64:
     """Times (S,) s about the middle of the exposure at which to draw a picture blurred by motion.
 
     pixels_of_motion: the fastest in the picture during the exposure. They are the middles of S equal parts,
-    so that their mean is the integral by the midpoint rule. S is 1 below 0.3 px, else 4, 8, 12 or 16: the
-    renderer spreads four over the pixel's area as well.
+    so that their mean is the integral by the midpoint rule. S is 1 below 0.3 px, else 3 to 16.
     """
     if pixels_of_motion < _SHARP_PX:
         return np.zeros(1)
-    groups = np.ceil(pixels_of_motion / (_STEP_PX * _GROUP))
-    samples = int(min(groups * _GROUP, _MOST_SAMPLES))
+    samples = int(np.clip(np.ceil(pixels_of_motion / _STEP_PX), _FEWEST_SAMPLES, _MOST_SAMPLES))
     return ((np.arange(samples) + 0.5) / samples - 0.5) * exposure_ms * 1e-3
