@@ -97,10 +97,10 @@ def emulate(
     truth beside it. If it is broken off, the same command goes on where it stopped.
 
     \b
-    Motions:  walk:[speed=0.9,...]      a person with a headset
-              robot:[speed=0.35,...]    a robot with two wheels
+    Motions:  walk:[speed=0.9,…]        a person with a headset
+              robot:[speed=0.35,…]      a robot with two wheels
               paper:1 .. paper:5        two people and a robot, 60 s, in 9x6x4 m
-              board:[vigour=1,...]      a device in a hand, before a calibration board
+              board:[vigour=1,…]        a device in a hand, before a calibration board
               euroc:FOLDER[,start=S]    real IMU and motion of a EuRoC recording
               tumvi:FOLDER[,start=S]    the same of a TUM-VI recording
               tum:FILE                  poses of a file; the IMU is simulated

@@ -8,6 +8,7 @@ from pathlib import Path
 from share.emulate import room_file
 from share.emulate.motion.avatars import Avatar, shapes
 from share.emulate.motion.plan import Agent, Plan, plan
+from share.emulate.motion.spec import EurocSpec, parse
 from share.emulate.motion.spline import SplinePath
 from share.emulate.progress import Progress
 from share.emulate.recipe import Recipe
@@ -22,8 +23,7 @@ from share.io.profile_types import Profile
 from share.types import I64, AgentKind
 
 _ROOM = "room"
-_DEFAULT_PROFILE = {"euroc": "euroc"}  # by kind of motion; else:
-_PROFILE = "d435i"
+_PROFILE, _EUROC_PROFILE = "d435i", "euroc"
 _DEPTH = "rgbd"
 
 
@@ -74,7 +74,8 @@ def _actor(agent: Agent, number: int, recipe: Recipe) -> Actor:
 
 def _profile(agent: Agent, recipe: Recipe) -> Profile:
     """`NAME` or `NAME:MODE`, as asked for, or what the motion was recorded with."""
-    usual = _DEFAULT_PROFILE.get(agent.spec.partition(":")[0], _PROFILE)
+    _, spec = parse(agent.spec)
+    usual = _EUROC_PROFILE if isinstance(spec, EurocSpec) else _PROFILE
     name, _, mode = (_chosen(recipe.profiles, agent.name) or usual).partition(":")
     return profile(name, mode or None)
 

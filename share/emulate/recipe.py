@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 from share.emulate.sensor.effects import Effects
@@ -51,6 +52,10 @@ class Recipe:
 
     @property
     def digest(self) -> str:
-        """Twelve characters that differ where anything does."""
-        text = json.dumps(self.plain(), sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:12]
+        """Twelve characters that differ where anything does, the user's scene and profiles included."""
+        digest = hashlib.sha256(json.dumps(self.plain(), sort_keys=True).encode())
+        for name in (self.scene, *self.profiles.values()):
+            path = Path(name.partition(":")[0])
+            if path.suffix and path.is_file():  # the user's own, not one of ours by its name
+                digest.update(path.read_bytes())
+        return digest.hexdigest()[:12]

@@ -123,7 +123,7 @@ def test_no_arguments_is_the_help_and_wrong_use(capsys):
         ("agent x --name a --kind car --edge tcp://localhost:1", "'car' is not one of 'ar', 'robot'"),
         ("edge --policy best", "'best' is not"),
         ("edge extra", "unexpected extra argument (extra)"),
-        ("demo --seconds 1", "1.0 is not in the range 2<=x<=600"),
+        ("demo --seconds 1", "1.0 is not in the range 3<=x<=600"),
         ("demo --seconds 601", "601.0 is not in the range"),
         ("demo --seconds soon", "'soon' is not a valid float"),
         ("demo --seconds nan", "nan"),

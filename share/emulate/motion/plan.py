@@ -100,6 +100,8 @@ def plan(specs: Sequence[str], layout: Layout, seconds: float, seed: int) -> Pla
     agents += [_at_board(a, a.spec, layout, seconds, seed) for a in asked if isinstance(a.spec, BoardSpec)]
     agents += _simulated(asked, layout, [_present(agent) for agent in agents], seconds, seed)
     order = [name for a in asked for name in _names(a)]
+    if any(isinstance(a.spec, PaperSpec) for a in asked) and seconds != paper.SECONDS:
+        notes = [*notes, f"an experiment of the paper lasts {paper.SECONDS:g} s"]
     return Plan(layout, tuple(sorted(agents, key=lambda a: order.index(a.name))), tuple(notes))
 
 
