@@ -1,0 +1,215 @@
+"""The filter's steps: propagate, update, and states that come and go. Each changes the state in place.
+
+Source: the EKF with right-invariant errors, see `state`; cloning of poses with an unknown time offset: Li &
+Mourikis (2014).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import blas, lapack
+
+from share.estimator.inertial import observe
+from share.estimator.inertial.imu import integrate
+from share.estimator.inertial.state import (
+    ACCEL_BIAS,
+    CORE,
+    EXTRINSIC,
+    GYRO_BIAS,
+    OFFSET,
+    POSE,
+    VELOCITY,
+    State,
+)
+from share.geometry import se3
+from share.geometry.camera import ImuNoise
+from share.types import F64, I64, ImuBatch
+
+_MOVING = 15  # columns that propagation changes
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """Rows of an update: residual (M, 2) measured - predicted, and how it depends on the state: core
+    (M, 2, 22), the pose (M, 2, 6) of keyframe number host (M,), inverse depth (M, 2) of feature number
+    which (M,). sigma (M,) of one coordinate, as the residual: normalised coordinates."""
+
+    which: I64
+    host: I64
+    residual: F64
+    core: F64
+    by_host: F64
+    by_rho: F64
+    sigma: F64
+
+    def take(self, keep: NDArray[np.bool_] | I64) -> Sight:
+        return Sight(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+
+
+def propagate(state: State, imu: ImuBatch, to_ns: int, noise: ImuNoise, gravity: float) -> F64:
+    """To `to_ns`, IMU time. The body's rate (3,) rad/s then, free of bias. Raises ValueError without
+    samples."""
+    motion = integrate(state.T, state.v, state.bg, state.ba, imu, state.stamp_ns, to_ns, noise, gravity)
+    F, P = motion.transition, state.cov
+    P[:_MOVING] = F @ P[:_MOVING]
+    P[:, :_MOVING] = P[:, :_MOVING] @ F.T
+    P[:_MOVING, :_MOVING] += motion.noise
+    state.T, state.v, state.stamp_ns = motion.T, motion.v, to_ns
+    return motion.rate
+
+
+def twist(state: State, rate: F64) -> F64:
+    """How the body's pose moves with time, (6,): T(t + dt) = Exp(twist dt) T(t). rate (3,): rad/s, body."""
+    turning = state.T[:3, :3] @ rate
+    return np.concatenate([turning, state.v - np.cross(turning, state.T[:3, 3])])
+
+
+def sight(state: State, which: I64, uv: F64, sigma: F64, rate: F64, T_right_left: F64 | None = None) -> Sight:
+    """What was seen at uv (M, 2), sigma (M,), of features number `which` (M,), in cam0 or in cam1."""
+    seen = observe.predict(state, which, T_right_left)
+    core = np.zeros((len(which), 2, CORE))
+    core[:, :, POSE], core[:, :, EXTRINSIC] = seen.by_pose, seen.by_extrinsic
+    core[:, :, OFFSET] = seen.by_pose @ twist(state, rate)
+    return Sight(which, state.host[which], uv - seen.uv, core, -seen.by_pose, seen.by_rho, sigma)
+
+
+def join(*sights: Sight) -> Sight:
+    """All rows of all of them."""
+    names = Sight.__dataclass_fields__
+    return Sight(*(np.concatenate([getattr(s, name) for s in sights]) for name in names))
+
+
+def gains(state: State, rows: Sight) -> tuple[F64, F64]:
+    """cov H' (n, 2 M) and H cov H' + R (2 M, 2 M) of rows sorted by host. H is not formed: a row has 29
+    entries."""
+    P, M = state.cov, len(rows.which)
+    core, by_host = rows.core.reshape(2 * M, CORE), rows.by_host.reshape(2 * M, 6)
+    by_rho, at_rho = rows.by_rho.ravel(), np.repeat(state.features_at + rows.which, 2)
+    groups = [
+        (state.keyframe(int(h)), slice(2 * a, 2 * b)) for h, a, b in zip(*_runs(rows.host), strict=True)
+    ]
+    PHt = P[:, :CORE] @ core.T + P[:, at_rho] * by_rho
+    for columns, part in groups:
+        PHt[:, part] += P[:, columns] @ by_host[part].T
+    S = core @ PHt[:CORE] + by_rho[:, None] * PHt[at_rho]
+    for columns, part in groups:
+        S[part] += by_host[part] @ PHt[columns]
+    S[np.diag_indices(2 * M)] += np.repeat(rows.sigma**2, 2)
+    return PHt, S
+
+
+def _runs(host: I64) -> tuple[I64, I64, I64]:
+    """Value, first and last + 1 of each run of equal ones."""
+    first = np.flatnonzero(np.r_[True, host[1:] != host[:-1]]) if len(host) else np.zeros(0, np.int64)
+    return host[first], first, np.r_[first[1:], len(host)]
+
+
+def surprise(rows: Sight, S: F64) -> F64:
+    """Squared Mahalanobis distance (M,) of each residual on its own, 2 degrees of freedom; inf where nothing
+    was predicted."""
+    M = len(rows.which)
+    a, b = 2 * np.arange(M), 2 * np.arange(M) + 1
+    x, y = rows.residual.T
+    sxx, sxy, syy = S[a, a], S[a, b], S[b, b]
+    d = (syy * x * x - 2 * sxy * x * y + sxx * y * y) / (sxx * syy - sxy * sxy)
+    out: F64 = np.where(np.isfinite(d), d, np.inf)
+    return out
+
+
+def update(state: State, rows: Sight, PHt: F64, S: F64) -> float:
+    """Apply rows with their `gains`. The squared Mahalanobis distance of all of them together.
+
+    Raises numpy.linalg.LinAlgError where S is not positive definite."""
+    return apply(state, rows.residual.ravel(), PHt, S)
+
+
+def apply(state: State, residual: F64, PHt: F64, S: F64) -> float:
+    """residual (m,), cov H' (n, m), its covariance S (m, m)."""
+    L, failed = lapack.dpotrf(S, lower=1, clean=1)
+    if failed:
+        raise np.linalg.LinAlgError("innovation covariance is not positive definite")
+    W = blas.dtrsm(1.0, L, PHt.T, lower=1)  # L^-1 H cov
+    white = blas.dtrsm(1.0, L, residual[:, None], lower=1)[:, 0]
+    state.cov -= W.T @ W
+    state.cov += state.cov.T
+    state.cov *= 0.5
+    move(state, W.T @ white)
+    return float(white @ white)
+
+
+def move(state: State, error: F64) -> None:
+    """Means by an error (n,)."""
+    by = se3.exp(np.concatenate([error[POSE][None], error[CORE : state.features_at].reshape(-1, 6)]))
+    turn = by[0, :3, :3]
+    state.v = turn @ state.v + error[VELOCITY]
+    state.T = by[0] @ state.T
+    state.poses = by[1:] @ state.poses
+    state.bg, state.ba = state.bg + error[GYRO_BIAS], state.ba + error[ACCEL_BIAS]
+    state.T_body_cam = state.T_body_cam @ se3.exp(error[EXTRINSIC])
+    state.offset_s += float(error[OFFSET])
+    state.rho = state.rho + error[state.features_at :]
+
+
+def add_keyframe(state: State, keyframe: int, rate: F64) -> int:
+    """The body's pose as it is when the image is taken: how far it has come by then depends on the time
+    offset. Its number."""
+    n, at = state.size, state.features_at
+    copy = np.zeros((6, n))
+    copy[:, POSE] = np.eye(6)
+    copy[:, OFFSET] = twist(state, rate)
+    rows = copy @ state.cov
+    grown = np.empty((n + 6, n + 6))
+    old = np.r_[0:at, at + 6 : n + 6]
+    new = slice(at, at + 6)
+    grown[np.ix_(old, old)] = state.cov
+    grown[new, old], grown[old, new] = rows, rows.T
+    grown[new, new] = rows @ copy.T
+    state.cov = grown
+    state.keyframes = np.append(state.keyframes, keyframe)
+    state.poses = np.concatenate([state.poses, state.T[None]])
+    return len(state.keyframes) - 1
+
+
+def add_features(state: State, ids: I64, host: int, ray: F64, rho: F64, sigma: F64) -> None:
+    """Features (N,) that keyframe number `host` sees on rays (N, 2), inverse depth rho with sigma (N,)."""
+    n, more = state.size, len(ids)
+    grown = np.zeros((n + more, n + more))
+    grown[:n, :n] = state.cov
+    new = np.arange(n, n + more)
+    grown[new, new] = sigma**2
+    state.cov = grown
+    state.ids = np.concatenate([state.ids, ids])
+    state.host = np.concatenate([state.host, np.full(more, host)])
+    state.ray = np.concatenate([state.ray, ray])
+    state.rho = np.concatenate([state.rho, rho])
+
+
+def keep_features(state: State, keep: NDArray[np.bool_]) -> None:
+    """The others are forgotten; what they taught of the rest stays."""
+    _keep_columns(state, np.r_[np.ones(state.features_at, bool), keep])
+    state.ids, state.host = state.ids[keep], state.host[keep]
+    state.ray, state.rho = state.ray[keep], state.rho[keep]
+
+
+def drop_keyframes(state: State, keyframes: I64) -> None:
+    """These ids, with the features that they host."""
+    leave = np.isin(state.keyframes, keyframes)
+    keep_features(state, ~leave[state.host])
+    _keep_columns(state, np.r_[np.ones(CORE, bool), np.repeat(~leave, 6), np.ones(len(state.ids), bool)])
+    state.host = (np.cumsum(~leave) - 1)[state.host]
+    state.keyframes, state.poses = state.keyframes[~leave], state.poses[~leave]
+
+
+def _keep_columns(state: State, keep: NDArray[np.bool_]) -> None:
+    if not keep.all():
+        state.cov = np.ascontiguousarray(state.cov[np.ix_(keep, keep)])
+
+
+def pose_cov(state: State) -> F64:
+    """Of T_odom_body (6, 6), perturbed on the right as everywhere else (`share.geometry.se3`)."""
+    Ad = se3.adjoint(se3.inverse(state.T))
+    out: F64 = Ad @ state.cov[POSE, POSE] @ Ad.T
+    return out

@@ -1,0 +1,86 @@
+"""What the filter knows: means, and one covariance over the errors of all of them.
+
+Errors of poses and velocity are on the left, in odom (the right-invariant error of Barrau & Bonnabel
+2017): R = Exp(phi) R_mean, p = Exp(phi) p_mean + rho, v = Exp(phi) v_mean + nu. What nobody can observe,
+a turn of everything about the vertical and a shift of everything, is then the same direction of the
+error whatever the means are, so no linearisation point can make the filter believe that it saw it.
+
+Columns of the covariance: body pose 6 | velocity 3 | gyro bias 3 | accel bias 3 | T_body_cam 6 (on
+the right) | time offset 1 | keyframe poses 6 each | inverse depths 1 each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.types import F64, I64
+
+POSE = slice(0, 6)
+VELOCITY = slice(6, 9)
+GYRO_BIAS = slice(9, 12)
+ACCEL_BIAS = slice(12, 15)
+EXTRINSIC = slice(15, 21)
+OFFSET = 21
+CORE = 22
+
+
+@dataclass(eq=False)
+class State:
+    """stamp_ns: IMU time of the body's mean. T (4, 4) T_odom_body; v (3,) m/s in odom; bg rad/s, ba m/s^2
+    (3,) in the body; T_body_cam (4, 4); offset_s: IMU time less camera time.
+
+    keyframes (K,) ids with poses (K, 4, 4) T_odom_body. Features: ids (N,), host (N,) index into
+    keyframes, ray (N, 2) normalised coordinates in the host's cam0, by definition exact: a feature is
+    what is there; rho (N,) inverse depth along the host's axis, 1/m. cov (22 + 6 K + N, same).
+    """
+
+    stamp_ns: int
+    T: F64
+    v: F64
+    bg: F64
+    ba: F64
+    T_body_cam: F64
+    offset_s: float
+    cov: F64
+    keyframes: I64
+    poses: F64
+    ids: I64
+    host: I64
+    ray: F64
+    rho: F64
+
+    @property
+    def size(self) -> int:
+        return CORE + 6 * len(self.keyframes) + len(self.ids)
+
+    @property
+    def features_at(self) -> int:
+        """The first feature's column."""
+        return CORE + 6 * len(self.keyframes)
+
+    def keyframe(self, k: int) -> slice:
+        """Columns of keyframe number k of `poses`."""
+        return slice(CORE + 6 * k, CORE + 6 * k + 6)
+
+
+def begin(stamp_ns: int, T: F64, v: F64, bg: F64, ba: F64, T_body_cam: F64, sigma: F64) -> State:
+    """A state without keyframes; sigma (22,): standard deviations of the core, uncorrelated."""
+    none = np.zeros(0, np.int64)
+    return State(
+        stamp_ns,
+        T.copy(),
+        v.copy(),
+        bg.copy(),
+        ba.copy(),
+        T_body_cam.copy(),
+        0.0,
+        np.diag(sigma**2),
+        none,
+        np.zeros((0, 4, 4)),
+        none,
+        none,
+        np.zeros((0, 2)),
+        np.zeros(0),
+    )
