@@ -17,6 +17,7 @@ from share.errors import ShareError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
+_failed: ShareError | None = None  # of this process, at its start
 _AHEAD = 2  # jobs handed out per worker, so that none waits for work
 
 
@@ -29,13 +30,14 @@ class Pool:
         self._pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (start, arguments))
 
     def run(self, work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result]]:
-        """Every job with `work(job)`, in the order in which they are done. Raises what a job raised."""
+        """Every job with `work(job)`, in the order in which they are done. Raises what a job raised, or
+        the ShareError that `start` did."""
         waiting = iter(jobs)
         running: dict[Future[Result], Job] = {}
         try:
             while True:
                 for job in islice(waiting, _AHEAD * self._workers - len(running)):
-                    running[self._pool.submit(work, job)] = job
+                    running[self._pool.submit(_do, work, job)] = job
                 if not running:
                     return
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -56,7 +58,17 @@ def _begin(start: Callable[..., None], arguments: tuple[object, ...]) -> None:
     """The first thing that a process does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    start(*arguments)
+    global _failed  # an exception here would be printed, and tell the parent nothing
+    try:
+        start(*arguments)
+    except ShareError as error:
+        _failed = error
+
+
+def _do(work: Callable[[Job], Result], job: Job) -> Result:
+    if _failed is not None:
+        raise _failed
+    return work(job)
 
 
 def _end_with_parent() -> None:

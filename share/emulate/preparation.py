@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import difflib
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from share.emulate import room_file
@@ -13,7 +14,7 @@ from share.emulate.motion.spline import SplinePath
 from share.emulate.progress import Progress
 from share.emulate.recipe import Recipe
 from share.emulate.sensor.device import Device, Pictures
-from share.emulate.stage import Actor, Stage
+from share.emulate.stage import Actor, Stage, within
 from share.emulate.types import Path as Motion
 from share.emulate.world.layout import Layout
 from share.errors import UsageError
@@ -22,24 +23,40 @@ from share.io.profile import profile
 from share.io.profile_types import Profile
 from share.types import I64, AgentKind
 
-_ROOM = "room"
+_GLTF = (".glb", ".gltf")
+_TAKEN = ("truth",)  # the name of a folder of the session
 _PROFILE, _EUROC_PROFILE = "d435i", "euroc"
 _DEPTH = "rgbd"
 
 
-def prepare(recipe: Recipe, work: Path, progress: Progress) -> tuple[Stage, Layout, tuple[str, ...]]:
-    """The stage, its room kept in `work`, what stands in it, and notes for a person.
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """layout: what stands in the room. notes: for a person."""
+
+    stage: Stage
+    layout: Layout
+    notes: tuple[str, ...]
+
+
+def prepare(recipe: Recipe, room: Path, progress: Progress) -> Prepared:
+    """The stage, whose room is to be kept in the folder `room`. Nothing is written.
 
     Raises UsageError, ConfigError or DataError for what cannot be made."""
     progress("planning", 0, 1)
     planned = plan(recipe.motions, furnish(recipe), recipe.seconds, recipe.seed)
     _check_names(recipe, planned)
     actors = tuple(_actor(agent, k, recipe) for k, agent in enumerate(planned.agents))
-    progress("making the room", 0, 1)
-    room = work / _ROOM
-    room_file.keep(planned.layout, {a.name: a.shapes for a in actors}, room)
     notes = planned.notes + tuple(f"{a.name}: {note}" for a in planned.agents for note in a.notes)
-    return Stage(room, actors), planned.layout, notes
+    progress("planning", 1, 1)
+    return Prepared(Stage(room, actors), planned.layout, notes)
+
+
+def keep_room(prepared: Prepared, progress: Progress) -> None:
+    """Draw the room's pictures and bake its light where the stage expects them, if they are not there yet."""
+    progress("making the room", 0, 1)
+    stage = prepared.stage
+    room_file.keep(prepared.layout, {actor.name: actor.shapes for actor in stage.actors}, stage.room)
+    progress("making the room", 1, 1)
 
 
 def furnish(recipe: Recipe) -> Layout:
@@ -48,13 +65,24 @@ def furnish(recipe: Recipe) -> Layout:
         from share.emulate.plain.scene import layout as plain_layout
 
         return plain_layout(recipe.seed, recipe.size)
-    if recipe.scene.endswith((".glb", ".gltf")):
-        from share.emulate.world.gltf import load_gltf
+    if recipe.scene.lower().endswith(_GLTF):
+        return _own_room(recipe)
+    from share.emulate.world.scenes import SCENES, layout
 
-        return load_gltf(Path(recipe.scene))
-    from share.emulate.world.scenes import layout
-
+    if recipe.scene not in SCENES:
+        known = (*SCENES, room_file.PLAIN)
+        near = difflib.get_close_matches(recipe.scene, known, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(known)}, or give a .glb file"
+        raise UsageError(f"scene '{recipe.scene}' is not known; {hint}")
     return layout(recipe.scene, recipe.seed, recipe.size)
+
+
+def _own_room(recipe: Recipe) -> Layout:
+    from share.emulate.world.gltf import load_gltf
+
+    if recipe.size is not None:
+        raise UsageError(f"{recipe.scene}: the room in a file has a size of its own; leave --size out")
+    return load_gltf(Path(recipe.scene))
 
 
 def _actor(agent: Agent, number: int, recipe: Recipe) -> Actor:
@@ -102,8 +130,7 @@ def _of_imu(agent: Agent, rig: Rig) -> Motion:
 
 def _outside(pictures: Pictures, gaps: I64) -> Pictures:
     """Without those taken where nobody knows the truth."""
-    t = pictures.true_ns[:, None]
-    known = ~((t > gaps[:, 0]) & (t < gaps[:, 1])).any(axis=1)
+    known = ~within(gaps, pictures.true_ns)
     return Pictures(pictures.index[known], pictures.true_ns[known], pictures.stamp_ns[known])
 
 
@@ -113,6 +140,10 @@ def _chosen(table: dict[str, str], name: str) -> str | None:
 
 def _check_names(recipe: Recipe, planned: Plan) -> None:
     known = {agent.name for agent in planned.agents}
+    if taken := known.intersection(_TAKEN):
+        raise UsageError(
+            f"an agent cannot be named '{taken.pop()}': the session's truth is in a folder of that name"
+        )
     for table in (recipe.sensors, recipe.profiles):
         for name in table:
             if name and name not in known:

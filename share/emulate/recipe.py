@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from share.emulate.motion.spec import RecordedSpec, parse
 from share.emulate.sensor.effects import Effects
 from share.errors import UsageError
 
 GENERATOR_VERSION = 2  # raise it when any picture, motion or file changes: cached sessions are made anew
 SENSORS = ("stereo", "rgbd")
 IMAGES = ("jpeg", "png")
+_DEPTHS, _TEXTS = ("*", "*/*", "*/*/*"), (".csv", ".txt", ".yaml")  # FOLDER/mav0/imu0/data.csv
 
 
 @dataclass(frozen=True)
@@ -34,8 +37,8 @@ class Recipe:
     images: str = "jpeg"
 
     def __post_init__(self) -> None:
-        if not 1 <= self.seconds <= 3600:
-            raise UsageError(f"{self.seconds:g} seconds: a session lasts 1 to 3600 seconds")
+        if not 3 <= self.seconds <= 3600:
+            raise UsageError(f"{self.seconds:g} seconds: a session lasts 3 to 3600 seconds")
         if not 0 <= self.seed < 2**63:
             raise UsageError(f"seed {self.seed}: must be 0 .. 2^63 - 1")
         for sensors in self.sensors.values():
@@ -52,10 +55,27 @@ class Recipe:
 
     @property
     def digest(self) -> str:
-        """Twelve characters that differ where anything does, the user's scene and profiles included."""
+        """Twelve characters that differ where anything does, the user's own files included. Raises UsageError
+        for a motion that cannot be understood."""
         digest = hashlib.sha256(json.dumps(self.plain(), sort_keys=True).encode())
+        for path in self._own_files():
+            digest.update(path.read_bytes())
+        return digest.hexdigest()[:12]
+
+    def _own_files(self) -> Iterator[Path]:
+        """Scene and profiles where they are files, not ours by their names, and all of recorded motions
+        but images."""
         for name in (self.scene, *self.profiles.values()):
             path = Path(name.partition(":")[0])
-            if path.suffix and path.is_file():  # the user's own, not one of ours by its name
-                digest.update(path.read_bytes())
-        return digest.hexdigest()[:12]
+            if path.suffix and path.is_file():
+                yield path
+        for text in self.motions:
+            _, spec = parse(text)
+            if isinstance(spec, RecordedSpec):
+                yield from _tables(Path(spec.path))
+
+
+def _tables(path: Path) -> list[Path]:
+    """The file, or what a recording's folder holds as text."""
+    found = [path] if path.is_file() else [p for depth in _DEPTHS for p in path.glob(depth)]
+    return sorted(p for p in found if p.is_file() and (p == path or p.suffix in _TEXTS))

@@ -20,7 +20,7 @@ def keep(layout: Layout, movers: dict[str, tuple[Shape, ...]], folder: Path) -> 
     if (folder / _PLAIN_FILE).exists() or (folder / _GL_FILE).exists():
         return
     if layout.name == PLAIN:
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         atomic_write(folder / _PLAIN_FILE, json.dumps({"seed": layout.seed, "size": layout.size}))
         return
     from share.emulate.world.build import build

@@ -1,7 +1,6 @@
-"""Makes a session folder: session.yaml, NAME.mcap and truth/NAME.tum per agent.
+"""Makes a session folder: session.yaml, plan.png, NAME.mcap and truth/NAME.tum per agent.
 
-A folder under its own name is whole. It grows as `.NAME.partial-DIGEST`, where what a break leaves is
-used by the next attempt at the same recipe, and is renamed at the end.
+recipe -> stage (nothing is written) -> how frames are exposed -> chunks of frames -> recordings, truth
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +17,10 @@ import numpy as np
 from share import __version__
 from share.emulate import shooting
 from share.emulate.asl import check_asl, to_asl
+from share.emulate.growth import Growth
 from share.emulate.plan_picture import draw_plan
 from share.emulate.pool import Pool
-from share.emulate.preparation import prepare
+from share.emulate.preparation import Prepared, keep_room, prepare
 from share.emulate.progress import Progress, silent
 from share.emulate.recipe import Recipe
 from share.emulate.sensor.exposure import Shots
@@ -27,8 +28,7 @@ from share.emulate.shooting import Look, Take
 from share.emulate.stage import Actor, Stage
 from share.emulate.takes import write_recording, write_truth
 from share.emulate.types import START_NS
-from share.emulate.world.layout import Layout
-from share.errors import ShareError, UsageError
+from share.errors import ShareError
 from share.io.files import atomic_write, writable_dir, writing
 from share.io.kalibr import to_kalibr
 from share.io.session import SCHEMA, SESSION
@@ -45,14 +45,21 @@ def make_session(
     recipe: Recipe, out: Path, workers: int = 2, progress: Progress = silent, asl: bool = False
 ) -> Path:
     """Make a session in the new folder `out` with `workers` processes; with `asl`, an EuRoC/ASL folder
-    NAME/mav0 of each agent instead.
+    NAME/mav0 of each agent instead. What a break leaves is used by the next attempt at the same recipe.
 
     Raises UsageError where `out` exists, or for what cannot be made; ShareError where the disk is full.
     """
-    with _lock(out):
-        if out.exists():
-            raise UsageError(f"{out}: exists already; give the name of a new folder")
-        _make(recipe, out, workers, progress, asl)
+    growth = Growth(out, recipe.digest)
+    growth.check_new()
+    prepared = prepare(recipe, growth.room, progress)
+    if asl:
+        check_asl(prepared.stage)
+    with growth, writing(out):
+        _check_space(growth, prepared.stage, recipe, copies=3 if asl else 2)
+        _make(recipe, prepared, growth, workers, progress)
+        if asl:
+            to_asl(growth.session, [actor.name for actor in prepared.stage.actors], progress)
+        growth.finish()
     return out
 
 
@@ -62,9 +69,9 @@ def cached_session(
     """The session of this recipe in `cache` (default: the user's), made if it is not there yet."""
     out = (default_cache() if cache is None else cache) / f"session-{recipe.digest}"
     if not out.exists():
-        with _lock(out):
+        with _lock(out.parent):
             if not out.exists():  # nobody else made it while we waited
-                _make(recipe, out, workers, progress)
+                make_session(recipe, out, workers, progress)
     return out
 
 
@@ -74,29 +81,18 @@ def default_cache() -> Path:
     return (Path(home) if Path(home).is_absolute() else Path.home() / ".cache") / "share"
 
 
-def _make(recipe: Recipe, out: Path, workers: int, progress: Progress, asl: bool = False) -> None:
-    partial = out.with_name(f".{out.name}.partial-{recipe.digest}")
-    with writing(out):
-        (partial / "truth").mkdir(parents=True, exist_ok=True)
-        work = partial / "work"
-        work.mkdir(exist_ok=True)
-        stage, layout, notes = prepare(recipe, work, progress)
-        if asl:
-            check_asl(stage)
-        _check_space(partial, stage, recipe)
-        with Pool(workers, shooting.begin, (stage, recipe.images)) as pool:
-            exposures = [_exposures(pool, stage, who, work, progress) for who in range(len(stage.actors))]
-            chunks = _shoot(pool, stage, exposures, work, progress)
-        for k, (actor, files) in enumerate(zip(stage.actors, chunks, strict=True)):
-            progress("writing recordings", k, len(stage.actors))
-            write_recording(actor, files, partial / f"{actor.name}.mcap")
-            write_truth(actor, partial / "truth" / f"{actor.name}.tum")
-        draw_plan(partial / PLAN, layout, stage.actors)
-        atomic_write(partial / SESSION, _description(recipe, stage, layout, notes))
-        if asl:
-            to_asl(partial, [actor.name for actor in stage.actors], progress)
-        shutil.rmtree(work)
-        partial.rename(out)
+def _make(recipe: Recipe, prepared: Prepared, growth: Growth, workers: int, progress: Progress) -> None:
+    stage, folder = prepared.stage, growth.session
+    keep_room(prepared, progress)
+    with Pool(workers, shooting.begin, (stage, recipe.images)) as pool:
+        exposures = [_exposures(pool, stage, who, growth.work, progress) for who in range(len(stage.actors))]
+        chunks = _shoot(pool, stage, exposures, growth, progress)
+    for k, (actor, files) in enumerate(zip(stage.actors, chunks, strict=True)):
+        progress("writing recordings", k, len(stage.actors))
+        write_recording(actor, files, folder / f"{actor.name}.mcap")
+        write_truth(actor, folder / "truth" / f"{actor.name}.tum")
+    draw_plan(folder / PLAN, prepared.layout, stage.actors)
+    atomic_write(folder / SESSION, _description(recipe, prepared))
 
 
 def _exposures(pool: Pool, stage: Stage, who: int, work: Path, progress: Progress) -> Shots:
@@ -113,15 +109,24 @@ def _exposures(pool: Pool, stage: Stage, who: int, work: Path, progress: Progres
             values[int(job.true_ns[0])] = seen
             progress(f"metering {actor.name}", len(values), len(jobs))
         brightness = np.concatenate([values[key] for key in sorted(values)])
-        np.save(kept, brightness)
+        atomic_write(kept, _npy(brightness))
     return actor.device.shots(true_ns, np.interp(true_ns - looks[0], looks - looks[0], brightness))
 
 
+def _npy(values: F64) -> bytes:
+    file = BytesIO()
+    np.save(file, values)
+    return file.getvalue()
+
+
 def _shoot(
-    pool: Pool, stage: Stage, exposures: list[Shots], work: Path, progress: Progress
+    pool: Pool, stage: Stage, exposures: list[Shots], growth: Growth, progress: Progress
 ) -> list[list[Path]]:
     """The chunks of each actor, in order; those that are there already are not drawn again."""
-    takes = [_takes(stage.actors[who], who, exposures[who], work) for who in range(len(stage.actors))]
+    takes = [
+        _takes(actor, who, exposures[who], growth.frames(actor.name))
+        for who, actor in enumerate(stage.actors)
+    ]
     todo = [take for them in takes for take in them if not take.file.exists()]
     total = sum(len(actor.pictures) for actor in stage.actors)
     done = total - sum(take.last - take.first for take in todo)
@@ -132,26 +137,33 @@ def _shoot(
     return [[take.file for take in them] for them in takes]
 
 
-def _takes(actor: Actor, who: int, shots: Shots, work: Path) -> list[Take]:
-    folder = work / actor.name
-    folder.mkdir(exist_ok=True)
+def _takes(actor: Actor, who: int, shots: Shots, folder: Path) -> list[Take]:
+    folder.mkdir(parents=True, exist_ok=True)
     count = len(actor.pictures)
     spans = [(k, min(k + _FRAMES, count)) for k in range(0, count, _FRAMES)]
     return [Take(who, a, b, folder / f"{a:06d}.chunk", shots.part(a, b)) for a, b in spans]
 
 
-def _check_space(folder: Path, stage: Stage, recipe: Recipe) -> None:
-    """Before hours are spent: the chunks and the recordings are there side by side at the end."""
+def _check_space(growth: Growth, stage: Stage, recipe: Recipe, copies: int) -> None:
+    """Before hours are spent: so many copies of the images are there side by side at the end."""
     images = sum(2 * len(actor.pictures) for actor in stage.actors)
-    need, free = 2 * images * _BYTES[recipe.images], shutil.disk_usage(folder).free
+    there = sum(chunk.stat().st_size for chunk in growth.drawn())
+    need, free = copies * images * _BYTES[recipe.images] - there, shutil.disk_usage(growth.work).free
     if need > free:
         raise ShareError(
-            f"{folder.parent}: about {need / 1e9:.1f} GB are needed and {free / 1e9:.1f} GB are free; "
-            "make room, or fewer --seconds"
+            f"{growth.out}: about {need / 1e9:.2f} GB are needed and {free / 1e9:.2f} GB are free; "
+            "make room, or give fewer --seconds"
         )
 
 
-def _description(recipe: Recipe, stage: Stage, layout: Layout, notes: tuple[str, ...]) -> str:
+def _first_shown_ns(actor: Actor) -> int:
+    """What the device's clock shows at the session's first instant."""
+    clock = actor.device.clock
+    shown = actor.path.start_ns + clock.offset_ns
+    return shown % clock.period_ns if clock.period_ns else shown
+
+
+def _description(recipe: Recipe, prepared: Prepared) -> str:
     """session.yaml. A stamp in an agent's files is session time + clock_offset_ns."""
     import yaml
 
@@ -160,31 +172,30 @@ def _description(recipe: Recipe, stage: Stage, layout: Layout, notes: tuple[str,
             "kind": actor.kind.value,
             "sensors": actor.rig.kind,
             "rate_hz": actor.device.profile.rate_hz,
-            "clock_offset_ns": actor.clock_offset_ns - START_NS + actor.device.clock.offset_ns,
+            "clock_offset_ns": _first_shown_ns(actor) - START_NS,
             "calibration": to_kalibr(actor.rig),
         }
-        for actor in stage.actors
+        for actor in prepared.stage.actors
     }
     provenance = {
         "generator": "share emulate",
         "share_version": __version__,
         **recipe.plain(),
-        "notes": list(notes),
+        "notes": list(prepared.notes),
     }
     data = {"schema": SCHEMA, "provenance": provenance, "agents": agents}
-    if layout.target is not None:
-        placed = layout.target
+    if (placed := prepared.layout.target) is not None:
         data[TARGET] = to_plain(placed.target) | {T_WORLD_TARGET: placed.T_world_target.tolist()}
     return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
 
 
 @contextmanager
-def _lock(out: Path) -> Iterator[None]:
-    """Only one process makes a session in a folder at a time; others wait. The lock is on the folder
+def _lock(cache: Path) -> Iterator[None]:
+    """Only one process at a time makes what is to be kept there; others wait. The lock is on the folder
     itself, so nothing is left behind, and the system releases it if we are killed."""
     import fcntl
 
-    handle = os.open(writable_dir(out.parent), os.O_RDONLY)
+    handle = os.open(writable_dir(cache), os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
         yield

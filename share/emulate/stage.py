@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 
 import numpy as np
+from numpy.typing import NDArray
 
 from share.emulate.motion.avatars import Avatar
 from share.emulate.sensor.device import Device, Pictures
@@ -36,6 +37,10 @@ class Actor:
     def clock_offset_ns(self) -> int:
         """Its first instant: sessions begin at 0."""
         return self.path.start_ns
+
+    def in_gap(self, true_ns: I64) -> NDArray[np.bool_]:
+        """At which of the times (N,) nobody knows where it is."""
+        return within(self.path.gaps, true_ns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +93,13 @@ class Stage:
                 there = session_ns + actor.clock_offset_ns
                 out[actor.name] = actor.avatar.parts(np.clip(there, actor.path.start_ns, actor.path.end_ns))
         return out
+
+
+def within(gaps: I64, true_ns: I64) -> NDArray[np.bool_]:
+    """Which of the times (N,) lie in one of the gaps (G, 2), whose ends are known."""
+    t = true_ns[:, None]
+    out: NDArray[np.bool_] = np.any((t > gaps[:, 0]) & (t < gaps[:, 1]), axis=1)
+    return out
 
 
 def T_body(rig: Rig, camera: str) -> F64:

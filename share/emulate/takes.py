@@ -27,8 +27,8 @@ def write_truth(actor: Actor, path: Path) -> None:
     """Pose of the body in the world when the device's clock, which is the IMU's too, shows the stamp of
     each picture. (With a time offset the picture itself was taken a little before or after.)"""
     times, stamps = actor.device.truth_times(actor.pictures)
-    inside = (times >= actor.path.start_ns) & (times <= actor.path.end_ns)
-    atomic_write(path, format_tum(Trajectory(stamps[inside], actor.path.poses(times[inside]))))
+    known = (times >= actor.path.start_ns) & (times <= actor.path.end_ns) & ~actor.in_gap(times)
+    atomic_write(path, format_tum(Trajectory(stamps[known], actor.path.poses(times[known]))))
 
 
 def _inertial(actor: Actor) -> Iterator[Measurement]:
