@@ -18,6 +18,11 @@ def test_at_rest_up_is_known_from_twenty_samples():
     assert rest.add(batch(9.8 * UP)) == pytest.approx(UP)
 
 
+def test_the_zero_of_a_cheap_accelerometer_is_no_motion():
+    """70 mg, the most that the data sheet of a D435i's BMI055 allows."""
+    assert AtRest().add(batch((9.807 + 0.07 * 9.807) * UP, n=20)) == pytest.approx(UP)
+
+
 @pytest.mark.parametrize(
     "imu",
     [

@@ -2,22 +2,15 @@
 
 import numpy as np
 import pytest
+from plain_walk import CAMERA, STEREO, T_CAM1_CAM0, pairs, poses
 
 from share.config import TrackerConfig
-from share.emulate.plain.motion import STYLES, move
-from share.emulate.plain.render import Renderer
-from share.emulate.plain.room import make_room
-from share.emulate.plain.sensor import Sensor
 from share.estimator import gravity
 from share.estimator.visual import VisualTracker
 from share.geometry import se3
-from share.geometry.camera import Camera, ImuNoise, Rig
+from share.geometry.camera import ImuNoise, Rig
 from share.types import Frame, ImuBatch, TrackState
 
-CAMERA = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)
-T_CAM1_CAM0 = np.eye(4)
-T_CAM1_CAM0[0, 3] = -0.05
-STEREO = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
 HZ = 20
 DEFAULT = TrackerConfig()
 
@@ -25,17 +18,8 @@ DEFAULT = TrackerConfig()
 @pytest.fixture(scope="module")
 def walk():
     """Four seconds of a person's stereo images, and the true poses of cam0."""
-    room, sensor = make_room(5), Sensor((5, 1))
-    renderer = Renderer(room, CAMERA)
-    T = move(STYLES["walker"], room.size, np.arange(0, 4, 1 / HZ), (5, 2))
-    images = [
-        (
-            sensor.gray(renderer.render(x)[0], i, 0),
-            sensor.gray(renderer.render(x @ se3.inverse(T_CAM1_CAM0))[0], i, 1),
-        )
-        for i, x in enumerate(T)
-    ]
-    return images, T
+    T = poses("walker", np.arange(1, 5, 1 / HZ), 5)
+    return pairs(T, 5), T
 
 
 def stamp(i):
@@ -106,9 +90,7 @@ def test_a_long_darkness_does_not_cost_the_map(walk):
 
 def test_carried_away_while_blind_begins_a_new_stretch(walk):
     images, _ = walk
-    elsewhere = Renderer(make_room(77), CAMERA)
-    T = move(STYLES["stroller"], make_room(77).size, np.arange(0, 1, 1 / HZ), (7, 2))
-    other = [(elsewhere.render(x)[0], elsewhere.render(x @ se3.inverse(T_CAM1_CAM0))[0]) for x in T]
+    other = pairs(poses("stroller", np.arange(1, 2, 1 / HZ), 77), 77)
     config = TrackerConfig(new_stretch_s=0.3)
     results, candidates = run([*images[:20], *other], config)
     states = [r.state for r in results]

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from plain_walk import CAMERA, T_CAM1_CAM0
 
-from share.emulate.plain.motion import STYLES, move
+from share.emulate.motion import walk
 from share.emulate.plain.render import Renderer
 from share.emulate.plain.room import make_room
 from share.geometry import se3
@@ -12,17 +13,13 @@ from share.types import Frame
 from share.vision import corners, depth, klt
 from share.vision.view import make_view, orb
 
-CAMERA = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)
-T_CAM1_CAM0 = np.eye(4)
-T_CAM1_CAM0[0, 3] = -0.05
-
 
 @pytest.fixture(scope="module")
 def scene():
     """Left image, its exact depth, right image, and an image from 8 cm and 3 degrees away."""
     room = make_room(3)
     renderer = Renderer(room, CAMERA)
-    T = move(STYLES["walker"], room.size, np.array([0.0, 3.0]), (3,))[1]
+    T = se3.compose(walk.turn(1, np.array([0.1]))[0] @ walk.CAMERA_AXES, np.array([5.35, 1.5, 1.66]))
     near = T @ se3.exp(np.array([0.01, 0.05, 0.0, 0.05, 0.01, 0.06]))
     left, exact = renderer.render(T)
     right, _ = renderer.render(T @ se3.inverse(T_CAM1_CAM0))

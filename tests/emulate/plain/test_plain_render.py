@@ -3,15 +3,13 @@
 import cv2
 import numpy as np
 import pytest
+from plain_walk import CAMERA, MOTIONS, gray, poses
 
-from share.emulate.plain.motion import STYLES, move
 from share.emulate.plain.render import Renderer
 from share.emulate.plain.room import make_room
-from share.emulate.plain.sensor import Sensor
 from share.geometry.camera import Camera
 from share.geometry.se3 import compose, inverse, transform
 
-CAMERA = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)
 SECONDS = np.arange(0, 20, 0.05)
 
 
@@ -26,8 +24,8 @@ def renderer(room):
 
 
 @pytest.fixture(scope="module")
-def path(room):
-    return move(STYLES["walker"], room.size, SECONDS, (0, 2, 0))
+def path():
+    return poses("walker", SECONDS, 0)
 
 
 def bilinear(image, px):
@@ -89,13 +87,12 @@ def test_one_view_predicts_another(renderer, path):
         assert np.percentile(np.abs(difference), 90) < 10.0
 
 
-@pytest.mark.parametrize("style", list(STYLES))
-def test_tracks_follow_the_exact_projection(room, renderer, style):
-    path = move(STYLES[style], room.size, SECONDS, (0, 2, 1))
-    sensor, errors = Sensor((0, 3)), []
+@pytest.mark.parametrize("who", MOTIONS)
+def test_tracks_follow_the_exact_projection(renderer, who):
+    path, errors = poses(who, SECONDS, 0), []
     for k in range(10, 390, 47):
-        (a, depth), (b, depth_b) = (renderer.render(path[i]) for i in (k, k + 1))
-        a, b = sensor.gray(a, k, 0), sensor.gray(b, k + 1, 0)
+        depth, depth_b = (renderer.render(path[i])[1] for i in (k, k + 1))
+        a, b = (gray(path[i], 0, i) for i in (k, k + 1))
         p = cv2.goodFeaturesToTrack(a, 200, 0.005, 15)
         q, found, _ = cv2.calcOpticalFlowPyrLK(a, b, p, None, winSize=(21, 21), maxLevel=3)
         p, q = p[:, 0].astype(float), q[:, 0]
@@ -110,12 +107,12 @@ def test_tracks_follow_the_exact_projection(room, renderer, style):
     assert np.percentile(errors, 90) < 0.35
 
 
-def test_statistics_are_near_a_real_images(room, renderer):
+def test_statistics_are_near_a_real_images():
     """A real EuRoC image: about 750 FAST corners, in 80 % of 8 x 8 cells."""
     corners, cells = [], []
-    for i, style in enumerate(STYLES.values()):
-        for k, T in enumerate(move(style, room.size, SECONDS, (0, 2, i))[::50]):
-            image = Sensor((0, 3)).gray(renderer.render(T)[0], k, 0)
+    for who in MOTIONS:
+        for k, T in enumerate(poses(who, SECONDS[::50], 0)):
+            image = gray(T, 0, k)
             found = cv2.FastFeatureDetector_create(20).detect(image)
             corners.append(len(found))
             cells.append(len({(int(c.pt[0]) // 80, int(c.pt[1]) // 60) for c in found}) / 64)
