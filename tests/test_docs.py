@@ -84,6 +84,12 @@ def test_every_page_of_docs_can_be_reached_from_the_readme() -> None:
     assert [p.name for p in (ROOT / "docs").glob("*.md") if f"docs/{p.name}" not in text] == []
 
 
+def test_every_picture_of_docs_is_shown_on_a_page() -> None:
+    text = "".join(page.read_text() for page in PAGES)
+    pictures = [p for ext in ("jpg", "png", "svg") for p in (ROOT / "docs").rglob(f"*.{ext}")]
+    assert pictures and [p.name for p in pictures if p.name not in text] == []
+
+
 def test_commands_page_has_every_command_and_no_other() -> None:
     assert set(documented()) == set(commands(cli))
 

@@ -3,6 +3,10 @@
 For every scene and two seeds, 3 x 4 views as people (1.5-1.75 m) and robots (0.35 m) have them, from places
 where one can stand, looking along free ways, each exposed to the same mean.
 Figures: tools/corner_statistics.py.
+
+    python tools/contact_sheets.py --session SESSION [--out DIR]
+
+makes DIR/session.jpg instead: the plan of an emulated session, beside it a row an agent of what it saw.
 """
 
 from __future__ import annotations
@@ -13,7 +17,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from share.core.measurement import CAM0
 from share.emulate.render.gl import GlRenderer
+from share.emulate.session import PLAN
 from share.emulate.types import Moment
 from share.emulate.world.build import build
 from share.emulate.world.layout import Layout
@@ -21,12 +27,15 @@ from share.emulate.world.occupancy import Occupancy
 from share.emulate.world.scenes import SCENES, layout
 from share.emulate.world.views import looking
 from share.geometry.camera import Camera
+from share.io.session import read_session
+from share.io.source import open_source
 from share.types import F32, F64, U8
 
 ROWS, COLUMNS = 3, 4
 CAMERA = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)  # as a D435i's infrared pair
 CLEARANCE = 0.45  # m
 EXPOSED, BRIGHTEST_GAIN = 110.0, 1.3  # mean gray level; how far dark views are raised to it
+SMALL = (288, 216)  # px, an image on a sheet
 BLUR, NOISE = 0.5, 1.5  # px, gray levels: of a good camera
 
 
@@ -68,9 +77,28 @@ def photograph(room: Layout, poses: list[F64]) -> list[U8]:
 
 
 def sheet(images: list[U8]) -> U8:
-    """ROWS x COLUMNS images, reduced to half their size."""
-    small = [cv2.resize(image, None, fx=0.45, fy=0.45, interpolation=cv2.INTER_AREA) for image in images]
+    """ROWS x COLUMNS images, made small."""
+    small = [cv2.resize(image, SMALL, interpolation=cv2.INTER_AREA) for image in images]
     return np.block([[small[r * COLUMNS + c] for c in range(COLUMNS)] for r in range(ROWS)])
+
+
+def seen(folder: Path) -> U8:
+    """The plan of a session (colour), and COLUMNS images of each agent over its whole length."""
+    rows = [_along(folder / name) for name in read_session(folder).agents]
+    images = cv2.cvtColor(np.concatenate(rows), cv2.COLOR_GRAY2BGR)
+    plan = cv2.imread(str(folder / PLAN))
+    size = round(plan.shape[1] * len(images) / plan.shape[0]), len(images)
+    return np.hstack([cv2.resize(plan, size, interpolation=cv2.INTER_AREA), images])
+
+
+def _along(agent: Path) -> U8:
+    """Images of cam0 of SESSION/NAME side by side."""
+    source = open_source(str(agent))
+    count = source.images_count
+    chosen = {(2 * k + 1) * count // (2 * COLUMNS) for k in range(COLUMNS)}
+    of_cam0 = (m for m in source.measurements() if m.stream == CAM0)
+    images = [m.payload.load() for k, m in enumerate(of_cam0) if k in chosen]
+    return np.hstack([cv2.resize(i, SMALL, interpolation=cv2.INTER_AREA) for i in images])
 
 
 def main() -> None:
@@ -80,16 +108,24 @@ def main() -> None:
     parser.add_argument(
         "--size", type=float, nargs=3, metavar=("X", "Y", "Z"), help="m, instead of the usual"
     )
+    parser.add_argument("--session", type=Path, help="an emulated session, instead of scenes")
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "docs" / "pictures")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
+    if args.session:
+        write(args.out / "session.jpg", seen(args.session))
+        return
     for name in args.scene or SCENES:
         for seed in args.seeds:
             room = layout(name, seed, tuple(args.size) if args.size else None)
             images = photograph(room, views(room, ROWS * COLUMNS))
-            path = args.out / f"{name}-{seed}.jpg"
-            cv2.imwrite(str(path), sheet(images), [cv2.IMWRITE_JPEG_QUALITY, 80])
-            print(f"{path}  {path.stat().st_size / 1e3:.0f} kB", flush=True)
+            write(args.out / f"{name}-{seed}.jpg", sheet(images))
+
+
+def write(path: Path, picture: U8) -> None:
+    """As JPEG, and say so."""
+    cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
+    print(f"{path}  {path.stat().st_size / 1e3:.0f} kB", flush=True)
 
 
 if __name__ == "__main__":
