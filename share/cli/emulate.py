@@ -11,6 +11,7 @@ import click
 
 from share.cli import options
 from share.cli.progress import Stages
+from share.errors import UsageError
 
 _WORKERS = 2
 
@@ -119,8 +120,8 @@ def emulate(
         seconds=seconds,
         seed=seed,
         size=size,
-        sensors=_by_name(sensors) or ({"": "stereo"} if euroc else {}),
-        profiles=_by_name(profiles),
+        sensors=_by_name("--sensors", sensors) or ({"": "stereo"} if euroc else {}),
+        profiles=_by_name("--profile", profiles),
         effects=parse(effects),
         images=images or ("png" if euroc else "jpeg"),
     )
@@ -130,10 +131,15 @@ def emulate(
     click.echo(json.dumps(made) if as_json else _text(made))
 
 
-def _by_name(words: tuple[str, ...]) -> dict[str, str]:
+def _by_name(option: str, words: tuple[str, ...]) -> dict[str, str]:
     """`NAME=VALUE` by its name, a bare VALUE, which is for everybody, by ""."""
-    pairs = [word.rpartition("=") for word in words]
-    return {name: value for name, _, value in pairs}
+    out: dict[str, str] = {}
+    for word in words:
+        name, _, value = word.partition("=") if "=" in word else ("", "", word)
+        if name in out:
+            raise UsageError(f"{option} is given twice for {name or 'everybody'}; give one of them")
+        out[name] = value
+    return out
 
 
 def _described(folder: Path, euroc: bool) -> dict[str, Any]:

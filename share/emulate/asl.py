@@ -15,6 +15,8 @@ from share.io.source import open_source
 def check_asl(stage: Stage) -> None:
     """Raises UsageError where an agent has what such a folder has no place for."""
     for actor in stage.actors:
+        if actor.device.clock.period_ns:
+            raise UsageError("stamps in an ASL folder do not wrap; leave --effect wrap=on out")
         if actor.rig.depth is not None:
             raise UsageError(
                 f"{actor.name}: an ASL folder has no place for depth; give --sensors {actor.name}=stereo"

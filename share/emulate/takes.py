@@ -18,9 +18,24 @@ from share.io.trajectory import Trajectory, format_tum
 
 def write_recording(actor: Actor, chunks: list[Path], path: Path) -> None:
     """`path`.mcap with everything, in order of time. Raises ShareError where the disk is full."""
+    clock = actor.device.clock
+    first, period = int(clock.read(np.array([actor.path.start_ns]))[0]), clock.period_ns
+    streams = (_counted(s, first, period) for s in (_inertial(actor), _pictures(chunks)))
     with Recorder(path, actor.rig) as recorder:
-        for measurement in heapq.merge(_inertial(actor), _pictures(chunks), key=lambda m: m.stamp_ns):
-            recorder.write(measurement)
+        for when, measurement in heapq.merge(*streams, key=lambda timed: timed[0]):
+            recorder.write(measurement, when)
+
+
+def _counted(
+    measurements: Iterator[Measurement], latest_ns: int, period_ns: int
+) -> Iterator[tuple[int, Measurement]]:
+    """Each with its stamp without wraps of the device's counter."""
+    for measurement in measurements:
+        if period_ns:
+            latest_ns = measurement.stamp_ns + period_ns * round(
+                (latest_ns - measurement.stamp_ns) / period_ns
+            )
+        yield (latest_ns if period_ns else measurement.stamp_ns), measurement
 
 
 def write_truth(actor: Actor, path: Path) -> None:

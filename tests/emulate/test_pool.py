@@ -56,6 +56,16 @@ def test_what_a_job_raises_is_raised_here():
         list(pool.run(fail_at_three, range(100)))
 
 
+def cannot_start():
+    raise UsageError("nothing to start with")
+
+
+def test_what_the_start_raises_is_raised_here(capfd):
+    with pytest.raises(UsageError, match="nothing to start with"), Pool(2, cannot_start, ()) as pool:
+        list(pool.run(add, range(3)))
+    assert capfd.readouterr() == ("", "")
+
+
 def test_a_worker_that_dies_is_said():
     with pytest.raises(ShareError, match="has died"), Pool(1, start, (0,)) as pool:
         list(pool.run(die, [1]))

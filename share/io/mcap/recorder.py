@@ -59,22 +59,24 @@ class Recorder:
         self._schemas: dict[str, int] = {}
         self._counts: dict[str, int] = {}
         self._flushed_ns: int | None = None
+        self._log_ns = 0
 
-    def write(self, measurement: Measurement) -> None:
-        """Append one measurement. Raises DataError for a stamp before 1970 or after 2038, ShareError if
-        the disk is full."""
+    def write(self, measurement: Measurement, log_ns: int | None = None) -> None:
+        """Append one measurement. log_ns: what readers sort by, where the stamps wrap; else the stamp.
+        Raises DataError for a stamp before 1970 or after 2038, ShareError if the disk is full."""
         stamp = measurement.stamp_ns
+        self._log_ns = stamp if log_ns is None else log_ns
         if not 0 <= stamp < 2**31 * 10**9:
             raise DataError(f"{self.path}: stamp {stamp} ns does not fit a ROS 2 message")
         with writing(self.path):
             if self._flushed_ns is None:
                 self._write_rig(stamp)
             if measurement.stream == IMU:
-                self._put(ros.TOPICS[IMU], _imu(stamp, measurement.payload), stamp)
+                self._put(ros.TOPICS[IMU], _imu(stamp, measurement.payload))
             else:
                 self._image(measurement.stream, stamp, measurement.payload)
-            if self._flushed_ns is None or stamp - self._flushed_ns >= _FLUSH_NS:
-                self._flush(stamp)
+            if self._flushed_ns is None or self._log_ns - self._flushed_ns >= _FLUSH_NS:
+                self._flush(self._log_ns)
 
     def close(self) -> None:
         """Finish the file and give it its name."""
@@ -108,10 +110,10 @@ class Recorder:
         header, is_depth, topic = ros.header(stamp, stream), stream == DEPTH, ros.TOPICS[stream]
         data = self._encoded(image, is_depth)
         if data is None:
-            self._put(topic, ros_images.to_raw(header, image.load()), stamp)
+            self._put(topic, ros_images.to_raw(header, image.load()))
         else:
             suffix = ros.SUFFIXES[is_depth]
-            self._put(topic + suffix, ros_images.to_compressed(header, data, is_depth), stamp)
+            self._put(topic + suffix, ros_images.to_compressed(header, data, is_depth))
 
     def _encoded(self, image: Any, is_depth: bool) -> bytes | None:
         """Bytes that can be written as they are, or None where the pixels must be written raw."""
@@ -125,10 +127,10 @@ class Recorder:
     def _write_rig(self, stamp: int) -> None:
         for stream, camera in ros_rig.cameras(self._rig).items():
             info = ros_rig.to_camera_info(camera, ros.header(stamp, stream))
-            self._put(ros.INFO_TOPICS[stream], info, stamp)
-        self._put(ros.TF_STATIC, ros_rig.to_tf(self._rig, stamp), stamp, _LATCHED)
+            self._put(ros.INFO_TOPICS[stream], info)
+        self._put(ros.TF_STATIC, ros_rig.to_tf(self._rig, stamp), _LATCHED)
 
-    def _put(self, topic: str, message: Any, stamp: int, metadata: dict[str, str] | None = None) -> None:
+    def _put(self, topic: str, message: Any, metadata: dict[str, str] | None = None) -> None:
         if topic not in self._channels:
             kind = message.__msgtype__
             if kind not in self._schemas:
@@ -137,7 +139,8 @@ class Recorder:
                 topic, "cdr", self._schemas[kind], metadata or {}
             )
         number = self._counts[topic] = self._counts.get(topic, 0) + 1
-        self._writer.add_message(self._channels[topic], stamp, ros.encode(message), stamp, number)
+        at = self._log_ns
+        self._writer.add_message(self._channels[topic], at, ros.encode(message), at, number)
 
     def _flush(self, stamp: int) -> None:
         self._flushed_ns = stamp
