@@ -1,0 +1,52 @@
+"""What tools/measure_emulation.py and tools/measure_paper.py measure at length, in part."""
+
+import importlib
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from share.emulate.recipe import Recipe
+from share.emulate.render.context import missing
+from share.emulate.session import make_session
+
+pytestmark = pytest.mark.slow
+TOOLS = Path(__file__).resolve().parents[2] / "tools"
+
+
+@pytest.fixture(scope="module")
+def tools():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(TOOLS)
+        yield SimpleNamespace(
+            emulation=importlib.import_module("measure_emulation"),
+            paper=importlib.import_module("measure_paper"),
+        )
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("number", range(1, 6))
+@pytest.mark.parametrize("scene", ["warehouse", "firestation"])
+def test_the_papers_experiments_fit_into_every_room(tools, scene, number, seed):
+    row = tools.paper.of_plan(scene, number, seed)
+    assert "failed" not in row, row["failed"]
+    assert max(abs(off) for off in row["length_off"]) <= 2.0  # percent
+    user1, user2, robot = row["floor_m"]
+    assert min(user1, user2) > 0.25 and robot > 0.17
+    assert min(row["head_m"]) > 0.17
+    assert row["people_m"] >= 0.6 and row["robot_m"] >= 0.5
+
+
+@pytest.mark.skipif(missing() is not None, reason=f"cannot draw: {missing()}")
+@pytest.mark.parametrize("motion", ["euroc:euroc/V1_02_medium,start=12", "tumvi:tumvi/room1,start=5"])
+def test_a_real_gyro_turns_as_the_pictures_do(tools, motion, shared_data, tmp_path):
+    kind, _, folder = motion.partition(":")
+    recipe = Recipe("warehouse", (f"a={kind}:{shared_data}/motion/{folder}",), seconds=5.0)
+    row = tools.emulation.of_session(str(make_session(recipe, tmp_path / "session") / "a"))
+    assert row["fit_mm"] < 4.0
+    assert row["fit_imu_turn_sigmas"] < 3.0 and row["fit_imu_velocity_sigmas"] < 3.0
+    assert row["turn_most_mrad"] > 10  # it does turn
+    assert row["turn_imu_path_mrad"] < 0.1
+    assert row["turn_imu_images_mrad"] < 0.4
+    assert abs(row["shift_ms"]) < 1.0
+    assert row["track_lost"] < 10 and row["track_ate_cm"] < 3.0
