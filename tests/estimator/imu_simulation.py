@@ -1,0 +1,155 @@
+"""The filter alone, fed with what a perfect front end would see, noise and all: for NEES and for calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from imu_world import CAMERA, GRAVITY, NOISE, Path, imu_of, rig
+
+from share.estimator.inertial import ekf, observe
+from share.estimator.inertial.state import CORE, State, begin
+from share.geometry import se3
+from share.types import ImuBatch
+
+FRAME_HZ, IMU_HZ = 20, 200
+SIGMA_PX = 0.5
+
+
+@dataclass
+class Setup:
+    """sigmas of the first state, wrong by as much; what is wrong with the calibration; how it is run."""
+
+    seconds: float = 20.0
+    features: int = 60
+    pose: tuple[float, float] = (0.01, 1e-4)  # tilt rad; position m (yaw too is 1e-4: there is no other origin)
+    velocity: float = 0.05
+    bg: float = 0.01
+    ba: float = 0.05
+    turn: float = 1e-6  # rad, of the extrinsic
+    shift: float = 1e-6  # m
+    offset: float = 1e-7  # s
+    extrinsic_error: np.ndarray | None = None  # (6,); None: drawn
+    offset_error: float | None = None
+    path: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class Run:
+    stamps: np.ndarray
+    nees: np.ndarray  # (N, 2): orientation, position, 3 dof each
+    pose_errors: np.ndarray  # (N, 6) right
+    state: State
+    extrinsics: np.ndarray  # (N, 7) errors: turn, shift, offset
+    surprise: np.ndarray  # (N,) mean squared Mahalanobis distance over degrees of freedom
+
+
+def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
+    rng = np.random.default_rng((seed, 9))
+    path, sensors = Path(seed, **setup.path), rig()
+    t_imu = np.arange(0, setup.seconds + 0.5, 1 / IMU_HZ)
+    imu, bg, ba = imu_of(path, t_imu, rng.normal(0, setup.bg, 3), rng.normal(0, setup.ba, 3), rng)
+    sigma = _sigmas(setup)
+    world = _World(path, sensors, rng)
+    extrinsic = setup.extrinsic_error if setup.extrinsic_error is not None else rng.normal(0, 1, 6) * sigma[15:21]
+    offset = setup.offset_error if setup.offset_error is not None else rng.normal(0, setup.offset)
+    # The clock of the camera is behind by `offset`: a frame stamped t is taken at t + offset, IMU time.
+    T0, v0 = path.poses(np.array([0.0]))[0], path.velocity(np.array([0.0]))[0]
+    first = rng.normal(0, 1, CORE) * sigma
+    state = begin(0, T0, v0, bg[0], ba[0], sensors.T_body_cam0, sigma)
+    first[15:] = 0
+    ekf.move(state, -first)
+    state.T_body_cam = sensors.T_body_cam0 @ se3.exp(extrinsic)
+    log, next_id, keyframe_at = [], 0, -np.inf
+    for k in range(1, int(setup.seconds * FRAME_HZ)):
+        stamp = k / FRAME_HZ
+        to_ns = round((stamp + state.offset_s) * 1e9)
+        near = slice(*np.searchsorted(imu.stamps_ns, (state.stamp_ns - 10**7, to_ns + 10**7)))
+        part = ImuBatch(imu.stamps_ns[near], imu.gyro[near], imu.accel[near])
+        rate = ekf.propagate(state, part, to_ns, NOISE, GRAVITY)
+        taken = stamp + offset
+        level = world.see(state, taken, rate)
+        if len(state.ids) < 0.7 * setup.features or stamp - keyframe_at > 1.0:
+            keyframe_at = stamp
+            host = ekf.add_keyframe(state, k, rate)
+            next_id = world.new(state, host, k, taken, setup.features - len(state.ids), next_id)
+            _forget_idle(state)
+        true = path.poses(np.array([state.stamp_ns * 1e-9 + offset - state.offset_s]))[0]
+        true = path.poses(np.array([taken + (state.offset_s - offset)]))[0]
+        error = se3.log(se3.inverse(state.T) @ true)
+        cov = ekf.pose_cov(state)
+        nees = [error[a:b] @ np.linalg.solve(cov[a:b, a:b], error[a:b]) for a, b in ((0, 3), (3, 6))]
+        calib = se3.log(se3.inverse(state.T_body_cam) @ sensors.T_body_cam0)
+        log.append((stamp, *nees, *error, *calib, state.offset_s - offset, level))
+    out = np.array(log)
+    return Run(out[:, 0], out[:, 1:3], out[:, 3:9], state, out[:, 9:16], out[:, 16])
+
+
+def _sigmas(setup: Setup) -> np.ndarray:
+    out = np.zeros(CORE)
+    out[0:2], out[2] = setup.pose[0], 1e-4
+    out[3:6] = setup.pose[1]
+    out[6:9], out[9:12], out[12:15] = setup.velocity, setup.bg, setup.ba
+    out[15:18], out[18:21], out[21] = setup.turn, setup.shift, setup.offset
+    return out
+
+
+def _forget_idle(state: State) -> None:
+    busy = np.unique(state.host)
+    idle = np.setdiff1d(np.arange(len(state.keyframes)), busy)
+    ekf.drop_keyframes(state, state.keyframes[idle])
+
+
+class _World:
+    """Points that come and go with the features."""
+
+    def __init__(self, path, sensors, rng):
+        self._path, self._rig, self._rng = path, sensors, rng
+        self._points = {}
+
+    def _camera(self, taken):
+        return self._path.poses(np.array([taken]))[0] @ self._rig.T_body_cam0
+
+    def see(self, state, taken, rate):
+        """Update with all that are in view; the others are lost. Mean surprise a degree of freedom."""
+        if len(state.ids) == 0:
+            return 1.0
+        points = np.array([self._points[i] for i in state.ids])
+        seen = []
+        for T_right_left in (None, self._rig.T_cam1_cam0):
+            T = se3.inverse(self._camera(taken))
+            T = T if T_right_left is None else T_right_left @ T
+            px = CAMERA.project(se3.transform(T, points))
+            px += self._rng.normal(0, SIGMA_PX, px.shape)
+            seen.append(np.where(CAMERA.inside(np.nan_to_num(px, nan=-1e9))[:, None], px, np.nan))
+        inside = ~np.isnan(seen[0][:, 0]) & ~np.isnan(seen[1][:, 0])
+        which = np.flatnonzero(inside)
+        sigma = np.full(len(which), SIGMA_PX / CAMERA.focal)
+        rows = ekf.join(
+            *(
+                ekf.sight(state, which, CAMERA.normalise(px[which]), sigma, rate, T)
+                for px, T in zip(seen, (None, self._rig.T_cam1_cam0), strict=True)
+            )
+        )
+        rows = rows.take(np.argsort(rows.host, kind="stable"))
+        level = 1.0
+        if len(which):
+            level = ekf.update(state, rows, *ekf.gains(state, rows)) / (2 * len(rows.which))
+        ekf.keep_features(state, inside)
+        return level
+
+    def new(self, state, host, k, taken, count, next_id):
+        if count <= 0:
+            return next_id
+        px = self._rng.uniform((5, 5), (634, 474), (count, 2))
+        uv, z = CAMERA.normalise(px), self._rng.uniform(1.5, 6.0, count)
+        in_cam = np.column_stack([uv, np.ones(count)]) * z[:, None]
+        for i, p in enumerate(se3.transform(self._camera(taken), in_cam)):
+            self._points[next_id + i] = p
+        sigma = SIGMA_PX / CAMERA.fx / self._rig.baseline
+        rho = np.maximum(1 / z + self._rng.normal(0, sigma, count), 0.02)
+        ekf.add_features(state, np.arange(next_id, next_id + count), host, uv, rho, np.full(count, sigma))
+        return next_id + count
+
+
+__all__ = ["Run", "Setup", "observe", "run"]
