@@ -13,6 +13,7 @@ from share.emulate.motion.spec import EurocSpec, parse
 from share.emulate.motion.spline import SplinePath
 from share.emulate.progress import Progress
 from share.emulate.recipe import Recipe
+from share.emulate.render import context
 from share.emulate.sensor.device import Device, Pictures
 from share.emulate.stage import Actor, Stage, within
 from share.emulate.types import Path as Motion
@@ -43,9 +44,11 @@ def prepare(recipe: Recipe, room: Path, progress: Progress) -> Prepared:
 
     Raises UsageError, ConfigError or DataError for what cannot be made."""
     progress("planning", 0, 1)
+    _check_first(recipe)
     planned = plan(recipe.motions, furnish(recipe), recipe.seconds, recipe.seed)
     _check_names(recipe, planned)
     actors = tuple(_actor(agent, k, recipe) for k, agent in enumerate(planned.agents))
+    _check_lenses(recipe, actors)
     notes = planned.notes + tuple(f"{a.name}: {note}" for a in planned.agents for note in a.notes)
     progress("planning", 1, 1)
     return Prepared(Stage(room, actors), planned.layout, notes)
@@ -104,7 +107,11 @@ def _profile(agent: Agent, recipe: Recipe) -> Profile:
     """`NAME` or `NAME:MODE`, as asked for, or what the motion was recorded with."""
     _, spec = parse(agent.spec)
     usual = _EUROC_PROFILE if isinstance(spec, EurocSpec) else _PROFILE
-    name, _, mode = (_chosen(recipe.profiles, agent.name) or usual).partition(":")
+    return _opened(_chosen(recipe.profiles, agent.name) or usual)
+
+
+def _opened(words: str) -> Profile:
+    name, _, mode = words.partition(":")
     return profile(name, mode or None)
 
 
@@ -136,6 +143,23 @@ def _outside(pictures: Pictures, gaps: I64) -> Pictures:
 
 def _chosen(table: dict[str, str], name: str) -> str | None:
     return table.get(name, table.get(""))
+
+
+def _check_first(recipe: Recipe) -> None:
+    """What can be found wrong without a plan. Raises ConfigError; RenderError where nothing can be drawn."""
+    for words in recipe.profiles.values():
+        _opened(words)
+    if recipe.scene != room_file.PLAIN:
+        context.create().release()
+
+
+def _check_lenses(recipe: Recipe, actors: tuple[Actor, ...]) -> None:
+    for actor in actors:
+        if recipe.scene == room_file.PLAIN and actor.rig.cam0.distortion:
+            raise UsageError(
+                f"{actor.name}: scene 'plain' has no lens distortion; "
+                f"give --profile {actor.name}=d435i, or another scene"
+            )
 
 
 def _check_names(recipe: Recipe, planned: Plan) -> None:

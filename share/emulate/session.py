@@ -87,10 +87,11 @@ def _make(recipe: Recipe, prepared: Prepared, growth: Growth, workers: int, prog
     with Pool(workers, shooting.begin, (stage, recipe.images)) as pool:
         exposures = [_exposures(pool, stage, who, growth.work, progress) for who in range(len(stage.actors))]
         chunks = _shoot(pool, stage, exposures, growth, progress)
+    progress("writing recordings", 0, len(stage.actors))
     for k, (actor, files) in enumerate(zip(stage.actors, chunks, strict=True)):
-        progress("writing recordings", k, len(stage.actors))
         write_recording(actor, files, folder / f"{actor.name}.mcap")
         write_truth(actor, folder / "truth" / f"{actor.name}.tum")
+        progress("writing recordings", k + 1, len(stage.actors))
     draw_plan(folder / PLAN, prepared.layout, stage.actors)
     atomic_write(folder / SESSION, _description(recipe, prepared))
 

@@ -49,4 +49,4 @@ def test_a_real_gyro_turns_as_the_pictures_do(tools, motion, shared_data, tmp_pa
     assert row["turn_imu_path_mrad"] < 0.1
     assert row["turn_imu_images_mrad"] < 0.4
     assert abs(row["shift_ms"]) < 1.0
-    assert row["track_lost"] < 10 and row["track_ate_cm"] < 3.0
+    assert row["track_lost_s"] < 0.5 and row["track_ate_cm"] < 3.0

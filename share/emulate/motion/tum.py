@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from share.emulate.motion.spline import DEGREE, SplinePath, continuous
-from share.errors import DataError
+from share.errors import DataError, UsageError
 from share.geometry import se3
 from share.io.trajectory import Trajectory, read_tum
 from share.types import F64, I64
@@ -29,8 +29,10 @@ _STILL_M, _STILL_RAD = 1e-3, 1e-3
 
 
 def read_path(path: Path, start: float = 0.0, seconds: float | None = None) -> SplinePath:
-    """The motion in `path` from `start` s after its beginning, for `seconds`. Raises DataError in one line
-    for what is no motion of a body."""
+    """The motion in `path` from `start` s after its beginning, for `seconds`. Raises UsageError where there
+    is no such file, DataError in one line for what is no motion of a body."""
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file")
     stamps, T = _part(path, read_tum(path), start, seconds)
     _check(path, stamps, T)
     return fitted(stamps, T)
