@@ -23,3 +23,23 @@ def shared_data() -> Path:
     if not path.is_dir():
         pytest.skip(f"real recordings are not here: {path} does not exist")
     return path
+
+
+@pytest.fixture(scope="session")
+def plain_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A user's cache folder ($XDG_CACHE_HOME) with the three seconds that `share demo --scene plain
+    --seconds 3 --seed 18` plays: ar1, ar2 and robot in the plain room, 45 frames each. With this seed
+    each device has had 20 IMU samples by its first picture, all that the tracker needs to begin."""
+    from share.emulate.demo import recipe
+    from share.emulate.session import cached_session
+
+    cache = tmp_path_factory.mktemp("cache")
+    cached_session(recipe("plain", 3.0, 18), cache / "share")
+    return cache
+
+
+@pytest.fixture(scope="session")
+def plain_session(plain_cache: Path) -> Path:
+    """The session in there."""
+    (session,) = (plain_cache / "share").iterdir()
+    return session

@@ -2,8 +2,9 @@
 
     python tools/bench_track.py [--frames N] [--recording SOURCE]
 
-On the demo's room (stereo walker and RGB-D robot, rendered in memory) and on a real recording; without
---recording that is the kitchen beside the checkout, if it is there. Rendering and decoding are not counted.
+On a walking headset (stereo) and an RGB-D robot in the plain room (a session in a temporary folder) and on a real
+recording; without --recording that is the kitchen beside the checkout, if it is there. Making and decoding
+images are not counted.
 `track_ms` is by the clock, all else CPU time. A stage's `median` is of one call; `per_frame` spreads all
 its calls over all frames.
 """
@@ -12,10 +13,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from functools import wraps
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -28,18 +31,17 @@ import poselib  # noqa: E402, F401 -- else the first frame would pay for it
 
 from share.config import Config, TrackerConfig  # noqa: E402
 from share.core.sequencer import SequencerCounters  # noqa: E402
-from share.emulate.plain.agents import AGENTS, BASELINE, RATE_HZ, Agent  # noqa: E402
-from share.emulate.plain.motion import move  # noqa: E402
-from share.emulate.plain.render import Renderer  # noqa: E402
-from share.emulate.plain.room import make_room  # noqa: E402
-from share.emulate.plain.sensor import Sensor  # noqa: E402
+from share.emulate.recipe import Recipe  # noqa: E402
+from share.emulate.session import make_session  # noqa: E402
 from share.estimator.visual import VisualTracker  # noqa: E402
-from share.geometry import se3  # noqa: E402
 from share.geometry.camera import Rig  # noqa: E402
 from share.io.source import open_source  # noqa: E402
 from share.run.pipeline import frames_of  # noqa: E402
 from share.types import Frame  # noqa: E402
 
+MOTIONS = ("ar1=walk:speed=0.65", "robot=robot:speed=0.3")
+PROFILE, RATE_HZ = "d435i:640x480@15", 15
+SHORTEST_S = 3  # of a session
 KITCHEN = Path(__file__).resolve().parents[2] / "shared" / "data" / "real" / "redkitchen_0000_0499"
 STAGES = {
     "_find": "klt",
@@ -54,37 +56,34 @@ Spent = dict[str, list[float]]  # CPU ms of every call, by stage
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--frames", type=int, default=200, help="of the demo's room (20 Hz)")
+    parser.add_argument("--frames", type=int, default=200, help=f"of the room ({RATE_HZ} Hz)")
     parser.add_argument("--recording", type=Path, help="any SOURCE that `share track` takes")
     options = parser.parse_args()
     spent = watch_stages()
-    report = {
-        f"room_{a.name}": bench(a.rig, room_frames(a, options.frames), spent) for a in (AGENTS[0], AGENTS[2])
-    }
+    report = bench_room(options.frames, spent)
     print(json.dumps(report | bench_recording(options.recording, spent), indent=2))
+
+
+def bench_room(frames: int, spent: Spent) -> dict[str, Any]:
+    recipe = Recipe("plain", MOTIONS, max(SHORTEST_S, frames / RATE_HZ), profiles={"": PROFILE})
+    with tempfile.TemporaryDirectory() as folder:
+        session = make_session(recipe, Path(folder) / "room")
+        return {
+            f"room_{name}": bench_source(session / name, spent, frames)
+            for name in (motion.partition("=")[0] for motion in MOTIONS)
+        }
 
 
 def bench_recording(given: Path | None, spent: Spent) -> dict[str, Any]:
     path = given or KITCHEN
     if not given and not path.exists():
         return {"recording": "the kitchen is not beside this checkout; name another with --recording"}
+    return {path.name: bench_source(path, spent)}
+
+
+def bench_source(path: Path, spent: Spent, frames: int | None = None) -> dict[str, Any]:
     source = open_source(str(path))
-    return {path.name: bench(source.rig, frames_of(source, Config(), SequencerCounters()), spent)}
-
-
-def room_frames(agent: Agent, count: int, seed: int = 0) -> Iterator[Frame]:
-    """What the agent's cameras see of the demo's room, with their noise."""
-    room = make_room(seed)
-    renderer, sensor, rig = Renderer(room, agent.rig.cam0), Sensor((seed, 3)), agent.rig
-    for k, T_world_cam in enumerate(move(agent.style, room.size, np.arange(count) / RATE_HZ, (seed, 2))):
-        image, z = renderer.render(T_world_cam)
-        image0, image1, depth = sensor.gray(image, k, 0), None, None
-        if rig.T_cam1_cam0 is not None:
-            right, _ = renderer.render(T_world_cam @ se3.inverse(rig.T_cam1_cam0))
-            image1 = sensor.gray(right, k, 1)
-        if rig.depth is not None:
-            depth = sensor.depth_mm(z, rig.depth.fx * BASELINE, k).astype(np.float32) / np.float32(1000)
-        yield Frame(k * 10**9 // RATE_HZ, k, image0, image1, depth)
+    return bench(source.rig, islice(frames_of(source, Config(), SequencerCounters()), frames), spent)
 
 
 def bench(rig: Rig, frames: Iterable[Frame], spent: Spent) -> dict[str, Any]:

@@ -155,23 +155,60 @@ def test_output_to_a_full_disk_is_one_line():
     assert (done.returncode, done.stderr) == (1, "share: cannot write the output: No space left on device\n")
 
 
-@pytest.mark.parametrize(
-    ("number", "code", "said"), [(signal.SIGINT, 130, "share: interrupted\n"), (signal.SIGTERM, 143, "")]
-)
-def test_an_interrupted_command_leaves_nothing_behind(number, code, said, tmp_path):
-    """The demo is stopped while it makes its session: no files, and no process that goes on making them."""
-    process = subprocess.Popen(
-        [*SHARE, "demo", "--seconds", "600", "--out", str(tmp_path / "out")],
-        env={"XDG_CACHE_HOME": str(tmp_path / "cache")},
+# ------------------------------------------------------------------ interrupted while it makes a session
+
+
+def interrupted(home: Path, number: int) -> tuple[int, str, str]:
+    """Exit code, stdout and stderr of a demo that gets a signal while it draws its session."""
+    with subprocess.Popen(
+        [*SHARE, "demo", "--scene", "plain", "--seconds", "3", "--out", str(home / "out")],
+        env={"XDG_CACHE_HOME": str(home)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-    )
-    cache = tmp_path / "cache" / "share"
-    deadline = time.monotonic() + 20
-    while not list(cache.glob(".room*/*.mcap.part")) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    process.send_signal(number)
-    assert process.communicate(timeout=20) == ("", said)  # at its end: nobody has the pipes open still
-    assert process.returncode == code
-    assert list(cache.iterdir()) == []
+    ) as process:
+        deadline = time.monotonic() + 60
+        while not chunks(home) and time.monotonic() < deadline and process.poll() is None:
+            time.sleep(0.02)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=20)  # at its end: nobody has the pipes open still
+    return process.returncode, out, err
+
+
+def chunks(home: Path) -> dict[Path, int]:
+    """What is drawn of a session that is not whole: files, and when they were written."""
+    return {path: path.stat().st_mtime_ns for path in home.glob("share/.session-*/**/*.chunk")}
+
+
+def only_unfinished(home: Path) -> bool:
+    """Nothing in the cache looks like a session, or like a recording of one."""
+    (left,) = (home / "share").iterdir()
+    return left.name.startswith(".session-") and not [*left.rglob("session.yaml"), *left.rglob("*.mcap*")]
+
+
+def test_a_command_that_is_ended_leaves_nothing_that_looks_whole(tmp_path):
+    assert interrupted(tmp_path, signal.SIGTERM) == (143, "", "")
+    assert chunks(tmp_path)
+    assert only_unfinished(tmp_path)
+
+
+def test_after_ctrl_c_the_same_command_goes_on_where_it_was(tmp_path):
+    from share.emulate.demo import recipe
+    from share.emulate.session import cached_session
+
+    assert interrupted(tmp_path, signal.SIGINT) == (130, "", "share: interrupted\n")
+    left, seen = chunks(tmp_path), []
+    assert left
+    assert only_unfinished(tmp_path)
+
+    def watch(what: str, done: int, total: int) -> None:
+        seen.append((what, done))
+        now = chunks(tmp_path)
+        assert {path: now[path] for path in left} == left  # not drawn again
+
+    session = cached_session(recipe("plain", 3.0, 0), tmp_path / "share", progress=watch)
+    began = next(done for what, done in seen if what == "drawing images")
+    assert 0 < began < 135  # frames that were there at once
+    assert ("drawing images", 135) in seen
+    assert list((tmp_path / "share").iterdir()) == [session]  # whole, and nothing else is left
+    assert sorted(path.name for path in session.glob("*.mcap")) == ["ar1.mcap", "ar2.mcap", "robot.mcap"]

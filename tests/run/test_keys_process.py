@@ -10,9 +10,7 @@ from pathlib import Path
 import pytest
 from children import SHARE, Child, start_agent
 
-from share.emulate.plain.session import make_session
-
-FRAMES = 20
+FRAMES = 45  # of `plain_session`
 
 
 def keys(folder: Path, *arguments: str) -> str:
@@ -20,9 +18,9 @@ def keys(folder: Path, *arguments: str) -> str:
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_session(tmp_path_factory.mktemp("made") / "room", FRAMES / 20, seed=3, workers=2) / "ar1"
+@pytest.fixture
+def recording(plain_session: Path) -> Path:
+    return plain_session / "ar1"
 
 
 class Server:
