@@ -82,7 +82,9 @@ def tracked(source: Source) -> Row:
     found = accuracy(run, source.truth()) if whole else None
     return {
         "track_frames": run.report["frames"],
-        "track_lost": run.report["frames"] - run.report["tracked"],
+        "track_tracked": run.report["tracked"],
+        "track_init_s": run.report["init_s"],
+        "track_lost_s": _round(run.report["lost_s"]),
         "track_stretches": run.report["stretches"],
         "track_ate_cm": _round(100 * found.rmse) if found else None,
         "track_worst_cm": _round(100 * found.max) if found else None,
