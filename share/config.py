@@ -66,6 +66,37 @@ class TrackerConfig:
 
 
 @dataclass(frozen=True)
+class InertialConfig:
+    """Tracking by cameras and IMU (`share.estimator.inertial`)."""
+
+    features: int = 110  # followed at a time
+    spacing_px: float = 18.0  # least distance between new ones
+    sigma_px: float = 0.5  # of a feature found again; its errors last, so this is more than their size
+    gate: float = 12.0  # squared Mahalanobis distance, 2 degrees of freedom, beyond which a sight is refused
+    alike: float = 0.85  # correlation with the first patch below which a feature is not seen
+    settled_px: float = 0.3  # a last correction larger than this is no find
+    reach_px: float = 4.0  # how far alignment may wander from where a feature was expected
+    imu_noise: float = 2.0  # times what the IMU's data sheet says
+    gravity: float = 9.81  # m/s^2
+    keyframe_m: float = 0.15  # a keyframe after this much motion since the last one,
+    keyframe_rad: float = 0.2  # or this much turning,
+    keyframe_seen: float = 0.7  # or when fewer than this part of the features wanted are seen
+    keyframe_gap_s: float = 0.1  # but never sooner
+    max_keyframes: int = 25  # in the state
+    view_features: int = 500  # ORB features of a keyframe, for other agents and for relocalisation
+    weak: int = 25  # features seen; fewer: WEAK
+    blind: int = 6  # fewer: INERTIAL_ONLY
+    max_speed_m_s: float = 8.0  # a state that is faster is LOST
+    lost_m: float = 0.5  # sigma of a position since the last sight that is LOST
+    turning_noise: float = 2.0  # rad/s, what a body may turn while its IMU is silent
+    moving_noise: float = 4.0  # m/s^2, the same of its acceleration
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "features", "spacing_px", "sigma_px", "gate", "imu_noise", "gravity")
+        _require_positive(self, "max_keyframes", "view_features")
+
+
+@dataclass(frozen=True)
 class PlaceConfig:
     """When two views are taken for the same place."""
 
@@ -205,6 +236,7 @@ class Config:
     """The whole; one section per part."""
 
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    inertial: InertialConfig = field(default_factory=InertialConfig)
     sequencer: SequencerConfig = field(default_factory=SequencerConfig)
     place: PlaceConfig = field(default_factory=PlaceConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)

@@ -77,6 +77,13 @@ class Camera:
                 break
         return uv
 
+    def jacobian(self, uv: F64) -> F64:
+        """d(pixel)/d(normalised coordinates) at (..., 2): (..., 2, 2)."""
+        scale = np.array([[self.fx], [self.fy]])
+        if not self.distortion:
+            return np.broadcast_to(scale * np.eye(2), (*uv.shape, 2)).copy()
+        return scale * self._radtan_jacobian(uv)
+
     def inside(self, px: F64, border: float = 0.0) -> np.ndarray:
         """Which pixels (..., 2) lie in the image, at least `border` px from its edge."""
         upper = (self.width - 1 - border, self.height - 1 - border)

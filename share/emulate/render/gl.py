@@ -54,9 +54,10 @@ class GlRenderer:
 
 @lru_cache
 def _places(count: int) -> F64:
-    """Where in its pixel each of `count` samples lies (count, 2) px, their mean being 0: spread evenly for
-    any count, not in rows, and going back and forth, so that motion in between neither shrinks nor
-    stretches them (Halton 1960)."""
-    places = qmc.Halton(2, scramble=False).random(count)
-    out: F64 = places - places.mean(axis=0)
+    """Where in its pixel each of `count` samples lies (count, 2) px: a row and a column for each, which edges
+    along either need, as the Halton sequence (1960) orders them. It begins at the third point: so few points
+    lie on no line and go back and forth, and motion in between neither shrinks nor stretches them."""
+    points = qmc.Halton(2, scramble=False).fast_forward(2).random(count)
+    ranks = points.argsort(axis=0).argsort(axis=0)
+    out: F64 = (ranks + 0.5) / count - 0.5
     return out

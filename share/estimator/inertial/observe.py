@@ -32,35 +32,40 @@ class Prediction:
 
 def predict(state: State, which: I64, T_right_left: F64 | None = None) -> Prediction:
     """What cam0, or with T_right_left (4, 4) cam1, should see of the features at indices `which` (N,)."""
-    host, rho = state.host[which], state.rho[which]
-    f = rays(state.ray[which])
-    T_odom_host = state.poses[host] @ state.T_body_cam
+    f, rho = rays(state.ray[which]), state.rho[which]
+    T_odom_host = state.poses[state.host[which]] @ state.T_body_cam
+    R_odom_host, t_odom_host = T_odom_host[:, :3, :3], T_odom_host[:, :3, 3]
     T_cam_odom = se3.inverse(state.T @ state.T_body_cam)
-    q_odom = _moved(T_odom_host[:, :3, :3], T_odom_host[:, :3, 3], f, rho)
     R, t = T_cam_odom[:3, :3], T_cam_odom[:3, 3]
-    q_cam = q_odom @ R.T + rho[:, None] * t
-    R_cam_host = R @ T_odom_host[:, :3, :3]
-    t_cam_host = T_odom_host[:, :3, 3] @ R.T + t
-    own = _lever(R_cam_host, f, rho) - _lever(np.broadcast_to(np.eye(3), R_cam_host.shape), q_cam, rho)
-    by_pose = -_lever(np.broadcast_to(R, R_cam_host.shape), q_odom, rho)
-    q, by_rho = q_cam, t_cam_host
+    q_odom = (R_odom_host @ f[:, :, None])[:, :, 0] + rho[:, None] * t_odom_host
+    q = q_odom @ R.T + rho[:, None] * t
+    by_pose = -_lever(R, q_odom, rho)
+    by_extrinsic = _lever(R @ R_odom_host, f, rho) - _lever(np.eye(3), q, rho)
+    by_rho = t_odom_host @ R.T + t
     if T_right_left is not None:
         turn, shift = T_right_left[:3, :3], T_right_left[:3, 3]
-        q = q @ turn.T + rho[:, None] * shift
-        by_rho = by_rho @ turn.T + shift
-        own, by_pose = turn @ own, turn @ by_pose
+        q, by_rho = q @ turn.T + rho[:, None] * shift, by_rho @ turn.T + shift
+        by_pose, by_extrinsic = turn @ by_pose, turn @ by_extrinsic
     uv, D = _projected(q)
-    return Prediction(uv, D @ by_pose, D @ own, (D @ by_rho[:, :, None])[:, :, 0])
+    return Prediction(uv, D @ by_pose, D @ by_extrinsic, (D @ by_rho[:, :, None])[:, :, 0])
 
 
-def _moved(R: F64, t: F64, q: F64, rho: F64) -> F64:
-    """Homogeneous points (N, 3) by transforms of their own."""
-    out: F64 = (R @ q[:, :, None])[:, :, 0] + rho[:, None] * t
+def warp(state: State, which: I64, spread: F64, slant: F64, T_right_left: F64 | None = None) -> F64:
+    """(N, 2, 2) how normalised coordinates change with the pixel of the host: what a patch round a feature
+    looks like. spread (N, 2, 2): d ray / d px of the host. slant (N, 2): d rho / d px, of the surface."""
+    T_cam_odom = se3.inverse(state.T @ state.T_body_cam)
+    T = T_cam_odom @ state.poses[state.host[which]] @ state.T_body_cam
+    if T_right_left is not None:
+        T = T_right_left @ T
+    R, t = T[:, :3, :3], T[:, :3, 3]
+    q = (R @ rays(state.ray[which])[:, :, None])[:, :, 0] + state.rho[which, None] * t
+    _, D = _projected(q)
+    out: F64 = D @ (R[:, :, :2] @ spread + t[:, :, None] * slant[:, None, :])
     return out
 
 
 def _lever(R: F64, q: F64, rho: F64) -> F64:
-    """R [-hat(q) | rho I], (N, 3, 6): what Exp(xi) does to q, seen through R."""
+    """R [-hat(q) | rho I], (N, 3, 6): what Exp(xi) does to q (N, 3), seen through R (3, 3) or (N, 3, 3)."""
     return np.concatenate([-R @ se3.hat(q), R * rho[:, None, None]], axis=2)
 
 

@@ -1,0 +1,127 @@
+"""What a feature looks like: the patch round it in the image that saw it first, and finding it again to a
+tenth of a pixel.
+
+Every later image is compared with that first patch, so that tracks do not creep. Inverse-compositional
+alignment (Baker & Matthews 2004): derivatives are the patch's own, made once; the patch is warped as its
+place in the room predicts, which leaves a shift to be found. Gain and bias of the light do not matter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from share.types import F32, F64, I64, U8
+
+HALF = 5  # px; patches are 11 x 11
+_SIDE = 2 * HALF + 1
+_AXIS = np.arange(-HALF, HALF + 1, dtype=np.float32)
+OFFSETS: F32 = np.stack(np.meshgrid(_AXIS, _AXIS), axis=-1).reshape(-1, 2)  # (S, 2) px, x and y
+_FLAT = 1e-3  # gray levels: a patch with less contrast is nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """N patches of S samples. gray (N, S): zero mean, unit norm; contrast (N,): the norm that it had.
+    slope (N, 2, S): derivatives by x and y less what gain and bias explain, in gray levels a pixel;
+    inverse (N, 2, 2): of their normal matrix."""
+
+    gray: F32
+    contrast: F32
+    slope: F32
+    inverse: F32
+
+    def __len__(self) -> int:
+        return len(self.gray)
+
+    def take(self, keep: NDArray[np.bool_] | I64) -> Patches:
+        return Patches(self.gray[keep], self.contrast[keep], self.slope[keep], self.inverse[keep])
+
+    def join(self, other: Patches) -> Patches:
+        pairs = ((getattr(self, name), getattr(other, name)) for name in self.__dataclass_fields__)
+        return Patches(*(np.concatenate(pair) for pair in pairs))
+
+    @property
+    def sigma_px(self) -> F32:
+        """(N,) error of a shift for one gray level of noise, in the worse direction."""
+        out: F32 = np.sqrt(np.linalg.eigvalsh(self.inverse)[:, 1])
+        return out
+
+
+def empty() -> Patches:
+    s = len(OFFSETS)
+    shapes = ((0, s), (0,), (0, 2, s), (0, 2, 2))
+    return Patches(*(np.zeros(shape, np.float32) for shape in shapes))
+
+
+def cut(image: U8, px: F32) -> Patches:
+    """The patches round px (N, 2)."""
+    if len(px) == 0:
+        return empty()
+    wide = np.arange(-HALF - 1, HALF + 2, dtype=np.float32)
+    x, y = np.meshgrid(wide, wide)
+    grown = _sample(image, px[:, :1] + x.ravel(), px[:, 1:] + y.ravel())
+    grown = grown.reshape(-1, _SIDE + 2, _SIDE + 2)
+    dx = (grown[:, 1:-1, 2:] - grown[:, 1:-1, :-2]) / 2
+    dy = (grown[:, 2:, 1:-1] - grown[:, :-2, 1:-1]) / 2
+    slope = np.stack([dx, dy], axis=1).reshape(len(px), 2, -1)
+    gray, contrast = _normed(grown[:, 1:-1, 1:-1].reshape(len(px), -1))
+    slope = slope - slope.mean(axis=2, keepdims=True)
+    slope = slope - (slope @ gray[:, :, None]) * gray[:, None, :]
+    normal = slope @ slope.transpose(0, 2, 1) + np.float32(1e-3) * np.eye(2, dtype=np.float32)
+    return Patches(gray, contrast, slope, np.linalg.inv(normal))
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """px (N, 2) where the patches are; alike (N,): normalised correlation there, 1 at best; step (N,): px
+    of the last correction, small where it settled."""
+
+    px: F32
+    alike: F32
+    step: F32
+
+
+def align(image: U8, patches: Patches, px: F64, warp: F64, most: int = 4, settled_px: float = 0.02) -> Found:
+    """From px (N, 2), the patches being warped by (N, 2, 2): d px here / d px there. At most `most` steps."""
+    n = len(patches)
+    at, W = px.astype(np.float32), warp.astype(np.float32)
+    alike, step = np.zeros(n, np.float32), np.full(n, np.inf, np.float32)
+    spread = OFFSETS @ W.transpose(0, 2, 1)  # (N, S, 2)
+    todo = np.arange(n)
+    for _ in range(most):
+        if len(todo) == 0:
+            break
+        part = patches if len(todo) == n else patches.take(todo)
+        here = spread[todo]
+        seen, _ = _normed(_sample(image, at[todo, :1] + here[..., 0], at[todo, 1:] + here[..., 1]))
+        alike[todo] = np.einsum("ns,ns->n", seen, part.gray)
+        error = (seen - part.gray) * part.contrast[:, None]
+        shift = part.inverse @ (part.slope @ error[:, :, None])
+        move = (W[todo] @ shift)[:, :, 0]
+        at[todo] -= move
+        step[todo] = np.hypot(move[:, 0], move[:, 1])
+        todo = todo[(step[todo] > settled_px) & np.isfinite(step[todo])]
+    return Found(at, alike, step)
+
+
+def _sample(image: U8, x: F32, y: F32) -> F32:
+    """Bilinear gray levels at (N, S) places."""
+    out: F32 = cv2.remap(
+        image,
+        np.ascontiguousarray(x),
+        np.ascontiguousarray(y),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    ).astype(np.float32)
+    return out
+
+
+def _normed(gray: F32) -> tuple[F32, F32]:
+    """Zero mean, unit norm (N, S), and the norm (N,)."""
+    gray = gray - gray.mean(axis=1, keepdims=True)
+    norm = np.sqrt(np.einsum("ns,ns->n", gray, gray))
+    return gray / np.maximum(norm, _FLAT)[:, None], norm
