@@ -2,9 +2,9 @@
 
     python tools/bench_track.py [--frames N] [--recording SOURCE]
 
-On a walking headset (stereo) and an RGB-D robot in the plain room (a session in a temporary folder) and on a real
-recording; without --recording that is the kitchen beside the checkout, if it is there. Making and decoding
-images are not counted.
+On a headset (stereo) and a robot (RGB-D) in the plain room, recorded for the purpose, and on a real
+recording; without --recording that is the kitchen beside the checkout, if it is there. Making and
+decoding images are not counted.
 `track_ms` is by the clock, all else CPU time. A stage's `median` is of one call; `per_frame` spreads all
 its calls over all frames.
 """

@@ -26,8 +26,9 @@ class Pool:
     with this process."""
 
     def __init__(self, workers: int, start: Callable[..., None], arguments: tuple[object, ...]) -> None:
-        self._workers = workers
-        self._pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (start, arguments))
+        self._workers, context = workers, get_context("spawn")
+        self._going_on, self._ours = context.Pipe(duplex=False)  # nothing is sent: workers end when it closes
+        self._pool = ProcessPoolExecutor(workers, context, _begin, (self._going_on, start, arguments))
 
     def run(self, work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result]]:
         """Every job with `work(job)`, in the order in which they are done. Raises what a job raised, or
@@ -51,13 +52,19 @@ class Pool:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._pool.shutdown(cancel_futures=True)  # waits for the jobs that run, about a second
+        if kind is not None:
+            self._ours.close()  # a job may take many seconds; what it writes is whole or not there
+        self._pool.shutdown(cancel_futures=True)
+        self._ours.close()
+        self._going_on.close()
 
 
-def _begin(start: Callable[..., None], arguments: tuple[object, ...]) -> None:
+def _begin(
+    going_on: connection.Connection, start: Callable[..., None], arguments: tuple[object, ...]
+) -> None:
     """The first thing that a process does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_end_with_parent, args=(going_on,), daemon=True).start()
     global _failed  # an exception here would be printed, and tell the parent nothing
     try:
         start(*arguments)
@@ -71,8 +78,8 @@ def _do(work: Callable[[Job], Result], job: Job) -> Result:
     return work(job)
 
 
-def _end_with_parent() -> None:
+def _end_with_parent(going_on: connection.Connection) -> None:
     parent = parent_process()
     if parent is not None:
-        connection.wait([parent.sentinel])
+        connection.wait([parent.sentinel, going_on])
         os._exit(1)

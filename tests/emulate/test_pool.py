@@ -56,6 +56,20 @@ def test_what_a_job_raises_is_raised_here():
         list(pool.run(fail_at_three, range(100)))
 
 
+def fail_or_sleep(job):
+    if job:
+        raise UsageError("the second fails")
+    time.sleep(60)
+
+
+def test_an_error_does_not_wait_for_what_runs():
+    began = time.monotonic()
+    with pytest.raises(UsageError, match="second"), Pool(2, start, (0,)) as pool:
+        list(pool.run(fail_or_sleep, range(2)))
+    assert time.monotonic() - began < 40
+    assert multiprocessing.active_children() == []
+
+
 def cannot_start():
     raise UsageError("nothing to start with")
 
