@@ -214,6 +214,7 @@ def test_no_space_is_said_before_anything_is_drawn(recipe, tmp_path, monkeypatch
     assert os.listdir(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_a_cached_session_is_made_once_and_not_from_work_for_another(small, tmp_path):
     recipe = small_recipe(small, "ann=walk:", effects=("blur=off",))
     name = f"session-{recipe.digest}"
@@ -228,6 +229,7 @@ def test_a_cached_session_is_made_once_and_not_from_work_for_another(small, tmp_
 # ------------------------------------------------------------------ other forms and faults
 
 
+@pytest.mark.slow
 def test_asl_folders_hold_the_same(small, tmp_path):
     recipe = small_recipe(small, "ann=walk:", sensors={"": "stereo"}, images="png")
     out = make_session(recipe, tmp_path / "flights", workers=1, asl=True)

@@ -42,10 +42,19 @@ def make_room(seed: int, size: tuple[float, float, float] = (9.0, 6.0, 3.0)) -> 
     """Another room for every seed. Furniture keeps to a strip of 0.75 m along the walls, but for a
     column in the middle: between them one can walk."""
     rng = np.random.default_rng([seed, 1])
-    boxes = np.stack([np.array([(0, 0, 0), size]), _column(rng, size), *_furniture(rng, size)])
+    boxes = _boxes(rng, size)
     pictures = [_picture(rng, boxes, face) for face in range(6 * len(boxes))]
     atlas, corners = _pack(pictures)
     return Room(boxes, atlas, _origins(boxes, corners))
+
+
+def room_boxes(seed: int, size: tuple[float, float, float]) -> F64:
+    """`make_room(seed, size).boxes`, without drawing its pictures."""
+    return _boxes(np.random.default_rng([seed, 1]), size)
+
+
+def _boxes(rng: np.random.Generator, size: tuple[float, float, float]) -> F64:
+    return np.stack([np.array([(0, 0, 0), size]), _column(rng, size), *_furniture(rng, size)])
 
 
 def face_axes(face: int) -> tuple[int, int, int]:

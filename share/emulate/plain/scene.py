@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from share.emulate.plain.render import Renderer as Caster
-from share.emulate.plain.room import make_room
+from share.emulate.plain.room import make_room, room_boxes
 from share.emulate.types import Moment
 from share.emulate.world.layout import Layout, Piece
 from share.emulate.world.materials import Material
@@ -27,7 +27,7 @@ def layout(seed: int, size: tuple[float, float, float] | None = None) -> Layout:
     if not all(a <= x <= b for a, x, b in zip(_SMALLEST, size, _LARGEST, strict=True)):
         low, high = (" x ".join(f"{x:g}" for x in s) for s in (_SMALLEST, _LARGEST))
         raise UsageError(f"the plain room can be {low} to {high} m")
-    boxes = make_room(seed, size).boxes
+    boxes = room_boxes(seed, size)
     skin = Material("plaster")  # never drawn: it has pictures of its own
     walls = [
         Piece(f"wall {k}", box(corners[0], corners[1], skin)) for k, corners in enumerate(_walls(boxes[0]))
