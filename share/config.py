@@ -82,7 +82,10 @@ class InertialConfig:
     keyframe_rad: float = 0.2  # or this much turning,
     keyframe_seen: float = 0.7  # or when fewer than this part of the features wanted are seen
     keyframe_gap_s: float = 0.1  # but never sooner
-    max_keyframes: int = 25  # in the state
+    max_keyframes: int = 30  # in the state
+    recall: int = 80  # features of earlier keyframes looked for again at a keyframe,
+    recall_m: float = 1.5  # of keyframes no further away than this
+    recall_rad: float = 0.7  # and turned by no more than this
     view_features: int = 500  # ORB features of a keyframe, for other agents and for relocalisation
     weak: int = 25  # features seen; fewer: WEAK
     blind: int = 6  # fewer: INERTIAL_ONLY

@@ -35,13 +35,14 @@ def seek(
     looks: Looks,
     config: InertialConfig,
     T_right_left: F64 | None = None,
+    fresh: int = 0,
 ) -> Sought:
-    """In cam0's image, or with T_right_left in cam1's."""
+    """In cam0's image, or with T_right_left in cam1's; of features from number `fresh` on."""
     which = np.arange(len(state.ids))
     expected, warp = _expected(camera, state, which, looks, T_right_left)
     out = np.nan_to_num(expected, nan=-1e6).astype(np.float32)
     found = np.zeros(len(which), bool)
-    inside = np.flatnonzero(camera.inside(np.nan_to_num(expected, nan=-1e6), _BORDER_PX))
+    inside = np.flatnonzero(camera.inside(np.nan_to_num(expected, nan=-1e6), _BORDER_PX) & (which >= fresh))
     if len(inside):
         out[inside], found[inside] = _settle(
             image, looks, inside, expected[inside], warp[inside], config, config.reach_px

@@ -13,6 +13,7 @@ from share.config import InertialConfig
 from share.estimator import gravity
 from share.estimator.inertial import ekf, features, find
 from share.estimator.inertial.features import Looks
+from share.estimator.inertial.memory import Memory
 from share.estimator.inertial.state import (
     ACCEL_BIAS,
     CORE,
@@ -48,6 +49,7 @@ class InertialTracker:
         self._imu = ImuBatch.empty()
         self._state: State | None = None
         self._looks: Looks = features.none()
+        self._memory = Memory()
         self._image: U8 | None = None
         self._rate = np.zeros(3)
         self._next_feature = self._next_keyframe = 0
@@ -73,6 +75,7 @@ class InertialTracker:
         new_stretch = self._next_keyframe == 0
         host = ekf.add_keyframe(s, self._next_keyframe, self._rate)
         self._next_keyframe += 1
+        self._wake(frame, s)
         self._add_features(frame, s, host)
         self._forget(s)
         self._keyframe_ns, self._T_keyframe = frame.stamp_ns, s.T.copy()
@@ -91,6 +94,7 @@ class InertialTracker:
         seen = self._update(frame, s, left)
         self._looks.px[left.found] = left.px[left.found]
         self._looks.age[seen] += 1
+        self._memory.sleep(s, self._looks, np.flatnonzero(~left.found))
         self._keep(s, seen)
         count = int(seen.sum())
         state = TrackState.OK if count >= self._config.weak else TrackState.WEAK
@@ -174,10 +178,48 @@ class InertialTracker:
         ekf.keep_features(s, keep)
         self._looks = self._looks.take(keep)
 
+    def _wake(self, frame: Frame, s: State) -> None:
+        """Features seen from about here before, where they lie as near as the filter knows."""
+        config = self._config
+        asked = 0
+        for k, asleep in self._memory.near(s, config.recall_m, config.recall_rad):
+            if asked >= config.recall:
+                break
+            before = len(s.ids)
+            asked += len(asleep.ids)
+            ekf.add_features(s, asleep.ids, k, asleep.ray, asleep.rho, asleep.sigma)
+            self._looks = self._looks.join(asleep.looks)
+            sought = find.seek(frame.image0, self._rig.cam0, s, self._looks, config, fresh=before)
+            rows = self._sight(s, sought, None)
+            good = np.ones(len(s.ids), bool)
+            good[before:] = False
+            if len(rows.which):
+                _, S = ekf.gains(s, rows)
+                good[rows.which[ekf.surprise(rows, S) < config.gate]] = True
+            self._memory.wake(int(s.keyframes[k]), s.ids[good & (np.arange(len(good)) >= before)])
+            self._looks.px[sought.found] = sought.px[sought.found]
+            self._keep(s, good)
+
     def _forget(self, s: State) -> None:
-        """Keyframes whose features are all gone."""
-        idle = np.setdiff1d(np.arange(len(s.keyframes)), np.unique(s.host))
-        ekf.drop_keyframes(s, s.keyframes[idle])
+        """Keyframes whose features are all gone, and, where there are too many, the most redundant ones."""
+        busy = np.isin(np.arange(len(s.keyframes)), s.host)
+        remembered = np.array([self._memory.has(int(k)) for k in s.keyframes], bool)
+        leave = ~busy & ~remembered
+        leave[-1] = False
+        while len(s.keyframes) - leave.sum() > self._config.max_keyframes:
+            left = np.flatnonzero(~leave)
+            apart = se3.log(se3.inverse(s.poses[left, None]) @ s.poses[None, left])
+            cost = np.linalg.norm(apart[..., 3:], axis=-1) + np.linalg.norm(apart[..., :3], axis=-1)
+            cost[np.diag_indices(len(left))] = np.inf
+            nearest = cost.min(axis=1) + 100.0 * busy[left]
+            nearest[-1] = np.inf
+            leave[left[np.argmin(nearest)]] = True
+        self._memory.forget(s.keyframes[leave])
+        self._drop_keyframes(s, leave)
+
+    def _drop_keyframes(self, s: State, leave: NDArray[np.bool_]) -> None:
+        self._looks = self._looks.take(~leave[s.host])
+        ekf.drop_keyframes(s, s.keyframes[leave])
 
     # ------------------------------------------------------------------ time
 

@@ -1,0 +1,87 @@
+"""Features that are out of sight, kept with the keyframes that saw them first until these are seen again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from share.estimator.inertial.features import Looks
+from share.estimator.inertial.state import State
+from share.geometry import se3
+from share.types import F64, I64
+
+_KNOWN = 0.1  # relative sigma of an inverse depth worth remembering
+_FORGETFUL = 1.5  # times the sigma that it had: what it shared with the pose is lost
+_MOST = 40  # of a keyframe
+
+
+@dataclass(frozen=True, eq=False)
+class Asleep:
+    """Features of one keyframe: ids (N,), rays (N, 2), inverse depths and sigmas (N,), looks."""
+
+    ids: I64
+    ray: F64
+    rho: F64
+    sigma: F64
+    looks: Looks
+
+    def take(self, keep: NDArray[np.bool_] | I64) -> Asleep:
+        return Asleep(self.ids[keep], self.ray[keep], self.rho[keep], self.sigma[keep], self.looks.take(keep))
+
+    def join(self, other: Asleep) -> Asleep:
+        return Asleep(
+            np.concatenate([self.ids, other.ids]),
+            np.concatenate([self.ray, other.ray]),
+            np.concatenate([self.rho, other.rho]),
+            np.concatenate([self.sigma, other.sigma]),
+            self.looks.join(other.looks),
+        )
+
+
+class Memory:
+    """By keyframe id. Memory is bounded by the keyframes of the state."""
+
+    def __init__(self) -> None:
+        self._of: dict[int, Asleep] = {}
+
+    def sleep(self, state: State, looks: Looks, which: I64) -> None:
+        """Remember features number `which` of the state if their depth is known."""
+        at = state.features_at + which
+        sigma = _FORGETFUL * np.sqrt(state.cov[at, at])
+        known = (sigma < _KNOWN * np.abs(state.rho[which])) | (sigma < 0.003)
+        known &= looks.age[which] >= 5
+        for host in np.unique(state.host[which[known]]):
+            mine = known & (state.host[which] == host)
+            part = which[mine]
+            asleep = Asleep(state.ids[part], state.ray[part], state.rho[part], sigma[mine], looks.take(part))
+            key = int(state.keyframes[host])
+            old = self._of.get(key)
+            asleep = asleep if old is None else old.join(asleep)
+            best = np.argsort(asleep.sigma, kind="stable")[:_MOST]
+            self._of[key] = asleep.take(np.sort(best))
+
+    def has(self, keyframe: int) -> bool:
+        return keyframe in self._of
+
+    def forget(self, keyframes: I64) -> None:
+        for keyframe in keyframes.tolist():
+            self._of.pop(keyframe, None)
+
+    def near(self, state: State, max_m: float, max_rad: float) -> list[tuple[int, Asleep]]:
+        """(number in the state, its sleepers) of keyframes that look from about here, nearest first."""
+        apart = se3.log(se3.inverse(state.poses) @ state.T)
+        far, turned = np.linalg.norm(apart[:, 3:], axis=1), np.linalg.norm(apart[:, :3], axis=1)
+        order = np.argsort(far + turned, kind="stable")
+        here = [int(k) for k in order if far[k] < max_m and turned[k] < max_rad]
+        return [(k, self._of[int(state.keyframes[k])]) for k in here if self.has(int(state.keyframes[k]))]
+
+    def wake(self, keyframe: int, ids: I64) -> None:
+        """These are features of the state again."""
+        left = self._of[keyframe]
+        keep = ~np.isin(left.ids, ids)
+        if keep.any():
+            self._of[keyframe] = left.take(keep)
+        else:
+            del self._of[keyframe]
