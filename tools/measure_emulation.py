@@ -7,7 +7,7 @@
 axes; turn, change of velocity).
 `turn_*_mrad`: the angle between what two of three say of the turn from one picture to the next, rms: the IMU
 in the recording, less the fitted bias, integrated; the recorded pictures of cam0 (KLT, exact depth, PnP); the
-path. `shift_ms`: of best correlation of the first two.
+path; of the first two also the median, and `shift_ms` of best correlation.
 """
 
 from __future__ import annotations
@@ -116,6 +116,7 @@ def turned(source: Source, path: RecordedPath, room: Layout) -> Row:
         "turn_median_mrad": _mrad(np.median(se3.angle(felt))),
         "turn_most_mrad": _mrad(se3.angle(felt).max()),
         "turn_imu_images_mrad": _mrad(_rms_between(felt, seen)),
+        "turn_imu_images_median_mrad": _mrad(np.median(se3.angle(felt.swapaxes(1, 2) @ seen))),
         "turn_imu_path_mrad": _mrad(_rms_between(felt, gone)),
         "turn_images_path_mrad": _mrad(_rms_between(seen, gone)),
         "shift_ms": _round(best_shift_ms(imu, path, start, end, seen)),
