@@ -77,6 +77,11 @@ class InertialConfig:
     settled_px: float = 0.3  # a last correction larger than this is no find
     reach_px: float = 4.0  # how far alignment may wander from where a feature was expected
     imu_noise: float = 2.0  # times what the IMU's data sheet says
+    gyro_bias: float = 0.02  # rad/s, to begin with
+    accel_bias: float = 0.3  # m/s^2, the same
+    extrinsic_rad: float = 1e-5  # what is not known of the camera's place on the body; small: taken as it is
+    extrinsic_m: float = 1e-5  # the same, of its position
+    offset_s: float = 1e-6  # the same of its time against the IMU's
     gravity: float = 9.81  # m/s^2
     keyframe_m: float = 0.15  # a keyframe after this much motion since the last one,
     keyframe_rad: float = 0.2  # or this much turning,

@@ -78,11 +78,12 @@ def cut(image: U8, px: F32) -> Patches:
 @dataclass(frozen=True, eq=False)
 class Found:
     """px (N, 2) where the patches are; alike (N,): normalised correlation there, 1 at best; step (N,): px
-    of the last correction, small where it settled."""
+    of the last correction, small where it settled; error (N, S): gray levels that no shift explains."""
 
     px: F32
     alike: F32
     step: F32
+    error: F32
 
 
 def align(image: U8, patches: Patches, px: F64, warp: F64, most: int = 4, settled_px: float = 0.02) -> Found:
@@ -90,6 +91,7 @@ def align(image: U8, patches: Patches, px: F64, warp: F64, most: int = 4, settle
     n = len(patches)
     at, W = px.astype(np.float32), warp.astype(np.float32)
     alike, step = np.zeros(n, np.float32), np.full(n, np.inf, np.float32)
+    left = np.zeros_like(patches.gray)
     spread = OFFSETS @ W.transpose(0, 2, 1)  # (N, S, 2)
     todo = np.arange(n)
     for _ in range(most):
@@ -101,11 +103,26 @@ def align(image: U8, patches: Patches, px: F64, warp: F64, most: int = 4, settle
         alike[todo] = np.einsum("ns,ns->n", seen, part.gray)
         error = (seen - part.gray) * part.contrast[:, None]
         shift = part.inverse @ (part.slope @ error[:, :, None])
+        left[todo] = error - (shift.transpose(0, 2, 1) @ part.slope)[:, 0]
         move = (W[todo] @ shift)[:, :, 0]
         at[todo] -= move
         step[todo] = np.hypot(move[:, 0], move[:, 1])
         todo = todo[(step[todo] > settled_px) & np.isfinite(step[todo])]
-    return Found(at, alike, step)
+    return Found(at, alike, step, left)
+
+
+def slanted(patches: Patches, error: F32, along: F64) -> tuple[F64, F64]:
+    """What a patch says of the slant of its surface: information (N, 2, 2) and its product with the step
+    (N, 2), for one gray level of noise. along (N, 2): px of the patch by which its middle moves for one
+    unit more of inverse depth; the step is the change of inverse depth by px of the patch. error: of
+    `align`."""
+    moved = (along.astype(np.float32)[:, None, :] @ patches.slope)[:, 0]  # gray levels for a unit
+    S = moved[:, None, :] * OFFSETS.T
+    S = S - S.mean(axis=2, keepdims=True)
+    explained = patches.inverse @ (patches.slope @ S.transpose(0, 2, 1))
+    S = S - explained.transpose(0, 2, 1) @ patches.slope
+    information = (S @ S.transpose(0, 2, 1)).astype(np.float64)
+    return information, -(S @ error[:, :, None])[:, :, 0].astype(np.float64)
 
 
 def _sample(image: U8, x: F32, y: F32) -> F32:

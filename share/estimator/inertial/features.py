@@ -12,34 +12,57 @@ from share.types import F32, F64, I64, U8
 from share.vision import patches
 from share.vision.patches import Patches
 
+_SLANT = 0.4  # tangent of a surface's slant, one sigma of the room's surfaces
+_FAR = 0.05  # 1/m; slants of what is further do not show
+_NOISE = 12.0  # gray levels: more than an image's noise, because a patch repeats its own errors
+_PATIENT = 0.3  # of what a frame says is taken: its errors are much like the next one's
+
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """patch of N features. spread (N, 2, 2): d ray / d px in the image that saw them first. px (N, 2): where
-    each was seen last. age (N,): frames in which it was seen."""
+    """patch of N features. spread (N, 2, 2): d ray / d px in the image that saw them first. slant (N, 2):
+    d rho / d px there, of the surface, and its information (N, 2, 2). px (N, 2): where each was seen
+    last. age (N,): frames in which it was seen."""
 
     patch: Patches
     spread: F64
+    slant: F64
+    slant_information: F64
     px: F32
     age: I64
 
     def take(self, keep: NDArray[np.bool_] | I64) -> Looks:
-        return Looks(self.patch.take(keep), self.spread[keep], self.px[keep], self.age[keep])
+        return Looks(self.patch.take(keep), *(getattr(self, name)[keep] for name in _ARRAYS))
 
     def join(self, other: Looks) -> Looks:
-        return Looks(
-            self.patch.join(other.patch),
-            np.concatenate([self.spread, other.spread]),
-            np.concatenate([self.px, other.px]),
-            np.concatenate([self.age, other.age]),
-        )
+        pairs = ((getattr(self, name), getattr(other, name)) for name in _ARRAYS)
+        return Looks(self.patch.join(other.patch), *(np.concatenate(pair) for pair in pairs))
 
 
-def looks(image: U8, camera: Camera, px: F32, ray: F64) -> Looks:
-    """Of new features at px (N, 2) of the image, on rays (N, 2)."""
+_ARRAYS = ("spread", "slant", "slant_information", "px", "age")
+
+
+def looks(image: U8, camera: Camera, px: F32, ray: F64, rho: F64) -> Looks:
+    """Of new features at px (N, 2) of the image, on rays (N, 2), at inverse depths (N,)."""
+    n = len(px)
     spread = np.asarray(np.linalg.inv(camera.jacobian(ray)), np.float64)
-    return Looks(patches.cut(image, px), spread, px, np.zeros(len(px), np.int64))
+    sigma = _SLANT * np.maximum(rho, _FAR) / camera.focal
+    information = np.eye(2) / sigma[:, None, None] ** 2
+    age = np.zeros(n, np.int64)
+    return Looks(patches.cut(image, px), spread, np.zeros((n, 2)), information, px, age)
+
+
+def learn_slant(looks: Looks, which: I64, error: F32, along: F64) -> None:
+    """From how the patches of features `which` (M,) look where they were found: see `patches.slanted`."""
+    information, step = patches.slanted(looks.patch.take(which), error, along)
+    information, step = information / _NOISE**2, step / _NOISE**2
+    prior = looks.slant_information[which]
+    pull = step - (prior @ looks.slant[which][:, :, None])[:, :, 0]
+    looks.slant[which] += _PATIENT * np.linalg.solve(prior + information, pull[:, :, None])[:, :, 0]
 
 
 def none() -> Looks:
-    return Looks(patches.empty(), np.zeros((0, 2, 2)), np.zeros((0, 2), np.float32), np.zeros(0, np.int64))
+    empty = np.zeros((0, 2)), np.zeros((0, 2, 2))
+    return Looks(
+        patches.empty(), empty[1], empty[0], empty[1], empty[0].astype(np.float32), np.zeros(0, np.int64)
+    )

@@ -16,16 +16,20 @@ from share.types import F32, F64, I64, U8
 from share.vision import klt, patches
 
 _BORDER_PX = 6.0
+_AGREE_PX = 1.5  # how far the way by the image before may be from what the first patch says
+_TINY = 1e-12 * np.eye(2)
 
 
 @dataclass(frozen=True, eq=False)
 class Sought:
     """Of all N features in one image: px (N, 2) and whether each was found; expected (N, 2), NaN behind the
-    camera."""
+    camera. For `patches.slanted`: error (N, S), along (N, 2)."""
 
     px: F32
     found: NDArray[np.bool_]
     expected: F64
+    error: F32
+    along: F64
 
 
 def seek(
@@ -38,48 +42,57 @@ def seek(
     fresh: int = 0,
 ) -> Sought:
     """In cam0's image, or with T_right_left in cam1's; of features from number `fresh` on."""
-    which = np.arange(len(state.ids))
-    expected, warp = _expected(camera, state, which, looks, T_right_left)
-    out = np.nan_to_num(expected, nan=-1e6).astype(np.float32)
-    found = np.zeros(len(which), bool)
-    inside = np.flatnonzero(camera.inside(np.nan_to_num(expected, nan=-1e6), _BORDER_PX) & (which >= fresh))
-    if len(inside):
-        out[inside], found[inside] = _settle(
-            image, looks, inside, expected[inside], warp[inside], config, config.reach_px
-        )
-    return Sought(out, found, expected)
+    n = len(state.ids)
+    where, warp, along = _expected(camera, state, np.arange(n), looks, T_right_left)
+    nowhere = np.zeros((n, len(patches.OFFSETS)), np.float32)
+    out = Sought(np.nan_to_num(where, nan=-1e6).astype(np.float32), np.zeros(n, bool), where, nowhere, along)
+    inside = camera.inside(np.nan_to_num(where, nan=-1e6), _BORDER_PX)
+    todo = np.flatnonzero(inside & (np.arange(n) >= fresh))
+    _settle(image, looks, todo, where[todo], warp[todo], config, config.reach_px, out)
+    return out
 
 
 def rescue(
     before: U8, image: U8, camera: Camera, state: State, looks: Looks, sought: Sought, config: InertialConfig
-) -> Sought:
+) -> None:
     """Those of cam0 that were not found, followed from the image before to wherever they went."""
     inside = camera.inside(np.nan_to_num(sought.expected, nan=-1e6), _BORDER_PX)
     todo = np.flatnonzero(~sought.found & inside & (looks.age > 0))
     if len(todo) == 0:
-        return sought
+        return
     guess = sought.expected[todo].astype(np.float32)
     px, ok = klt.follow(before, image, looks.px[todo], guess, window=15, levels=2, back_check_px=1.0)
-    todo, px = todo[ok], px[ok]
-    _, warp = _expected(camera, state, todo, looks, None)
-    out, found = sought.px.copy(), sought.found.copy()
-    out[todo], found[todo] = _settle(image, looks, todo, px.astype(np.float64), warp, config, 1.5)
-    return Sought(out, found, sought.expected)
+    todo = todo[ok]
+    _, warp, _ = _expected(camera, state, todo, looks, None)
+    _settle(image, looks, todo, px[ok].astype(np.float64), warp, config, _AGREE_PX, sought)
 
 
 def _expected(
     camera: Camera, state: State, which: I64, looks: Looks, T_right_left: F64 | None
-) -> tuple[F64, F64]:
-    """px (N, 2), NaN behind the camera, and warps (N, 2, 2) px by px."""
-    uv = observe.predict(state, which, T_right_left).uv
-    slant = np.zeros((len(which), 2))
-    turned = observe.warp(state, which, looks.spread[which], slant, T_right_left)
-    return camera.distort(uv), camera.jacobian(uv) @ turned
+) -> tuple[F64, F64, F64]:
+    """px (N, 2), NaN behind the camera; warps (N, 2, 2) px by px; and by how many px of its first image a
+    feature moves for one unit more of inverse depth (N, 2)."""
+    seen = observe.predict(state, which, T_right_left)
+    turned = observe.warp(state, which, looks.spread[which], looks.slant[which], T_right_left)
+    along = np.linalg.solve(np.nan_to_num(turned) + _TINY, np.nan_to_num(seen.by_rho)[..., None])[..., 0]
+    return camera.distort(seen.uv), camera.jacobian(seen.uv) @ turned, np.asarray(along, np.float64)
 
 
 def _settle(
-    image: U8, looks: Looks, which: I64, px: F64, warp: F64, config: InertialConfig, reach_px: float
-) -> tuple[F32, NDArray[np.bool_]]:
-    out = patches.align(image, looks.patch.take(which), px, warp)
-    strayed = np.linalg.norm(out.px - px, axis=1)
-    return out.px, (out.alike > config.alike) & (out.step < config.settled_px) & (strayed < reach_px)
+    image: U8,
+    looks: Looks,
+    which: I64,
+    px: F64,
+    warp: F64,
+    config: InertialConfig,
+    reach_px: float,
+    out: Sought,
+) -> None:
+    """Align features `which` from px (N, 2) and put into `out` what came of it."""
+    if len(which) == 0:
+        return
+    found = patches.align(image, looks.patch.take(which), px, warp)
+    strayed = np.linalg.norm(found.px - px, axis=1)
+    out.px[which], out.error[which] = found.px, found.error
+    good = (found.alike > config.alike) & (found.step < config.settled_px) & (strayed < reach_px)
+    out.found[which] = good

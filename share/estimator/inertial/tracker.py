@@ -10,20 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.config import InertialConfig
-from share.estimator import gravity
 from share.estimator.inertial import ekf, features, find
+from share.estimator.inertial.beginning import first_state
 from share.estimator.inertial.features import Looks
 from share.estimator.inertial.memory import Memory
-from share.estimator.inertial.state import (
-    ACCEL_BIAS,
-    CORE,
-    EXTRINSIC,
-    GYRO_BIAS,
-    OFFSET,
-    VELOCITY,
-    State,
-    begin,
-)
+from share.estimator.inertial.state import State
 from share.estimator.visual import TrackResult
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
@@ -31,9 +22,6 @@ from share.types import F64, U8, Candidate, Frame, ImuBatch, TrackState
 from share.vision import corners
 from share.vision.depth import from_depth_camera, from_stereo
 from share.vision.view import make_view
-
-_TILT, _SPEED, _GYRO_BIAS, _ACCEL_BIAS = 0.1, 0.5, 0.02, 0.3  # sigmas to begin with
-_FEWEST_SAMPLES = 10  # of the IMU, to begin with
 
 
 class InertialTracker:
@@ -90,10 +78,11 @@ class InertialTracker:
         )
         left = find.seek(frame.image0, self._rig.cam0, s, self._looks, self._config)
         if self._image is not None:
-            left = find.rescue(self._image, frame.image0, self._rig.cam0, s, self._looks, left, self._config)
+            find.rescue(self._image, frame.image0, self._rig.cam0, s, self._looks, left, self._config)
         seen = self._update(frame, s, left)
         self._looks.px[left.found] = left.px[left.found]
         self._looks.age[seen] += 1
+        features.learn_slant(self._looks, np.flatnonzero(seen), left.error[seen], left.along[seen])
         self._memory.sleep(s, self._looks, np.flatnonzero(~left.found))
         self._keep(s, seen)
         count = int(seen.sum())
@@ -161,7 +150,7 @@ class InertialTracker:
         ids = np.arange(self._next_feature, self._next_feature + len(px))
         self._next_feature += len(px)
         ekf.add_features(s, ids, host, ray, rho, sigma)
-        self._looks = self._looks.join(features.looks(frame.image0, camera, px, ray))
+        self._looks = self._looks.join(features.looks(frame.image0, camera, px, ray, rho))
 
     def _inverse_depth(self, frame: Frame, px: NDArray[np.float32], ray: F64) -> tuple[F64, F64]:
         """1/m (N,), NaN unknown, and sigma."""
@@ -243,15 +232,8 @@ class InertialTracker:
     # ------------------------------------------------------------------ beginnings
 
     def _start(self, frame: Frame) -> TrackResult:
-        if len(self._imu) < _FEWEST_SAMPLES:
+        self._state = first_state(frame.stamp_ns, self._imu, self._rig, self._config)
+        if self._state is None:
             return TrackResult(TrackState.INITIALISING, None)
-        up = self._imu.accel[-60:].mean(axis=0)
-        T = gravity.level(up / np.linalg.norm(up), self._rig.T_body_cam0[:3, 2])
-        sigma = np.zeros(CORE)
-        sigma[0:2], sigma[2], sigma[3:6] = _TILT, 1e-4, 1e-4
-        sigma[VELOCITY], sigma[GYRO_BIAS], sigma[ACCEL_BIAS] = _SPEED, _GYRO_BIAS, _ACCEL_BIAS
-        sigma[EXTRINSIC], sigma[OFFSET] = 1e-6, 1e-6
-        zero = np.zeros(3)
-        self._state = begin(frame.stamp_ns, T, zero, zero, zero, self._rig.T_body_cam0, sigma)
-        self._rate = self._imu.gyro[-1]
+        self._rate = self._imu.gyro[-1] - self._state.bg
         return TrackResult(TrackState.OK, self._pose(self._state), True, 0, True)
