@@ -5,7 +5,7 @@ from motion_sim import every, person
 from share.emulate.motion.plan import plan
 from share.emulate.world.occupancy import Occupancy
 from share.emulate.world.scenes.table import layout
-from share.errors import DataError, UsageError
+from share.errors import UsageError
 from share.io.trajectory import Trajectory, format_tum
 from share.types import AgentKind
 
@@ -58,7 +58,7 @@ def test_what_cannot_be_planned(warehouse, specs, says):
 def test_bad_lengths_and_files(warehouse, tmp_path):
     with pytest.raises(UsageError, match="3 to 3600"):
         plan(["walk:"], warehouse, float("nan"), 1)
-    with pytest.raises(DataError, match="no such file"):
+    with pytest.raises(UsageError, match="no such file"):
         plan([f"tum:{tmp_path}/none.tum"], warehouse, 10.0, 1)
 
 
