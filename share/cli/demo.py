@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from share.run.demo import Progress
     from share.run.score import SessionScore
 
+_SEED = 11  # in this room all three soon look at the same things; in others 20 s may be too short for that
+
 
 class _Seconds(click.FloatRange):
     """Refuses NaN too, which is below no least and above no greatest."""
@@ -32,7 +34,7 @@ class _Seconds(click.FloatRange):
 @click.option("--policy", type=click.Choice(POLICIES), default=POLICIES[0], show_default=True)
 @click.option("--out", metavar="DIR", default="share-demo", show_default=True, help="Everything it leaves.")
 @click.option("--scene", help="Which kind of room (see share emulate --help).  [default: warehouse]")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Which room.")
+@click.option("--seed", type=click.IntRange(0), default=_SEED, show_default=True, help="Which room.")
 def demo(seconds: float, policy: str, out: str, scene: str | None, seed: int) -> None:
     """The whole system on this machine, nothing else needed.
 
