@@ -161,7 +161,7 @@ def test_output_to_a_full_disk_is_one_line():
 def interrupted(home: Path, number: int) -> tuple[int, str, str]:
     """Exit code, stdout and stderr of a demo that gets a signal while it draws its session."""
     with subprocess.Popen(
-        [*SHARE, "demo", "--scene", "plain", "--seconds", "3", "--out", str(home / "out")],
+        [*SHARE, "demo", "--scene", "plain", "--seed", "0", "--seconds", "3", "--out", str(home / "out")],
         env={"XDG_CACHE_HOME": str(home)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
