@@ -72,6 +72,8 @@ class InertialConfig:
     features: int = 110  # followed at a time
     spacing_px: float = 18.0  # least distance between new ones
     sigma_px: float = 0.5  # of a feature found again; its errors last, so this is more than their size
+    common_rad: float = 5e-5  # error of an image that all its features share: its blur, its time
+    common_m: float = 1e-4  # the same, as a shift of the camera
     gate: float = 12.0  # squared Mahalanobis distance, 2 degrees of freedom, beyond which a sight is refused
     alike: float = 0.85  # correlation with the first patch below which a feature is not seen
     settled_px: float = 0.3  # a last correction larger than this is no find
@@ -96,8 +98,9 @@ class InertialConfig:
     blind: int = 6  # fewer: INERTIAL_ONLY
     max_speed_m_s: float = 8.0  # a state that is faster is LOST
     lost_m: float = 0.5  # sigma of a position since the last sight that is LOST
-    turning_noise: float = 2.0  # rad/s, what a body may turn while its IMU is silent
-    moving_noise: float = 4.0  # m/s^2, the same of its acceleration
+    silent_s: float = 0.1  # an IMU that says nothing for longer is taken as silent
+    turning_noise: float = 0.5  # rad/s/sqrt(Hz), how a body's turning may change meanwhile
+    moving_noise: float = 1.0  # m/s^2/sqrt(Hz), the same of its velocity
 
     def __post_init__(self) -> None:
         _require_positive(self, "features", "spacing_px", "sigma_px", "gate", "imu_noise", "gravity")

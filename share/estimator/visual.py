@@ -18,6 +18,7 @@ from share.config import TrackerConfig
 from share.estimator import gravity, relocalise
 from share.estimator.localmap import LocalKeyframe, LocalMap
 from share.estimator.pose import PoseEstimate, consensus, refine
+from share.estimator.result import TrackResult
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
 from share.types import F32, F64, I64, U8, Candidate, Frame, TrackState
@@ -26,21 +27,6 @@ from share.vision.view import depth_at, make_view
 
 RESEMBLANCE = 0.8  # NCC below which a re-found patch is another thing
 MIN_TO_LOOK_FOR = 8  # fewer points of an old keyframe are not worth an image pyramid
-
-
-@dataclass(frozen=True, eq=False)
-class TrackResult:
-    """What one frame came to. T_odom_body is None where there is no pose to be had.
-
-    keyframe: this frame became one; `VisualTracker.keyframe` gives what it shows. points: how many
-    the pose rests on. new_stretch: odometry broke before this keyframe.
-    """
-
-    state: TrackState
-    T_odom_body: F64 | None
-    keyframe: bool = False
-    points: int = 0
-    new_stretch: bool = False
 
 
 @dataclass(frozen=True, eq=False)

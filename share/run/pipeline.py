@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from share.config import Config
 from share.core.sequencer import SequencerCounters, sequence, streams_of
 from share.errors import DataError, MisfitError, UsageError
+from share.estimator.inertial.tracker import InertialTracker
 from share.estimator.visual import VisualTracker
 from share.io.images import load
 from share.io.source import Source
@@ -42,8 +43,10 @@ def frames_of(
         yield frame
 
 
-def tracker_for(source: Source, config: Config) -> VisualTracker:
-    """The estimator that fits the rig. The inertial one takes this place where there is an IMU."""
+def tracker_for(source: Source, config: Config) -> VisualTracker | InertialTracker:
+    """The estimator that fits the rig."""
     if source.rig.cam1 is None and source.rig.depth is None:
         raise UsageError(f"{source.name}: one camera without depth gives no scale; stereo or depth is needed")
+    if source.rig.imu is not None:
+        return InertialTracker(source.rig, config.inertial, config.tracker)
     return VisualTracker(source.rig, config.tracker)

@@ -26,3 +26,8 @@ def detect(image: U8, taken: F32, count: int, spacing: float, quality: float = 0
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 0.03)
     refined: F32 = cv2.cornerSubPix(image, corners, (3, 3), (-1, -1), criteria).reshape(-1, 2)
     return refined
+
+
+def count(image: U8, contrast: int = 12) -> int:
+    """How many FAST corners there are: whether there is anything to see."""
+    return len(cv2.FastFeatureDetector.create(contrast).detect(image))

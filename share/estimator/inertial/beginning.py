@@ -51,6 +51,15 @@ def first_state(stamp_ns: int, imu: ImuBatch, rig: Rig, config: InertialConfig) 
     return state
 
 
+def state_by_camera(stamp_ns: int, rig: Rig, config: InertialConfig) -> State:
+    """For a body whose IMU says nothing: up is where the top of the image is, more or less."""
+    up = rig.T_body_cam0[:3, :3] @ np.array([0.0, -1.0, 0.0])
+    T, zero = gravity.level(up, rig.T_body_cam0[:3, 2]), np.zeros(3)
+    sigma = _sigmas(False, config)
+    sigma[0:2] = _SAME  # a body that coasts tells nothing of gravity
+    return begin(stamp_ns, T, zero, zero, zero, rig.T_body_cam0, sigma)
+
+
 def _still(gyro: F64, accel: F64) -> bool:
     turn = np.linalg.norm(gyro.mean(axis=0)) + np.linalg.norm(gyro.std(axis=0))
     return bool(turn < _STILL_TURN and np.linalg.norm(accel.std(axis=0)) < _STILL_SHAKE)

@@ -6,6 +6,7 @@ Mourikis (2014).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,7 @@ from share.geometry.camera import ImuNoise
 from share.types import F64, I64, ImuBatch
 
 _MOVING = 15  # columns that propagation changes
+_SETTLED = 1e-4  # rad, m, 1/m: a correction that changes no derivative
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +84,9 @@ def join(*sights: Sight) -> Sight:
     return Sight(*(np.concatenate([getattr(s, name) for s in sights]) for name in names))
 
 
-def gains(state: State, rows: Sight) -> tuple[F64, F64]:
+def gains(state: State, rows: Sight, common: F64 | None = None) -> tuple[F64, F64]:
     """cov H' (n, 2 M) and H cov H' + R (2 M, 2 M) of rows sorted by host. H is not formed: a row has 29
-    entries."""
+    entries. common (6, 6): covariance of an error that all rows share, as one of the pose, on its right."""
     P, M = state.cov, len(rows.which)
     core, by_host = rows.core.reshape(2 * M, CORE), rows.by_host.reshape(2 * M, 6)
     by_rho, at_rho = rows.by_rho.ravel(), np.repeat(state.features_at + rows.which, 2)
@@ -98,6 +100,9 @@ def gains(state: State, rows: Sight) -> tuple[F64, F64]:
     for columns, part in groups:
         S[part] += by_host[part] @ PHt[columns]
     S[np.diag_indices(2 * M)] += np.repeat(rows.sigma**2, 2)
+    if common is not None:
+        B = core[:, POSE] @ se3.adjoint(state.T)
+        S += B @ common @ B.T
     return PHt, S
 
 
@@ -119,6 +124,39 @@ def surprise(rows: Sight, S: F64) -> F64:
     return out
 
 
+def relinearised(
+    state: State, rows_at: Callable[[], Sight], common: F64 | None = None, rounds: int = 4
+) -> Sight:
+    """Rows whose derivatives are those at the state that they lead to: an iterated EKF (Bell & Cathey 1993).
+
+    rows_at: makes them from `state`, whose means are as before when this returns. For where the first
+    prediction is far off; the rows' residuals are what `gains` and `update` want.
+    """
+    before, error = state.means(), np.zeros(state.size)
+    for _ in range(rounds):
+        rows = rows_at()
+        rows.residual[:] += times(state, rows, error)
+        PHt, S = gains(state, rows, common)
+        step = _gain(PHt, S, rows.residual.ravel())[0] - error
+        error += step
+        state.restore(before)
+        move(state, error)
+        if np.abs(step).max() < _SETTLED:
+            break
+    rows = rows_at()
+    rows.residual[:] += times(state, rows, error)
+    state.restore(before)
+    return rows
+
+
+def times(state: State, rows: Sight, error: F64) -> F64:
+    """H error (M, 2)."""
+    poses = error[CORE : state.features_at].reshape(-1, 6)[rows.host]
+    by_rho = rows.by_rho * error[state.features_at + rows.which, None]
+    out: F64 = rows.core @ error[:CORE] + (rows.by_host @ poses[:, :, None])[:, :, 0] + by_rho
+    return out
+
+
 def update(state: State, rows: Sight, PHt: F64, S: F64) -> float:
     """Apply rows with their `gains`. The squared Mahalanobis distance of all of them together.
 
@@ -128,16 +166,22 @@ def update(state: State, rows: Sight, PHt: F64, S: F64) -> float:
 
 def apply(state: State, residual: F64, PHt: F64, S: F64) -> float:
     """residual (m,), cov H' (n, m), its covariance S (m, m)."""
-    L, failed = lapack.dpotrf(S, lower=1, clean=1)
-    if failed:
-        raise np.linalg.LinAlgError("innovation covariance is not positive definite")
-    W = blas.dtrsm(1.0, L, PHt.T, lower=1)  # L^-1 H cov
-    white = blas.dtrsm(1.0, L, residual[:, None], lower=1)[:, 0]
+    error, W, white = _gain(PHt, S, residual)
     state.cov -= W.T @ W
     state.cov += state.cov.T
     state.cov *= 0.5
-    move(state, W.T @ white)
+    move(state, error)
     return float(white @ white)
+
+
+def _gain(PHt: F64, S: F64, residual: F64) -> tuple[F64, F64, F64]:
+    """The error (n,) that the residual tells of, L^-1 H cov (m, n), L^-1 residual (m,) with L L' = S."""
+    L, failed = lapack.dpotrf(S, lower=1, clean=1)
+    if failed:
+        raise np.linalg.LinAlgError("innovation covariance is not positive definite")
+    W = blas.dtrsm(1.0, L, PHt.T, lower=1)
+    white = blas.dtrsm(1.0, L, residual[:, None], lower=1)[:, 0]
+    return W.T @ white, W, white
 
 
 def move(state: State, error: F64) -> None:

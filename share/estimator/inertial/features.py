@@ -12,6 +12,9 @@ from share.types import F32, F64, I64, U8
 from share.vision import patches
 from share.vision.patches import Patches
 
+_LATELY = 0.2  # of a residual that is added to a lag
+_RUN_PX, _UNUSUAL = 0.5, 5.0  # a lag of this size, and so many times the least ones, is a motion of its own
+_FEWEST = 12  # features that say something of each other
 _SLANT = 0.4  # tangent of a surface's slant, one sigma of the room's surfaces
 _FAR = 0.05  # 1/m; slants of what is further do not show
 _NOISE = 12.0  # gray levels: more than an image's noise, because a patch repeats its own errors
@@ -22,13 +25,15 @@ _PATIENT = 0.3  # of what a frame says is taken: its errors are much like the ne
 class Looks:
     """patch of N features. spread (N, 2, 2): d ray / d px in the image that saw them first. slant (N, 2):
     d rho / d px there, of the surface, and its information (N, 2, 2). px (N, 2): where each was seen
-    last. age (N,): frames in which it was seen."""
+    last; lag (N, 2): px by which it has lately run away from where the others say it should be. age (N,):
+    frames in which it was seen."""
 
     patch: Patches
     spread: F64
     slant: F64
     slant_information: F64
     px: F32
+    lag: F64
     age: I64
 
     def take(self, keep: NDArray[np.bool_] | I64) -> Looks:
@@ -39,7 +44,7 @@ class Looks:
         return Looks(self.patch.join(other.patch), *(np.concatenate(pair) for pair in pairs))
 
 
-_ARRAYS = ("spread", "slant", "slant_information", "px", "age")
+_ARRAYS = ("spread", "slant", "slant_information", "px", "lag", "age")
 
 
 def looks(image: U8, camera: Camera, px: F32, ray: F64, rho: F64) -> Looks:
@@ -49,7 +54,8 @@ def looks(image: U8, camera: Camera, px: F32, ray: F64, rho: F64) -> Looks:
     sigma = _SLANT * np.maximum(rho, _FAR) / camera.focal
     information = np.eye(2) / sigma[:, None, None] ** 2
     age = np.zeros(n, np.int64)
-    return Looks(patches.cut(image, px), spread, np.zeros((n, 2)), information, px, age)
+    nothing = np.zeros((n, 2))
+    return Looks(patches.cut(image, px), spread, nothing, information, px, nothing.copy(), age)
 
 
 def learn_slant(looks: Looks, which: I64, error: F32, along: F64) -> None:
@@ -61,8 +67,31 @@ def learn_slant(looks: Looks, which: I64, error: F32, along: F64) -> None:
     looks.slant[which] += _PATIENT * np.linalg.solve(prior + information, pull[:, :, None])[:, :, 0]
 
 
+def runaways(looks: Looks, which: I64, residual: F64) -> NDArray[np.bool_]:
+    """Which of features `which` (M,) move on their own. residual (M, 2): px from where they were expected.
+
+    What moves slowly passes every gate, a little off each time and always the same way, and drags the pose
+    along. The quarter that lags least stands still, and what it has in common is the pose's own error.
+    """
+    if len(which) < _FEWEST:
+        return np.zeros(len(which), bool)
+    far = np.linalg.norm(looks.lag[which], axis=1)
+    still = far <= np.quantile(far, 0.25)
+    own = residual - np.median(residual[still], axis=0)
+    looks.lag[which] += _LATELY * (own - looks.lag[which])
+    far = np.linalg.norm(looks.lag[which], axis=1)
+    out: NDArray[np.bool_] = far > max(_RUN_PX, _UNUSUAL * float(np.quantile(far, 0.25)))
+    return out
+
+
 def none() -> Looks:
     empty = np.zeros((0, 2)), np.zeros((0, 2, 2))
     return Looks(
-        patches.empty(), empty[1], empty[0], empty[1], empty[0].astype(np.float32), np.zeros(0, np.int64)
+        patches.empty(),
+        empty[1],
+        empty[0],
+        empty[1],
+        empty[0].astype(np.float32),
+        empty[0],
+        np.zeros(0, np.int64),
     )

@@ -40,15 +40,18 @@ def seek(
     config: InertialConfig,
     T_right_left: F64 | None = None,
     fresh: int = 0,
+    left: Sought | None = None,
 ) -> Sought:
-    """In cam0's image, or with T_right_left in cam1's; of features from number `fresh` on."""
+    """In cam0's image, or with T_right_left in cam1's; of features from number `fresh` on. left: of the same
+    frame; only what it found is sought, as far from where it was expected as there."""
     n = len(state.ids)
     where, warp, along = _expected(camera, state, np.arange(n), looks, T_right_left)
     nowhere = np.zeros((n, len(patches.OFFSETS)), np.float32)
     out = Sought(np.nan_to_num(where, nan=-1e6).astype(np.float32), np.zeros(n, bool), where, nowhere, along)
-    inside = camera.inside(np.nan_to_num(where, nan=-1e6), _BORDER_PX)
-    todo = np.flatnonzero(inside & (np.arange(n) >= fresh))
-    _settle(image, looks, todo, where[todo], warp[todo], config, config.reach_px, out)
+    start = where if left is None else where + (left.px - left.expected)
+    inside = camera.inside(np.nan_to_num(start, nan=-1e6), _BORDER_PX) & (np.arange(n) >= fresh)
+    todo = np.flatnonzero(inside if left is None else inside & left.found)
+    _settle(image, looks, todo, start[todo], warp[todo], config, config.reach_px, out)
     return out
 
 
@@ -57,7 +60,7 @@ def rescue(
 ) -> None:
     """Those of cam0 that were not found, followed from the image before to wherever they went."""
     inside = camera.inside(np.nan_to_num(sought.expected, nan=-1e6), _BORDER_PX)
-    todo = np.flatnonzero(~sought.found & inside & (looks.age > 0))
+    todo = np.flatnonzero(~sought.found & inside)
     if len(todo) == 0:
         return
     guess = sought.expected[todo].astype(np.float32)

@@ -12,6 +12,7 @@ the right) | time offset 1 | keyframe poses 6 each | inverse depths 1 each.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -59,6 +60,18 @@ class State:
     def features_at(self) -> int:
         """The first feature's column."""
         return CORE + 6 * len(self.keyframes)
+
+    def means(self) -> tuple[Any, ...]:
+        """All but the covariance, for `restore`."""
+        return self.T, self.v, self.bg, self.ba, self.T_body_cam, self.offset_s, self.poses, self.rho
+
+    def snapshot(self) -> tuple[tuple[Any, ...], F64, int]:
+        """Means, covariance and stamp; the covariance is a copy, for steps of the filter write into it."""
+        return self.means(), self.cov.copy(), self.stamp_ns
+
+    def restore(self, means: tuple[Any, ...]) -> None:
+        """What `means` gave. Steps of the filter replace arrays and never write into them."""
+        self.T, self.v, self.bg, self.ba, self.T_body_cam, self.offset_s, self.poses, self.rho = means
 
     def keyframe(self, k: int) -> slice:
         """Columns of keyframe number k of `poses`."""

@@ -2,6 +2,7 @@
 
 A frame's way: IMU -> propagate -> where features should be -> find them by their patches -> gate ->
 update. A keyframe, after its pose is out: the pose joins the state, free corners become its features.
+Without the IMU the body is taken to go on as it does, without sight the IMU carries it for a while.
 """
 
 from __future__ import annotations
@@ -9,231 +10,300 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from share.config import InertialConfig
-from share.estimator.inertial import ekf, features, find
-from share.estimator.inertial.beginning import first_state
+from share.config import InertialConfig, TrackerConfig
+from share.estimator import relocalise
+from share.estimator.inertial import ekf, find
+from share.estimator.inertial.beginning import first_state, state_by_camera
 from share.estimator.inertial.features import Looks
-from share.estimator.inertial.memory import Memory
-from share.estimator.inertial.state import State
-from share.estimator.visual import TrackResult
+from share.estimator.inertial.samples import Samples, coasting
+from share.estimator.inertial.scene import Scene
+from share.estimator.inertial.state import POSE, VELOCITY, State
+from share.estimator.localmap import LocalKeyframe, LocalMap
+from share.estimator.pose import consensus
+from share.estimator.result import TrackResult
 from share.geometry import se3
-from share.geometry.camera import ImuNoise, Rig
-from share.types import F64, U8, Candidate, Frame, ImuBatch, TrackState
+from share.geometry.camera import ImuNoise, Rig, rays
+from share.types import F64, U8, Candidate, Frame, TrackState
 from share.vision import corners
-from share.vision.depth import from_depth_camera, from_stereo
 from share.vision.view import make_view
+
+_READY_RAD, _READY_M_S = np.radians(3.0), 0.3  # sigmas of tilt and velocity: a pose is worth telling
+_FAR_OFF_PX = 1.0  # median residual, from which derivatives are taken anew
+_MINORITY, _MAJORITY = 0.3, 0.7  # of the features found: believed after the IMU; agreeing against it
+_PATIENCE = 10  # frames without a sample of the IMU, after which we begin without
+_LEVEL_RAD = np.radians(3.0)  # sigma of tilt up to which others are told what is up
 
 
 class InertialTracker:
     """Feed frames in order to `track`. Deterministic: the same frames give the same poses."""
 
-    def __init__(self, rig: Rig, config: InertialConfig) -> None:
-        assert rig.imu is not None
+    def __init__(self, rig: Rig, config: InertialConfig, places: TrackerConfig, seed: int = 0) -> None:
+        if rig.imu is None:
+            raise ValueError("without an IMU there is VisualTracker")
+        if rig.cam1 is None and rig.depth is None:
+            raise ValueError("a camera alone gives no scale: stereo or depth is needed")
         self._rig, self._config = rig, config
-        n, k = rig.imu, config.imu_noise
-        self._noise = ImuNoise(
-            n.gyro_density * k, n.accel_density * k, n.gyro_walk * k, n.accel_walk * k, n.rate_hz
-        )
-        self._imu = ImuBatch.empty()
-        self._state: State | None = None
-        self._looks: Looks = features.none()
-        self._memory = Memory()
+        self._noise = _louder(rig.imu, config.imu_noise)
+        self._coasting = ImuNoise(config.turning_noise, config.moving_noise, 0.0, 0.0, rig.imu.rate_hz)
+        self._common = np.diag(np.repeat([config.common_rad**2, config.common_m**2], 3))
+        self._samples = Samples()
+        self._scene: Scene | None = None
         self._image: U8 | None = None
+        self._stamp_ns = 0
         self._rate = np.zeros(3)
-        self._next_feature = self._next_keyframe = 0
+        self._saturated = False
+        self._waited = 0  # frames, for the IMU
+        self._ready = False
+        self._new_stretch = False  # the next keyframe begins one
         self._keyframe_ns = 0
         self._T_keyframe = np.eye(4)
+        self._places = LocalMap(places.max_keyframes)  # where to look for oneself when LOST
+        self._places_config, self._seed, self._places_tried = places, seed, 0
+        self._lost_ns: int | None = None
 
     @property
     def state(self) -> State | None:
         """The filter's; for those who look into it."""
-        return self._state
+        return self._scene.state if self._scene else None
+
+    @property
+    def looks(self) -> Looks | None:
+        """Of the state's features."""
+        return self._scene.looks if self._scene else None
 
     def track(self, frame: Frame) -> TrackResult:
         """The pose of this frame, causal. Frames must come with rising stamps."""
-        self._remember(frame.imu)
-        result = self._start(frame) if self._state is None else self._follow(frame, self._state)
-        self._image = frame.image0
+        self._samples.add(frame.imu)
+        result = self._begin(frame) if self._scene is None else self._follow(frame, self._scene)
+        self._image, self._stamp_ns = frame.image0, frame.stamp_ns
         return result
 
     def keyframe(self, frame: Frame) -> Candidate:
         """Make the frame just tracked a keyframe; call it where `track` said so. What it shows to others."""
-        s = self._state
-        assert s is not None
-        new_stretch = self._next_keyframe == 0
-        host = ekf.add_keyframe(s, self._next_keyframe, self._rate)
-        self._next_keyframe += 1
-        self._wake(frame, s)
-        self._add_features(frame, s, host)
-        self._forget(s)
-        self._keyframe_ns, self._T_keyframe = frame.stamp_ns, s.T.copy()
+        scene = self._scene
+        assert scene is not None
+        if frame.stamp_ns != self._keyframe_ns:
+            self._anchor(frame, scene)
+        new_stretch, self._new_stretch = self._new_stretch, False
         view = make_view(frame, self._rig, self._config.view_features)
-        return Candidate(s.T, ekf.pose_cov(s), s.T[2, :3], view, new_stretch)
+        s = scene.state
+        self._places.add_keyframe(frame.image0, s.T @ s.T_body_cam)
+        self._places.set_view(view)
+        up = s.T[2, :3] if self._tilt(s) < _LEVEL_RAD else np.zeros(3)
+        return Candidate(s.T, ekf.pose_cov(s), up, view, new_stretch)
 
     # ------------------------------------------------------------------ the usual frame
 
-    def _follow(self, frame: Frame, s: State) -> TrackResult:
-        self._rate = ekf.propagate(
-            s, self._samples(s, frame), self._imu_time(s, frame), self._noise, self._config.gravity
-        )
-        left = find.seek(frame.image0, self._rig.cam0, s, self._looks, self._config)
-        if self._image is not None:
-            find.rescue(self._image, frame.image0, self._rig.cam0, s, self._looks, left, self._config)
-        seen = self._update(frame, s, left)
-        self._looks.px[left.found] = left.px[left.found]
-        self._looks.age[seen] += 1
-        features.learn_slant(self._looks, np.flatnonzero(seen), left.error[seen], left.along[seen])
-        self._memory.sleep(s, self._looks, np.flatnonzero(~left.found))
-        self._keep(s, seen)
+    def _follow(self, frame: Frame, scene: Scene) -> TrackResult:
+        before, means, cov, stamp_ns = scene.state.T, *scene.state.snapshot()
+        heard = self._propagate(frame, scene.state)
+        left, seen = self._look(frame, scene)
+        if heard and self._contradicted(scene, left, seen):
+            scene.state.restore(means)
+            scene.state.cov, scene.state.stamp_ns = cov, stamp_ns
+            heard = self._propagate(frame, scene.state, deaf=True)
+            left, seen = self._look(frame, scene)
+        scene.seen(left, seen)
+        if not heard:
+            self._rate = _mean_rate(before, scene.state.T, frame.stamp_ns - self._stamp_ns)
         count = int(seen.sum())
-        state = TrackState.OK if count >= self._config.weak else TrackState.WEAK
-        if count < self._config.blind:
-            state = TrackState.INERTIAL_ONLY
-        return TrackResult(state, self._pose(s), self._wants_keyframe(frame, s, count), count)
+        state = self._judge(scene.state, count, heard)
+        if not self._trusted(scene.state):
+            return self._lose(frame)
+        if state is TrackState.LOST:
+            return TrackResult(state, None)
+        wanted = self._wants_keyframe(frame, scene, count)
+        if state is TrackState.INITIALISING:
+            if wanted:
+                self._anchor(frame, scene)
+            return TrackResult(state, None)
+        return self._told(scene.state, state, wanted, count)
 
-    def _update(self, frame: Frame, s: State, left: find.Sought) -> NDArray[np.bool_]:
+    def _told(self, s: State, state: TrackState, wanted: bool, count: int) -> TrackResult:
+        first, self._ready = not self._ready, True
+        new_stretch = first and self._new_stretch
+        return TrackResult(state, self._pose(s), wanted or first, count, new_stretch, ekf.pose_cov(s))
+
+    def _look(self, frame: Frame, scene: Scene) -> tuple[find.Sought, NDArray[np.bool_]]:
+        """Where cam0 shows the features, and which (N,) were seen and believed."""
+        s, looks = scene.state, scene.looks
+        left = find.seek(frame.image0, self._rig.cam0, s, looks, self._config)
+        if self._image is not None:
+            find.rescue(self._image, frame.image0, self._rig.cam0, s, looks, left, self._config)
+        return left, self._update(frame, scene, left)
+
+    def _contradicted(self, scene: Scene, left: find.Sought, seen: NDArray[np.bool_]) -> bool:
+        """Whether nearly all that is found agrees among itself and not with the IMU, which is saturated."""
+        which = np.flatnonzero(left.found)
+        if not self._saturated or len(which) < self._config.weak or seen.sum() > _MINORITY * len(which):
+            return False
+        s = scene.state
+        T_odom_host = s.poses[s.host[which]] @ s.T_body_cam
+        in_host = rays(s.ray[which]) / np.maximum(s.rho[which, None], 1e-3)
+        points = (T_odom_host[:, :3, :3] @ in_host[:, :, None])[:, :, 0] + T_odom_host[:, :3, 3]
+        uv = self._rig.cam0.normalise(left.px[which].astype(np.float64))
+        agree = consensus(points, uv, self._rig.cam0.focal, self._places_config.ransac_px, self._seed)
+        return agree is not None and bool(agree.inliers.mean() > _MAJORITY)
+
+    def _propagate(self, frame: Frame, s: State, deaf: bool = False) -> bool:
+        """To when the image was taken. Whether the IMU was heard."""
+        to_ns = frame.stamp_ns + round(s.offset_s * 1e9)
+        if to_ns <= s.stamp_ns:
+            return True
+        imu = self._samples.between(s.stamp_ns, to_ns, round(self._config.silent_s * 1e9))
+        self._saturated = imu is not None and self._samples.saturated(imu)
+        if imu is not None and not deaf:
+            self._rate = ekf.propagate(s, imu, to_ns, self._noise, self._config.gravity)
+            return True
+        imu = coasting(s, self._rate, to_ns, self._config.gravity)
+        ekf.propagate(s, imu, to_ns, self._coasting, self._config.gravity)
+        return False
+
+    def _update(self, frame: Frame, scene: Scene, left: find.Sought) -> NDArray[np.bool_]:
         """Which features (N,) were seen and believed."""
-        sights = [self._sight(s, left, None)]
+        s, config = scene.state, self._config
+        sought: list[tuple[find.Sought, F64 | None]] = [(left, None)]
         if frame.image1 is not None and self._rig.cam1 is not None:
             T = self._rig.T_cam1_cam0
-            right = find.seek(frame.image1, self._rig.cam1, s, self._looks, self._config, T)
-            right.found[~left.found] = False
-            sights.append(self._sight(s, right, T))
-        rows = ekf.join(*sights)
-        rows = rows.take(np.argsort(rows.host, kind="stable"))
+            right = find.seek(frame.image1, self._rig.cam1, s, scene.looks, config, T, left=left)
+            sought.append((right, T))
+
+        def rows_now() -> ekf.Sight:
+            rows = ekf.join(*(scene.sight(image, self._rate, T) for image, T in sought))
+            return rows.take(np.argsort(rows.host, kind="stable"))
+
         seen = np.zeros(len(s.ids), bool)
+        rows = rows_now()
         if len(rows.which) == 0:
             return seen
-        PHt, S = ekf.gains(s, rows)
-        good = ekf.surprise(rows, S) < self._config.gate
-        bad = np.zeros(len(s.ids), bool)
-        bad[rows.which[~good]] = True  # one camera's doubt is enough
-        good &= ~bad[rows.which]
-        twice = np.repeat(good, 2)
+        if np.median(np.abs(rows.residual)) * self._rig.cam0.focal > _FAR_OFF_PX:
+            rows = ekf.relinearised(s, rows_now, self._common)
+        PHt, S = ekf.gains(s, rows, self._common)
+        doubted = rows.which[ekf.surprise(rows, S) >= config.gate]
+        good = ~np.isin(rows.which, doubted)  # one camera's doubt is enough
         if good.any():
+            twice = np.repeat(good, 2)
             ekf.update(s, rows.take(good), PHt[:, twice], S[np.ix_(twice, twice)])
         seen[rows.which[good]] = True
         return seen
 
-    def _sight(self, s: State, sought: find.Sought, T_right_left: F64 | None) -> ekf.Sight:
-        camera = self._rig.cam0 if T_right_left is None else self._rig.cam1
-        assert camera is not None
-        which = np.flatnonzero(sought.found)
-        uv = camera.normalise(sought.px[which].astype(np.float64))
-        sigma = np.full(len(which), self._config.sigma_px / camera.focal)
-        return ekf.sight(s, which, uv, sigma, self._rate, T_right_left)
+    def _judge(self, s: State, count: int, heard: bool) -> TrackState:
+        config = self._config
+        if heard and not self._ready and not self._converged(s):
+            return TrackState.INITIALISING
+        if count < config.blind:
+            return TrackState.INERTIAL_ONLY if heard else TrackState.LOST
+        if not heard:
+            return TrackState.VISION_ONLY
+        return TrackState.OK if count >= config.weak else TrackState.WEAK
+
+    def _trusted(self, s: State) -> bool:
+        """Finite, no faster than a person or robot can be, and not gone too far unseen."""
+        finite = np.isfinite(s.T).all() and np.isfinite(s.v).all() and np.isfinite(s.cov).all()
+        return bool(
+            finite
+            and np.linalg.norm(s.v) < self._config.max_speed_m_s
+            and self._drift_m(s) < self._config.lost_m
+        )
+
+    def _converged(self, s: State) -> bool:
+        fast = np.sqrt(np.trace(s.cov[VELOCITY, VELOCITY]))
+        return bool(self._tilt(s) < _READY_RAD and fast < _READY_M_S)
+
+    def _tilt(self, s: State) -> float:
+        """Sigma, rad."""
+        return float(np.sqrt(s.cov[0, 0] + s.cov[1, 1]))
+
+    def _drift_m(self, s: State) -> float:
+        """Sigma of the position against the newest keyframe's."""
+        k = s.keyframe(len(s.keyframes) - 1)
+        P = s.cov
+        D = P[POSE, POSE] + P[k, k] - P[POSE, k] - P[k, POSE]
+        H = np.hstack([-se3.hat(s.T[:3, 3]), np.eye(3)])
+        return float(np.sqrt(max(np.trace(H @ D @ H.T), 0.0)))
 
     def _pose(self, s: State) -> F64:
         """At the frame's stamp, IMU time: the state is where the image was taken."""
         return se3.exp(-ekf.twist(s, self._rate) * s.offset_s) @ s.T
 
-    def _wants_keyframe(self, frame: Frame, s: State, count: int) -> bool:
+    # ------------------------------------------------------------------ keyframes
+
+    def _wants_keyframe(self, frame: Frame, scene: Scene, count: int) -> bool:
         config = self._config
         if frame.stamp_ns - self._keyframe_ns < config.keyframe_gap_s * 1e9:
             return False
-        motion = se3.log(se3.inverse(self._T_keyframe) @ s.T)
+        if count < config.blind and corners.count(frame.image0) < config.weak:
+            return False  # the dark, or a wall
+        motion = se3.log(se3.inverse(self._T_keyframe) @ scene.state.T)
         return bool(
             np.linalg.norm(motion[3:]) > config.keyframe_m
             or np.linalg.norm(motion[:3]) > config.keyframe_rad
             or count < config.keyframe_seen * config.features
         )
 
-    # ------------------------------------------------------------------ what comes and goes
+    def _anchor(self, frame: Frame, scene: Scene) -> None:
+        scene.add_keyframe(frame, self._rate)
+        self._keyframe_ns, self._T_keyframe = frame.stamp_ns, scene.state.T.copy()
 
-    def _add_features(self, frame: Frame, s: State, host: int) -> None:
-        config, camera = self._config, self._rig.cam0
-        px = corners.detect(frame.image0, self._looks.px, config.features - len(s.ids), config.spacing_px)
-        ray = camera.normalise(px.astype(np.float64))
-        rho, sigma = self._inverse_depth(frame, px, ray)
-        known = ~np.isnan(rho)
-        px, ray, rho, sigma = px[known], ray[known], rho[known], sigma[known]
-        ids = np.arange(self._next_feature, self._next_feature + len(px))
-        self._next_feature += len(px)
-        ekf.add_features(s, ids, host, ray, rho, sigma)
-        self._looks = self._looks.join(features.looks(frame.image0, camera, px, ray, rho))
+    # ------------------------------------------------------------------ beginnings and losses
 
-    def _inverse_depth(self, frame: Frame, px: NDArray[np.float32], ray: F64) -> tuple[F64, F64]:
-        """1/m (N,), NaN unknown, and sigma."""
-        if frame.image1 is not None and self._rig.cam1 is not None:
-            z = from_stereo(frame.image0, frame.image1, self._rig, px, ray)
-            sigma = self._config.sigma_px / self._rig.cam0.focal / self._rig.baseline
-        else:
-            assert frame.depth is not None
-            z = from_depth_camera(frame.depth, self._rig, ray)
-            sigma = 0.3 / (self._rig.cam0.focal * 0.05)
-        return 1 / z, np.full(len(z), sigma)
-
-    def _keep(self, s: State, keep: NDArray[np.bool_]) -> None:
-        ekf.keep_features(s, keep)
-        self._looks = self._looks.take(keep)
-
-    def _wake(self, frame: Frame, s: State) -> None:
-        """Features seen from about here before, where they lie as near as the filter knows."""
-        config = self._config
-        asked = 0
-        for k, asleep in self._memory.near(s, config.recall_m, config.recall_rad):
-            if asked >= config.recall:
-                break
-            before = len(s.ids)
-            asked += len(asleep.ids)
-            ekf.add_features(s, asleep.ids, k, asleep.ray, asleep.rho, asleep.sigma)
-            self._looks = self._looks.join(asleep.looks)
-            sought = find.seek(frame.image0, self._rig.cam0, s, self._looks, config, fresh=before)
-            rows = self._sight(s, sought, None)
-            good = np.ones(len(s.ids), bool)
-            good[before:] = False
-            if len(rows.which):
-                _, S = ekf.gains(s, rows)
-                good[rows.which[ekf.surprise(rows, S) < config.gate]] = True
-            self._memory.wake(int(s.keyframes[k]), s.ids[good & (np.arange(len(good)) >= before)])
-            self._looks.px[sought.found] = sought.px[sought.found]
-            self._keep(s, good)
-
-    def _forget(self, s: State) -> None:
-        """Keyframes whose features are all gone, and, where there are too many, the most redundant ones."""
-        busy = np.isin(np.arange(len(s.keyframes)), s.host)
-        remembered = np.array([self._memory.has(int(k)) for k in s.keyframes], bool)
-        leave = ~busy & ~remembered
-        leave[-1] = False
-        while len(s.keyframes) - leave.sum() > self._config.max_keyframes:
-            left = np.flatnonzero(~leave)
-            apart = se3.log(se3.inverse(s.poses[left, None]) @ s.poses[None, left])
-            cost = np.linalg.norm(apart[..., 3:], axis=-1) + np.linalg.norm(apart[..., :3], axis=-1)
-            cost[np.diag_indices(len(left))] = np.inf
-            nearest = cost.min(axis=1) + 100.0 * busy[left]
-            nearest[-1] = np.inf
-            leave[left[np.argmin(nearest)]] = True
-        self._memory.forget(s.keyframes[leave])
-        self._drop_keyframes(s, leave)
-
-    def _drop_keyframes(self, s: State, leave: NDArray[np.bool_]) -> None:
-        self._looks = self._looks.take(~leave[s.host])
-        ekf.drop_keyframes(s, s.keyframes[leave])
-
-    # ------------------------------------------------------------------ time
-
-    def _remember(self, imu: ImuBatch) -> None:
-        old, keep = self._imu, slice(-400, None)
-        self._imu = ImuBatch(
-            np.concatenate([old.stamps_ns[keep], imu.stamps_ns]),
-            np.concatenate([old.gyro[keep], imu.gyro]),
-            np.concatenate([old.accel[keep], imu.accel]),
-        )
-
-    def _imu_time(self, s: State, frame: Frame) -> int:
-        return frame.stamp_ns + round(s.offset_s * 1e9)
-
-    def _samples(self, s: State, frame: Frame) -> ImuBatch:
-        stamps = self._imu.stamps_ns
-        first = max(int(np.searchsorted(stamps, s.stamp_ns, side="right")) - 1, 0)
-        last = int(np.searchsorted(stamps, self._imu_time(s, frame))) + 1
-        return ImuBatch(stamps[first:last], self._imu.gyro[first:last], self._imu.accel[first:last])
-
-    # ------------------------------------------------------------------ beginnings
-
-    def _start(self, frame: Frame) -> TrackResult:
-        self._state = first_state(frame.stamp_ns, self._imu, self._rig, self._config)
-        if self._state is None:
+    def _begin(self, frame: Frame) -> TrackResult:
+        """At odom's origin, z up. After a loss, where the map says; at last anew."""
+        found = self._find_place(frame)
+        waiting = TrackState.INITIALISING if self._lost_ns is None else TrackState.LOST
+        lost_ns = 0 if self._lost_ns is None else frame.stamp_ns - self._lost_ns
+        if found is None and 0 < lost_ns < self._places_config.new_stretch_s * 1e9:
+            return TrackResult(waiting, None)
+        state = first_state(frame.stamp_ns, self._samples.all, self._rig, self._config)
+        self._waited += state is None
+        if state is None and self._waited >= _PATIENCE:
+            state = state_by_camera(frame.stamp_ns, self._rig, self._config)
+        if state is None:
+            return TrackResult(waiting, None)
+        if found is not None:
+            state.T = found @ se3.inverse(self._rig.T_body_cam0)
+        scene = Scene(state, self._rig, self._config)
+        self._rate = self._samples.all.gyro[-1] - state.bg if len(self._samples.all) else np.zeros(3)
+        self._anchor(frame, scene)
+        if len(state.ids) < self._config.weak:
+            return TrackResult(waiting, None)
+        self._scene, self._ready = scene, False
+        self._new_stretch = found is None
+        if found is None:
+            self._places = LocalMap(self._places_config.max_keyframes)
+        self._lost_ns = None
+        if not self._converged(state):
             return TrackResult(TrackState.INITIALISING, None)
-        self._rate = self._imu.gyro[-1] - self._state.bg
-        return TrackResult(TrackState.OK, self._pose(self._state), True, 0, True)
+        return self._told(state, TrackState.OK, True, len(state.ids))
+
+    def _lose(self, frame: Frame) -> TrackResult:
+        """What is left of the filter is worth nothing."""
+        self._scene, self._ready, self._lost_ns = None, False, frame.stamp_ns
+        return TrackResult(TrackState.LOST, None)
+
+    def _find_place(self, frame: Frame) -> F64 | None:
+        """T_odom_cam (4, 4) of a LOST frame by its ORB features."""
+        if self._lost_ns is None or not self._places.keyframes:
+            return None
+        numbers = sorted(self._places.keyframes, reverse=True)
+        count = self._places_config.relocalise_hosts
+        first = self._places_tried * count % len(numbers)
+        self._places_tried += 1
+        chosen: list[LocalKeyframe] = [self._places.keyframes[n] for n in numbers[first : first + count]]
+        return relocalise.find(chosen, frame, self._rig, self._places_config, self._seed)
+
+
+def _mean_rate(before: F64, after: F64, dt_ns: int) -> F64:
+    """rad/s (3,), in the body."""
+    out: F64 = se3.so3_log(before[:3, :3].T @ after[:3, :3]) / max(dt_ns * 1e-9, 1e-3)
+    return out
+
+
+def _louder(imu: ImuNoise, times: float) -> ImuNoise:
+    return ImuNoise(
+        imu.gyro_density * times,
+        imu.accel_density * times,
+        imu.gyro_walk * times,
+        imu.accel_walk * times,
+        imu.rate_hz,
+    )

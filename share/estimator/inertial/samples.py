@@ -1,0 +1,54 @@
+"""The IMU's last samples, and what stands in for them where it says nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from share.estimator.inertial.state import State
+from share.geometry import se3
+from share.types import F64, ImuBatch
+
+_KEPT = 600
+_REPEATED = 4  # samples at the end of the scale
+
+
+class Samples:
+    """In order of time, the last few seconds."""
+
+    def __init__(self) -> None:
+        self.all = ImuBatch.empty()
+        self._most = np.zeros(6)  # of each axis, ever
+
+    def add(self, imu: ImuBatch) -> None:
+        """Samples that are not later than what is there are left out."""
+        old = self.all
+        self._most = np.abs(np.hstack([imu.gyro, imu.accel])).max(axis=0, initial=0.0).clip(self._most)
+        start = int(np.searchsorted(imu.stamps_ns, old.stamps_ns[-1], side="right")) if len(old) else 0
+        self.all = ImuBatch(
+            np.concatenate([old.stamps_ns[-_KEPT:], imu.stamps_ns[start:]]),
+            np.concatenate([old.gyro[-_KEPT:], imu.gyro[start:]]),
+            np.concatenate([old.accel[-_KEPT:], imu.accel[start:]]),
+        )
+
+    def between(self, from_ns: int, to_ns: int, silent_ns: int) -> ImuBatch | None:
+        """Those inside and one beyond each end, where there is one; None where it says nothing for longer
+        than `silent_ns`."""
+        stamps = self.all.stamps_ns
+        first = max(int(np.searchsorted(stamps, from_ns, side="right")) - 1, 0)
+        last = int(np.searchsorted(stamps, to_ns)) + 1
+        part = stamps[first:last]
+        if len(part) == 0 or np.diff(np.r_[part, max(to_ns, int(part[-1]))]).max() > silent_ns:
+            return None
+        return ImuBatch(part, self.all.gyro[first:last], self.all.accel[first:last])
+
+    def saturated(self, imu: ImuBatch) -> bool:
+        """Whether an axis shows the most that it ever has several times: noise does not repeat itself."""
+        return bool((np.abs(np.hstack([imu.gyro, imu.accel])) == self._most).sum(axis=0).max() >= _REPEATED)
+
+
+def coasting(state: State, rate: F64, to_ns: int, gravity: float) -> ImuBatch:
+    """What an IMU would measure of a body that goes on as it does: rate (3,) rad/s, velocity unchanged."""
+    half = se3.so3_exp(rate * (to_ns - state.stamp_ns) * 0.5e-9)
+    force = (state.T[:3, :3] @ half).T @ np.array([0.0, 0.0, gravity])
+    stamps = np.array([state.stamp_ns, to_ns])
+    return ImuBatch(stamps, np.tile(rate + state.bg, (2, 1)), np.tile(force + state.ba, (2, 1)))

@@ -1,0 +1,144 @@
+"""The filter's state with what its features look like: what is added, forgotten, remembered, woken."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from share.config import InertialConfig
+from share.estimator.inertial import ekf, features, find
+from share.estimator.inertial.features import Looks
+from share.estimator.inertial.find import Sought
+from share.estimator.inertial.memory import Memory
+from share.estimator.inertial.state import State
+from share.geometry import se3
+from share.geometry.camera import Rig
+from share.types import F32, F64, Frame
+from share.vision import corners
+from share.vision.depth import from_depth_camera, from_stereo
+
+_DEPTH_SIGMA_PX, _DEPTH_BASELINE = 0.3, 0.05  # of the stereo pair inside a depth camera, m
+_NOISE = 3.0  # gray levels of an image
+_SHARPEST_PX = 0.5  # error by noise alone, beyond which a patch is no feature
+_SHUN_FRAMES = 30  # for which nothing new is sought where something moved by itself
+_FAR = 100.0  # redundancy that features in view are worth
+
+
+class Scene:
+    """Keyframes, features and their looks, always in step with `state`."""
+
+    def __init__(self, state: State, rig: Rig, config: InertialConfig) -> None:
+        self.state, self._rig, self._config = state, rig, config
+        self.looks: Looks = features.none()
+        self._memory = Memory()
+        self._shunned: list[F32] = []
+        self._next_feature = self._next_keyframe = 0
+
+    def add_keyframe(self, frame: Frame, rate: F64) -> int:
+        """The frame just tracked: its pose, features seen from about here before, and new ones. Its id."""
+        s, keyframe = self.state, self._next_keyframe
+        self._next_keyframe += 1
+        host = ekf.add_keyframe(s, keyframe, rate)
+        self._wake(frame, rate)
+        self._add_features(frame, host)
+        self._forget()
+        return keyframe
+
+    def seen(self, left: Sought, seen: NDArray[np.bool_]) -> None:
+        """Which features (N,) a frame showed. The others are gone, or asleep where they were not found."""
+        self.looks.px[left.found] = left.px[left.found]
+        self.looks.age[seen] += 1
+        which = np.flatnonzero(seen)
+        away = which[features.runaways(self.looks, which, left.px[which] - left.expected[which])]
+        seen[away] = False
+        self._shun(left.px[away])
+        features.learn_slant(self.looks, np.flatnonzero(seen), left.error[seen], left.along[seen])
+        self._memory.sleep(self.state, self.looks, np.flatnonzero(~left.found))
+        self._keep(seen)
+
+    def _shun(self, px: F32) -> None:
+        """No new feature near px (N, 2) for a while: there goes somebody."""
+        self._shunned = [*self._shunned[-_SHUN_FRAMES:], px]
+
+    def sight(self, sought: Sought, rate: F64, T_right_left: F64 | None = None) -> ekf.Sight:
+        """Rows for the filter of the features that were found in cam0, or with T_right_left in cam1."""
+        camera = self._rig.cam0 if T_right_left is None else self._rig.cam1
+        assert camera is not None
+        which = np.flatnonzero(sought.found)
+        uv = camera.normalise(sought.px[which].astype(np.float64))
+        sigma = np.full(len(which), self._config.sigma_px / camera.focal)
+        return ekf.sight(self.state, which, uv, sigma, rate, T_right_left)
+
+    def _add_features(self, frame: Frame, host: int) -> None:
+        config, camera, s = self._config, self._rig.cam0, self.state
+        taken = np.concatenate([self.looks.px, *self._shunned])
+        px = corners.detect(frame.image0, taken, config.features - len(s.ids), config.spacing_px)
+        ray = camera.normalise(px.astype(np.float64))
+        rho, sigma = self._inverse_depth(frame, px, ray)
+        looks = features.looks(frame.image0, camera, px, ray, np.nan_to_num(rho))
+        good = ~np.isnan(rho) & (_NOISE * looks.patch.sigma_px < _SHARPEST_PX)
+        ids = np.arange(self._next_feature, self._next_feature + int(good.sum()))
+        self._next_feature += len(ids)
+        ekf.add_features(s, ids, host, ray[good], rho[good], sigma[good])
+        self.looks = self.looks.join(looks.take(good))
+
+    def _inverse_depth(self, frame: Frame, px: F32, ray: F64) -> tuple[F64, F64]:
+        """1/m (N,), NaN unknown, and sigma (N,)."""
+        focal = self._rig.cam0.focal
+        if frame.image1 is not None and self._rig.cam1 is not None:
+            z = from_stereo(frame.image0, frame.image1, self._rig, px, ray)
+            sigma = self._config.sigma_px / focal / self._rig.baseline
+        elif frame.depth is not None:
+            z = from_depth_camera(frame.depth, self._rig, ray)
+            sigma = _DEPTH_SIGMA_PX / focal / _DEPTH_BASELINE
+        else:
+            z, sigma = np.full(len(px), np.nan), 1.0
+        return 1 / z, np.full(len(z), sigma)
+
+    def _wake(self, frame: Frame, rate: F64) -> None:
+        """Features seen from about here before, where they lie as near as the filter knows."""
+        asked = 0
+        for k, asleep in self._memory.near(self.state, self._config.recall_m, self._config.recall_rad):
+            if asked >= self._config.recall:
+                return
+            asked += len(asleep.ids)
+            before = len(self.state.ids)
+            ekf.add_features(self.state, asleep.ids, k, asleep.ray, asleep.rho, asleep.sigma)
+            self.looks = self.looks.join(asleep.looks)
+            good = self._recognised(frame, rate, before)
+            self._memory.wake(int(self.state.keyframes[k]), self.state.ids[good][before:])
+            self._keep(good)
+
+    def _recognised(self, frame: Frame, rate: F64, fresh: int) -> NDArray[np.bool_]:
+        """Of features from number `fresh` on, those that are found where they should be; all others."""
+        sought = find.seek(frame.image0, self._rig.cam0, self.state, self.looks, self._config, fresh=fresh)
+        self.looks.px[sought.found] = sought.px[sought.found]
+        rows = self.sight(sought, rate)
+        good = np.arange(len(self.state.ids)) < fresh
+        if len(rows.which):
+            _, S = ekf.gains(self.state, rows)
+            good[rows.which[ekf.surprise(rows, S) < self._config.gate]] = True
+        return good
+
+    def _keep(self, keep: NDArray[np.bool_]) -> None:
+        ekf.keep_features(self.state, keep)
+        self.looks = self.looks.take(keep)
+
+    def _forget(self) -> None:
+        """Keyframes whose features are all gone, and, where there are too many, the most redundant ones.
+        Never the newest."""
+        s = self.state
+        busy = np.isin(np.arange(len(s.keyframes)), s.host)
+        leave = ~busy & ~np.array([self._memory.has(int(k)) for k in s.keyframes], bool)
+        leave[-1] = False
+        while len(s.keyframes) - leave.sum() > self._config.max_keyframes:
+            left = np.flatnonzero(~leave)
+            apart = se3.log(se3.inverse(s.poses[left, None]) @ s.poses[None, left])
+            cost = np.linalg.norm(apart[..., 3:], axis=-1) + np.linalg.norm(apart[..., :3], axis=-1)
+            cost[np.diag_indices(len(left))] = np.inf
+            nearest = cost.min(axis=1) + _FAR * busy[left]
+            nearest[-1] = np.inf
+            leave[left[np.argmin(nearest)]] = True
+        self._memory.forget(s.keyframes[leave])
+        self.looks = self.looks.take(~leave[s.host])
+        ekf.drop_keyframes(s, s.keyframes[leave])
