@@ -56,9 +56,10 @@ def propagate(state: State, imu: ImuBatch, to_ns: int, noise: ImuNoise, gravity:
     samples."""
     motion = integrate(state.T, state.v, state.bg, state.ba, imu, state.stamp_ns, to_ns, noise, gravity)
     F, P = motion.transition, state.cov
-    P[:_MOVING] = F @ P[:_MOVING]
-    P[:, :_MOVING] = P[:, :_MOVING] @ F.T
-    P[:_MOVING, :_MOVING] += motion.noise
+    own = F @ P[:_MOVING, :_MOVING] @ F.T + motion.noise
+    P[:_MOVING, :_MOVING] = (own + own.T) / 2
+    P[:_MOVING, _MOVING:] = F @ P[:_MOVING, _MOVING:]
+    P[_MOVING:, :_MOVING] = P[:_MOVING, _MOVING:].T
     state.T, state.v, state.stamp_ns = motion.T, motion.v, to_ns
     return motion.rate
 
@@ -167,9 +168,7 @@ def update(state: State, rows: Sight, PHt: F64, S: F64) -> float:
 def apply(state: State, residual: F64, PHt: F64, S: F64) -> float:
     """residual (m,), cov H' (n, m), its covariance S (m, m)."""
     error, W, white = _gain(PHt, S, residual)
-    state.cov -= W.T @ W
-    state.cov += state.cov.T
-    state.cov *= 0.5
+    state.cov -= W.T @ W  # numpy makes this one symmetric to the last bit
     move(state, error)
     return float(white @ white)
 

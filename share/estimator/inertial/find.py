@@ -16,6 +16,7 @@ from share.types import F32, F64, I64, U8
 from share.vision import klt, patches
 
 _BORDER_PX = 6.0
+_YOUNG = 10  # frames
 _AGREE_PX = 1.5  # how far the way by the image before may be from what the first patch says
 _TINY = 1e-12 * np.eye(2)
 
@@ -50,9 +51,16 @@ def seek(
     out = Sought(np.nan_to_num(where, nan=-1e6).astype(np.float32), np.zeros(n, bool), where, nowhere, along)
     start = where if left is None else where + (left.px - left.expected)
     inside = camera.inside(np.nan_to_num(start, nan=-1e6), _BORDER_PX) & (np.arange(n) >= fresh)
-    todo = np.flatnonzero(inside if left is None else inside & left.found)
+    todo = np.flatnonzero(inside if left is None else inside & left.found & _by_turns(looks))
     _settle(image, looks, todo, start[todo], warp[todo], config, config.reach_px, out)
     return out
+
+
+def _by_turns(looks: Looks) -> NDArray[np.bool_]:
+    """Which features (N,) a second camera is asked for: young ones always, for their depth, others in every
+    third frame."""
+    turn: NDArray[np.bool_] = (looks.age + np.arange(len(looks.age))) % 3 == 0
+    return turn | (looks.age < _YOUNG)
 
 
 def rescue(

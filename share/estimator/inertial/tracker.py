@@ -57,6 +57,7 @@ class InertialTracker:
         self._new_stretch = False  # the next keyframe begins one
         self._keyframe_ns = 0
         self._T_keyframe = np.eye(4)
+        self._keyframe_count = 0
         self._places = LocalMap(places.max_keyframes)  # where to look for oneself when LOST
         self._places_config, self._seed, self._places_tried = places, seed, 0
         self._lost_ns: int | None = None
@@ -181,7 +182,9 @@ class InertialTracker:
         PHt, S = ekf.gains(s, rows, self._common)
         doubted = rows.which[ekf.surprise(rows, S) >= config.gate]
         good = ~np.isin(rows.which, doubted)  # one camera's doubt is enough
-        if good.any():
+        if good.all():
+            ekf.update(s, rows, PHt, S)
+        elif good.any():
             twice = np.repeat(good, 2)
             ekf.update(s, rows.take(good), PHt[:, twice], S[np.ix_(twice, twice)])
         seen[rows.which[good]] = True
@@ -238,12 +241,13 @@ class InertialTracker:
         return bool(
             np.linalg.norm(motion[3:]) > config.keyframe_m
             or np.linalg.norm(motion[:3]) > config.keyframe_rad
-            or count < config.keyframe_seen * config.features
+            or count < config.keyframe_seen * self._keyframe_count
         )
 
     def _anchor(self, frame: Frame, scene: Scene) -> None:
         scene.add_keyframe(frame, self._rate)
-        self._keyframe_ns, self._T_keyframe = frame.stamp_ns, scene.state.T.copy()
+        self._keyframe_ns, self._T_keyframe = frame.stamp_ns, scene.state.T
+        self._keyframe_count = len(scene.state.ids)
 
     # ------------------------------------------------------------------ beginnings and losses
 

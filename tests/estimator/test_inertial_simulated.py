@@ -1,0 +1,67 @@
+"""The filter in a simulated world: as sure as it should be, and able to calibrate itself."""
+
+import numpy as np
+import pytest
+from imu_simulation import Setup, run
+
+BANDS = {6: (1.37, 5.04), 50: (2.36, 3.72)}  # of the mean of N chi-square values, 3 dof, 95 %
+
+
+def nees(seeds, setup):
+    """Mean over runs and the seconds from 1 on, of orientation and position."""
+    return np.mean([run(seed, setup).nees[20:].mean(axis=0) for seed in range(seeds)], axis=0)
+
+
+def test_it_is_as_sure_as_it_should_be():
+    low, high = BANDS[6]
+    orientation, position = nees(6, Setup(seconds=6.0))
+    assert low < orientation < high
+    assert low < position < high
+
+
+@pytest.mark.slow
+def test_it_is_as_sure_as_it_should_be_in_fifty_runs():
+    """At 2, 5, 10 and 20 s, not over time, for errors of one run last."""
+    runs = [run(seed) for seed in range(50)]
+    low, high = BANDS[50]
+    for k in (40, 100, 200, 398):
+        orientation, position = np.mean([r.nees[k] for r in runs], axis=0)
+        print(k / 20, orientation, position)
+        assert low < orientation < high
+        assert low < position < high
+
+
+def wrong(seed, sigma):
+    """3 degrees, 3 cm and 10 ms in some direction; sigma: times as much as that is what the filter expects."""
+    rng = np.random.default_rng(seed)
+    turn, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    error = np.concatenate([turn * np.radians(3), shift * 0.03])
+    each = sigma / np.sqrt(3)
+    return Setup(
+        seconds=30.0,
+        turn=np.radians(3) * each + 1e-6,
+        shift=0.03 * each + 1e-6,
+        offset=0.01 * sigma + 1e-7,
+        extrinsic_error=error,
+        offset_error=float(rng.choice([-0.01, 0.01])),
+    )
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 6))])
+def test_it_finds_where_its_camera_sits_and_when_it_looks(seed):
+    left = run(seed, wrong(seed, 1.0)).extrinsics[-1]
+    print(np.degrees(np.linalg.norm(left[:3])), 1e3 * np.linalg.norm(left[3:6]), 1e3 * left[6])
+    assert np.degrees(np.linalg.norm(left[:3])) < 0.2
+    assert np.linalg.norm(left[3:6]) < 0.005
+    assert abs(left[6]) < 0.0005
+
+
+@pytest.mark.slow
+def test_a_wrong_extrinsic_taken_for_true_breaks_the_bands():
+    assert nees(3, wrong(0, 0.0)).min() > 20
+
+
+def test_the_same_seed_gives_the_same_bits():
+    a, b = (run(3, Setup(seconds=1.0)) for _ in range(2))
+    assert a.state.cov.tobytes() == b.state.cov.tobytes()
+    assert a.pose_errors.tobytes() == b.pose_errors.tobytes()
