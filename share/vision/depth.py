@@ -12,6 +12,7 @@ from share.vision import klt
 
 EDGE = 0.05  # relative depth step within 3x3 px that marks an object's edge
 MIN_DEPTH, MAX_DEPTH = 0.2, 12.0  # m
+_FIRST = 3.0  # m, a guess
 
 
 def from_depth_camera(depth: F32, rig: Rig, uv: F64) -> F64:
@@ -78,8 +79,8 @@ def from_stereo(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, guess_m: F64
         return out
     ray = rays(uv)
     expected = np.full(len(px), np.nan) if guess_m is None else guess_m
-    for fallback in (3.0, 1.2):
-        todo = np.flatnonzero(np.isnan(out))
+    for fallback in (_FIRST, 1.2):  # a second try where nothing was expected
+        todo = np.flatnonzero(np.isnan(out) & (np.isnan(expected) | (fallback == _FIRST)))
         if len(todo) == 0:
             break
         z = np.where(np.isnan(expected[todo]), fallback, expected[todo])

@@ -10,22 +10,33 @@ from share.types import F32, F64, U8, Frame, View
 from share.vision import depth as depths
 
 
-def depth_at(frame: Frame, rig: Rig, px: F32, uv: F64) -> F64:
-    """Depth (N,) m in cam0 of image points, from whatever the frame carries; NaN where unknown."""
+def depth_at(frame: Frame, rig: Rig, px: F32, uv: F64, guess_m: F64 | None = None) -> F64:
+    """Depth (N,) m in cam0 of image points, from whatever the frame carries; NaN where unknown. guess_m (N,):
+    about how far they are, if that is known."""
     if frame.depth is not None and rig.depth is not None:
         return depths.from_depth_camera(frame.depth, rig, uv)
     if frame.image1 is not None and rig.cam1 is not None:
-        return depths.from_stereo(frame.image0, frame.image1, rig, px, uv)
+        return depths.from_stereo(frame.image0, frame.image1, rig, px, uv, guess_m)
     return np.full(len(px), np.nan)
 
 
-def make_view(frame: Frame, rig: Rig, count: int = 500) -> View:
-    """ORB features (Rublee et al. 2011) of cam0 with 3D points where the frame gives depth."""
+def make_view(frame: Frame, rig: Rig, count: int = 500, known: tuple[F32, F64] | None = None) -> View:
+    """ORB features (Rublee et al. 2011) of cam0 with 3D points where the frame gives depth. known: px (M, 2)
+    and depth (M,) m of points whose neighbours will not be much nearer or further."""
     px, descriptors = orb(frame.image0, count)
     uv = rig.cam0.normalise(px.astype(np.float64))
-    z = depth_at(frame, rig, px, uv)
+    z = depth_at(frame, rig, px, uv, None if known is None else _nearest(px, *known))
     points = rays(uv) * z[:, None]
     return View(uv.astype(np.float32), points.astype(np.float32), descriptors)
+
+
+def _nearest(px: F32, known_px: F32, known_m: F64) -> F64:
+    """Depth (N,) m of the known point next to each; NaN where there is none."""
+    if len(known_px) == 0:
+        return np.full(len(px), np.nan)
+    apart = (px**2).sum(axis=1)[:, None] - 2 * px @ known_px.T + (known_px**2).sum(axis=1)
+    out: F64 = known_m[apart.argmin(axis=1)]
+    return out
 
 
 def orb(image: U8, count: int, grid: tuple[int, int] = (8, 6)) -> tuple[F32, U8]:

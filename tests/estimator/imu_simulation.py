@@ -152,5 +152,6 @@ class _World:
             self._points[next_id + i] = p
         sigma = SIGMA_PX / CAMERA.fx / self._rig.baseline
         rho = np.maximum(1 / z + self._rng.normal(0, sigma, count), 0.02)
-        ekf.add_features(state, np.arange(next_id, next_id + count), host, uv, rho, np.full(count, sigma))
+        hosts = np.full(count, host)
+        ekf.add_features(state, np.arange(next_id, next_id + count), hosts, uv, rho, np.full(count, sigma))
         return next_id + count

@@ -35,7 +35,7 @@ def state():
         ekf.add_features(
             s,
             np.arange(5) + 5 * k,
-            k,
+            np.full(5, k),
             rng.uniform(-0.4, 0.4, (5, 2)),
             rng.uniform(0.2, 0.8, 5),
             np.full(5, 0.05),

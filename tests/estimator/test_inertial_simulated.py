@@ -32,7 +32,7 @@ def test_it_is_as_sure_as_it_should_be_in_fifty_runs():
 
 
 def wrong(seed, sigma):
-    """3 degrees, 3 cm and 10 ms in some direction; sigma: times as much as that is what the filter expects."""
+    """3 degrees, 3 cm and 10 ms in some direction; the filter expects `sigma` times as much."""
     rng = np.random.default_rng(seed)
     turn, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     error = np.concatenate([turn * np.radians(3), shift * 0.03])

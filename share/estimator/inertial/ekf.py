@@ -216,8 +216,8 @@ def add_keyframe(state: State, keyframe: int, rate: F64) -> int:
     return len(state.keyframes) - 1
 
 
-def add_features(state: State, ids: I64, host: int, ray: F64, rho: F64, sigma: F64) -> None:
-    """Features (N,) that keyframe number `host` sees on rays (N, 2), inverse depth rho with sigma (N,)."""
+def add_features(state: State, ids: I64, host: I64, ray: F64, rho: F64, sigma: F64) -> None:
+    """Features (N,) that keyframes number `host` (N,) see on rays (N, 2), inverse depths rho, sigma (N,)."""
     n, more = state.size, len(ids)
     grown = np.zeros((n + more, n + more))
     grown[:n, :n] = state.cov
@@ -225,7 +225,7 @@ def add_features(state: State, ids: I64, host: int, ray: F64, rho: F64, sigma: F
     grown[new, new] = sigma**2
     state.cov = grown
     state.ids = np.concatenate([state.ids, ids])
-    state.host = np.concatenate([state.host, np.full(more, host)])
+    state.host = np.concatenate([state.host, host])
     state.ray = np.concatenate([state.ray, ray])
     state.rho = np.concatenate([state.rho, rho])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,20 +19,29 @@ _MOST = 40  # of a keyframe
 
 @dataclass(frozen=True, eq=False)
 class Asleep:
-    """Features of one keyframe: ids (N,), rays (N, 2), inverse depths and sigmas (N,), looks."""
+    """Features: ids (N,), number of the host (N,), rays (N, 2), inverse depths and sigmas (N,), looks."""
 
     ids: I64
+    host: I64
     ray: F64
     rho: F64
     sigma: F64
     looks: Looks
 
     def take(self, keep: NDArray[np.bool_] | I64) -> Asleep:
-        return Asleep(self.ids[keep], self.ray[keep], self.rho[keep], self.sigma[keep], self.looks.take(keep))
+        return Asleep(
+            self.ids[keep],
+            self.host[keep],
+            self.ray[keep],
+            self.rho[keep],
+            self.sigma[keep],
+            self.looks.take(keep),
+        )
 
     def join(self, other: Asleep) -> Asleep:
         return Asleep(
             np.concatenate([self.ids, other.ids]),
+            np.concatenate([self.host, other.host]),
             np.concatenate([self.ray, other.ray]),
             np.concatenate([self.rho, other.rho]),
             np.concatenate([self.sigma, other.sigma]),
@@ -55,7 +64,14 @@ class Memory:
         for host in np.unique(state.host[which[known]]):
             mine = known & (state.host[which] == host)
             part = which[mine]
-            asleep = Asleep(state.ids[part], state.ray[part], state.rho[part], sigma[mine], looks.take(part))
+            asleep = Asleep(
+                state.ids[part],
+                state.host[part],
+                state.ray[part],
+                state.rho[part],
+                sigma[mine],
+                looks.take(part),
+            )
             key = int(state.keyframes[host])
             old = self._of.get(key)
             asleep = asleep if old is None else old.join(asleep)
@@ -69,19 +85,27 @@ class Memory:
         for keyframe in keyframes.tolist():
             self._of.pop(keyframe, None)
 
-    def near(self, state: State, max_m: float, max_rad: float) -> list[tuple[int, Asleep]]:
-        """(number in the state, its sleepers) of keyframes that look from about here, nearest first."""
+    def near(self, state: State, max_m: float, max_rad: float, most: int) -> Asleep | None:
+        """Those of the keyframes that look from about here, the nearest ones first until there are `most`;
+        their hosts are numbers in the state. None where there are none."""
         apart = se3.log(se3.inverse(state.poses) @ state.T)
         far, turned = np.linalg.norm(apart[:, 3:], axis=1), np.linalg.norm(apart[:, :3], axis=1)
-        order = np.argsort(far + turned, kind="stable")
-        here = [int(k) for k in order if far[k] < max_m and turned[k] < max_rad]
-        return [(k, self._of[int(state.keyframes[k])]) for k in here if self.has(int(state.keyframes[k]))]
+        out: Asleep | None = None
+        for k in np.argsort(far + turned, kind="stable").tolist():
+            mine = self._of.get(int(state.keyframes[k]))
+            if mine is None or far[k] >= max_m or turned[k] >= max_rad:
+                continue
+            mine = replace(mine, host=np.full(len(mine.ids), k))
+            out = mine if out is None else out.join(mine)
+            if len(out.ids) >= most:
+                break
+        return out
 
-    def wake(self, keyframe: int, ids: I64) -> None:
+    def wake(self, ids: I64) -> None:
         """These are features of the state again."""
-        left = self._of[keyframe]
-        keep = ~np.isin(left.ids, ids)
-        if keep.any():
-            self._of[keyframe] = left.take(keep)
-        else:
-            del self._of[keyframe]
+        for keyframe, asleep in list(self._of.items()):
+            keep = ~np.isin(asleep.ids, ids)
+            if not keep.any():
+                del self._of[keyframe]
+            elif not keep.all():
+                self._of[keyframe] = asleep.take(keep)

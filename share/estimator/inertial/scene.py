@@ -12,7 +12,7 @@ from share.estimator.inertial.find import Sought
 from share.estimator.inertial.memory import Memory
 from share.estimator.inertial.state import State
 from share.geometry import se3
-from share.geometry.camera import Rig
+from share.geometry.camera import Rig, rays
 from share.types import F32, F64, Frame
 from share.vision import corners
 from share.vision.depth import from_depth_camera, from_stereo
@@ -21,6 +21,8 @@ _DEPTH_SIGMA_PX, _DEPTH_BASELINE = 0.3, 0.05  # of the stereo pair inside a dept
 _NOISE = 3.0  # gray levels of an image
 _SHARPEST_PX = 0.5  # error by noise alone, beyond which a patch is no feature
 _SHUN_FRAMES = 30  # for which nothing new is sought where something moved by itself
+_SLANT_EVERY = 2  # frames in which a feature's slant is learnt
+_FARTHEST, _NEAREST_M = 0.03, 0.2  # 1/m; m
 _FAR = 100.0  # redundancy that features in view are worth
 
 
@@ -52,9 +54,18 @@ class Scene:
         away = which[features.runaways(self.looks, which, left.px[which] - left.expected[which])]
         seen[away] = False
         self._shun(left.px[away])
-        features.learn_slant(self.looks, np.flatnonzero(seen), left.error[seen], left.along[seen])
+        turn = np.flatnonzero(seen & ((self.looks.age + np.arange(len(seen))) % _SLANT_EVERY == 0))
+        features.learn_slant(self.looks, turn, left.error[turn], left.along[turn])
         self._memory.sleep(self.state, self.looks, np.flatnonzero(~left.found))
         self._keep(seen)
+
+    def depths(self) -> tuple[F32, F64]:
+        """px (N, 2) and depth (N,) m of the features in the image that was seen last."""
+        s = self.state
+        T_cam_odom = se3.inverse(s.T @ s.T_body_cam)
+        R = T_cam_odom @ s.poses[s.host] @ s.T_body_cam
+        z = (R[:, 2, :3] * rays(s.ray)).sum(axis=1) / np.maximum(s.rho, _FARTHEST) + R[:, 2, 3]
+        return self.looks.px, np.maximum(z, _NEAREST_M)
 
     def _shun(self, px: F32) -> None:
         """No new feature near px (N, 2) for a while: there goes somebody."""
@@ -79,7 +90,7 @@ class Scene:
         good = ~np.isnan(rho) & (_NOISE * looks.patch.sigma_px < _SHARPEST_PX)
         ids = np.arange(self._next_feature, self._next_feature + int(good.sum()))
         self._next_feature += len(ids)
-        ekf.add_features(s, ids, host, ray[good], rho[good], sigma[good])
+        ekf.add_features(s, ids, np.full(len(ids), host), ray[good], rho[good], sigma[good])
         self.looks = self.looks.join(looks.take(good))
 
     def _inverse_depth(self, frame: Frame, px: F32, ray: F64) -> tuple[F64, F64]:
@@ -97,17 +108,15 @@ class Scene:
 
     def _wake(self, frame: Frame, rate: F64) -> None:
         """Features seen from about here before, where they lie as near as the filter knows."""
-        asked = 0
-        for k, asleep in self._memory.near(self.state, self._config.recall_m, self._config.recall_rad):
-            if asked >= self._config.recall:
-                return
-            asked += len(asleep.ids)
-            before = len(self.state.ids)
-            ekf.add_features(self.state, asleep.ids, k, asleep.ray, asleep.rho, asleep.sigma)
-            self.looks = self.looks.join(asleep.looks)
-            good = self._recognised(frame, rate, before)
-            self._memory.wake(int(self.state.keyframes[k]), self.state.ids[good][before:])
-            self._keep(good)
+        s, config, fresh = self.state, self._config, len(self.state.ids)
+        asleep = self._memory.near(s, config.recall_m, config.recall_rad, config.recall)
+        if asleep is None:
+            return
+        ekf.add_features(s, asleep.ids, asleep.host, asleep.ray, asleep.rho, asleep.sigma)
+        self.looks = self.looks.join(asleep.looks)
+        good = self._recognised(frame, rate, fresh)
+        self._memory.wake(s.ids[good][fresh:])
+        self._keep(good)
 
     def _recognised(self, frame: Frame, rate: F64, fresh: int) -> NDArray[np.bool_]:
         """Of features from number `fresh` on, those that are found where they should be; all others."""

@@ -86,8 +86,8 @@ class InertialTracker:
         if frame.stamp_ns != self._keyframe_ns:
             self._anchor(frame, scene)
         new_stretch, self._new_stretch = self._new_stretch, False
-        view = make_view(frame, self._rig, self._config.view_features)
         s = scene.state
+        view = make_view(frame, self._rig, self._config.view_features, scene.depths())
         self._places.add_keyframe(frame.image0, s.T @ s.T_body_cam)
         self._places.set_view(view)
         up = s.T[2, :3] if self._tilt(s) < _LEVEL_RAD else np.zeros(3)
