@@ -95,10 +95,10 @@ def test_an_edge_listens_and_ends_when_asked(program):
 
 def test_the_whole_system_and_the_same_digits_as_from_source(share, tmp_path):
     """Spawned workers, child processes, MCAP, poselib, gtsam, filterpy and matplotlib all work frozen."""
-    said = share("demo", "--seconds", 6, "--out", tmp_path / "demo").stdout
+    said = share("demo", "--seconds", 20, "--out", tmp_path / "demo").stdout
     assert "3 of 3 agents in one map" in said
     assert (tmp_path / "demo" / "trajectories.png").stat().st_size > 10_000
-    (session,) = (tmp_path / ".cache" / "share").glob("room-*")
+    (session,) = (tmp_path / ".cache" / "share").glob("session-*")
     share("track", session / "ar1", "--out", tmp_path / "frozen.tum")
     source = [ROOT / ".venv" / "bin" / "share", "track", session / "ar1", "--out", tmp_path / "source.tum"]
     subprocess.run(source, check=True, capture_output=True)
@@ -110,4 +110,4 @@ def test_nothing_is_in_it_that_no_command_needs(program):
     names = {path.name for path in inside.iterdir()}
     assert not names & {"torch", "tkinter", "_tkinter", "IPython", "pandas", "onnxruntime", "pyrealsense2"}
     sizes = (path.lstat().st_size for path in inside.rglob("*") if not path.is_dir())
-    assert sum(sizes) < 500 * MB
+    assert sum(sizes) < 530 * MB  # 45 of them to bake the light of rooms

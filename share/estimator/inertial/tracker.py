@@ -30,6 +30,7 @@ from share.vision.view import make_view
 _READY_RAD, _READY_M_S = np.radians(3.0), 0.3  # sigmas of tilt and velocity: a pose is worth telling
 _FAR_OFF_PX = 1.0  # median residual, from which derivatives are taken anew
 _MINORITY, _MAJORITY = 0.3, 0.7  # of the features found: believed after the IMU; agreeing against it
+_ASTRAY = 5  # frames in a row that show nothing of what they should: the filter is wrong, not the light
 _PATIENCE = 10  # frames without a sample of the IMU, after which we begin without
 _LEVEL_RAD = np.radians(3.0)  # sigma of tilt up to which others are told what is up
 
@@ -52,8 +53,10 @@ class InertialTracker:
         self._stamp_ns = 0
         self._rate = np.zeros(3)
         self._saturated = False
+        self._astray = 0  # frames in a row that show something, and nothing of what they should
         self._waited = 0  # frames, for the IMU
         self._ready = False
+        self._knows_up = False  # the IMU said so
         self._new_stretch = False  # the next keyframe begins one
         self._keyframe_ns = 0
         self._T_keyframe = np.eye(4)
@@ -88,9 +91,10 @@ class InertialTracker:
         new_stretch, self._new_stretch = self._new_stretch, False
         s = scene.state
         view = make_view(frame, self._rig, self._config.view_features, scene.depths())
-        self._places.add_keyframe(frame.image0, s.T @ s.T_body_cam)
-        self._places.set_view(view)
-        up = s.T[2, :3] if self._tilt(s) < _LEVEL_RAD else np.zeros(3)
+        if not self._astray:
+            self._places.add_keyframe(frame.image0, s.T @ s.T_body_cam)
+            self._places.set_view(view)
+        up = s.T[2, :3] if self._knows_up and self._tilt(s) < _LEVEL_RAD else np.zeros(3)
         return Candidate(s.T, ekf.pose_cov(s), up, view, new_stretch)
 
     # ------------------------------------------------------------------ the usual frame
@@ -108,12 +112,14 @@ class InertialTracker:
         if not heard:
             self._rate = _mean_rate(before, scene.state.T, frame.stamp_ns - self._stamp_ns)
         count = int(seen.sum())
+        textured = count >= self._config.blind or corners.count(frame.image0) >= self._config.weak
+        self._astray = self._astray + 1 if textured and count < self._config.blind else 0
         state = self._judge(scene.state, count, heard)
-        if not self._trusted(scene.state):
+        if not self._trusted(scene.state) or self._astray >= _ASTRAY:
             return self._lose(frame)
         if state is TrackState.LOST:
             return TrackResult(state, None)
-        wanted = self._wants_keyframe(frame, scene, count)
+        wanted = textured and self._wants_keyframe(frame, scene, count)
         if state is TrackState.INITIALISING:
             if wanted:
                 self._anchor(frame, scene)
@@ -235,8 +241,6 @@ class InertialTracker:
         config = self._config
         if frame.stamp_ns - self._keyframe_ns < config.keyframe_gap_s * 1e9:
             return False
-        if count < config.blind and corners.count(frame.image0) < config.weak:
-            return False  # the dark, or a wall
         motion = se3.log(se3.inverse(self._T_keyframe) @ scene.state.T)
         return bool(
             np.linalg.norm(motion[3:]) > config.keyframe_m
@@ -260,6 +264,7 @@ class InertialTracker:
             return TrackResult(waiting, None)
         state = first_state(frame.stamp_ns, self._samples.all, self._rig, self._config)
         self._waited += state is None
+        self._knows_up = state is not None
         if state is None and self._waited >= _PATIENCE:
             state = state_by_camera(frame.stamp_ns, self._rig, self._config)
         if state is None:
@@ -282,7 +287,7 @@ class InertialTracker:
 
     def _lose(self, frame: Frame) -> TrackResult:
         """What is left of the filter is worth nothing."""
-        self._scene, self._ready, self._lost_ns = None, False, frame.stamp_ns
+        self._scene, self._ready, self._lost_ns, self._astray = None, False, frame.stamp_ns, 0
         return TrackResult(TrackState.LOST, None)
 
     def _find_place(self, frame: Frame) -> F64 | None:

@@ -1,0 +1,174 @@
+"""The inertial tracker on three seconds of an emulated D435i: exact truth, and what goes wrong."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from share.config import Config, InertialConfig, TrackerConfig
+from share.core.sequencer import SequencerCounters
+from share.estimator.inertial.tracker import InertialTracker
+from share.geometry.camera import Camera, ImuNoise, Rig
+from share.io.source import open_source
+from share.io.trajectory import Trajectory
+from share.metrics.ate import ate
+from share.run.pipeline import frames_of
+from share.types import ImuBatch, TrackState
+
+OK, BLIND, DEAF, LOST = TrackState.OK, TrackState.INERTIAL_ONLY, TrackState.VISION_ONLY, TrackState.LOST
+STARTING = TrackState.INITIALISING
+
+
+@pytest.fixture(scope="module")
+def walk(plain_session):
+    """Frames, the rig, the truth."""
+    source = open_source(f"{plain_session}/ar1")
+    return list(frames_of(source, Config(), SequencerCounters())), source.rig, source.truth()
+
+
+def run(walk, frames, config=None):
+    tracker, results, candidates = (
+        InertialTracker(walk[1], config or InertialConfig(), TrackerConfig()),
+        [],
+        [],
+    )
+    for frame in frames:
+        results.append(tracker.track(frame))
+        if results[-1].keyframe:
+            candidates.append(tracker.keyframe(frame))
+    return results, candidates, tracker
+
+
+def error_m(walk, frames, results):
+    told = [
+        (f.stamp_ns, r.T_odom_body) for f, r in zip(frames, results, strict=True) if r.T_odom_body is not None
+    ]
+    stamps, poses = zip(*told, strict=True)
+    return ate(Trajectory(np.array(stamps), np.array(poses)), walk[2]).rmse
+
+
+def dark(frame):
+    black = np.zeros_like(frame.image0)
+    return dataclasses.replace(frame, image0=black, image1=black)
+
+
+def mute(frame):
+    return dataclasses.replace(frame, imu=ImuBatch.empty())
+
+
+def some(frames, change, first, last):
+    return [change(f) if first <= k < last else f for k, f in enumerate(frames)]
+
+
+def states(results):
+    return [r.state for r in results]
+
+
+def test_to_the_centimetre_and_every_frame(walk):
+    frames = walk[0]
+    results, candidates, _ = run(walk, frames)
+    assert set(states(results)[:3]) <= {STARTING, OK}
+    assert states(results)[3:] == [OK] * (len(frames) - 3)
+    assert error_m(walk, frames, results) < 0.01
+    assert candidates[0].new_stretch
+    assert not any(c.new_stretch for c in candidates[1:])
+    for r in results[3:]:
+        assert np.linalg.eigvalsh(r.cov)[0] > 0
+
+
+def test_up_is_up(walk):
+    """Of the body, as keyframes tell others; the accelerometer of a D435i is off by up to 0.2 m/s^2."""
+    frames, _, truth = walk
+    _, candidates, tracker = run(walk, frames)
+    last = tracker.state.stamp_ns
+    up = truth.T[np.argmin(np.abs(truth.stamps_ns - last))][2, :3]
+    assert np.degrees(np.arccos(tracker.state.T[2, :3] @ up)) < 1.5
+    assert np.linalg.norm(candidates[-1].up) == pytest.approx(1)
+
+
+def test_same_frames_same_bits(walk):
+    a, b = (run(walk, walk[0][:25])[0] for _ in range(2))
+    assert [x.cov is None for x in a] == [y.cov is None for y in b]
+    for x, y in zip(a, b, strict=True):
+        if x.cov is not None:
+            assert (x.T_odom_body == y.T_odom_body).all()
+            assert (x.cov == y.cov).all()
+
+
+def test_the_imu_carries_it_through_the_dark(walk):
+    frames = some(walk[0], dark, 20, 35)
+    results, _, _ = run(walk, frames)
+    assert states(results)[20:35] == [BLIND] * 15
+    assert states(results)[37:] == [OK] * 8
+    assert error_m(walk, frames, results) < 0.03
+
+
+def test_an_imu_that_falls_silent_is_seen_and_ends_nothing(walk):
+    frames = some(walk[0], mute, 8, 18)
+    results, _, _ = run(walk, frames)
+    assert states(results)[10:18] == [DEAF] * 8  # it is missed after a tenth of a second
+    assert states(results)[20:] == [OK] * 25
+    assert error_m(walk, frames, results) < 0.02
+
+
+def test_it_says_when_it_has_gone_astray_and_finds_back(walk):
+    """The IMU is silent while the head turns by 2 rad/s: hard at 15 Hz. What is not known is not told."""
+    frames = some(walk[0], mute, 20, 30)
+    results, _, _ = run(walk, frames)
+    assert set(states(results)[22:29]) == {DEAF}
+    assert states(results)[-4:] == [OK] * 4
+
+
+def test_an_imu_that_was_never_there(walk):
+    frames = some(walk[0], mute, 0, 99)
+    results, candidates, _ = run(walk, frames)
+    assert states(results)[:9] == [STARTING] * 9
+    assert states(results)[10:] == [DEAF] * 35
+    assert error_m(walk, frames, results) < 0.04
+    assert all((c.up == 0).all() for c in candidates)
+
+
+def test_lost_without_imu_and_sight_and_found_again(walk):
+    frames = some(some(walk[0], mute, 3, 99), dark, 8, 18)
+    results, candidates, _ = run(walk, frames)
+    assert set(states(results)[9:18]) == {LOST}
+    assert all(r.T_odom_body is None for r in results if r.state is LOST)
+    assert all(r.state.has_pose for r in results[20:26])
+    assert not any(c.new_stretch for c in candidates[1:])
+
+
+def test_dropped_frames(walk):
+    kept, waiting = [], []
+    for k, frame in enumerate(walk[0]):
+        waiting.append(frame.imu)
+        if k <= 5 or k % 4:
+            names = ("stamps_ns", "gyro", "accel")
+            imu = ImuBatch(*(np.concatenate([getattr(b, name) for b in waiting]) for name in names))
+            kept.append(dataclasses.replace(frame, imu=imu))
+            waiting = []
+    results, _, _ = run(walk, kept)
+    assert error_m(walk, kept, results) < 0.01
+
+
+def test_waits_for_something_to_see(walk):
+    frames = some(walk[0][:15], dark, 0, 6)
+    results, _, _ = run(walk, frames)
+    assert states(results)[:6] == [STARTING] * 6
+    assert results[-1].state is OK
+
+
+def test_memory_is_bounded(walk):
+    config = InertialConfig(max_keyframes=4, keyframe_m=0.02, keyframe_rad=0.02)
+    results, candidates, tracker = run(walk, walk[0], config)
+    assert len(candidates) > 8
+    assert len(tracker.state.keyframes) <= 4
+    assert tracker.state.size < 22 + 6 * 4 + 2 * config.features
+    assert results[-1].state is OK
+
+
+def test_what_it_cannot_track_is_refused():
+    camera, noise = Camera(640, 480, 385.0, 385.0, 319.5, 239.5), ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, 200.0)
+    stereo = Rig(camera, np.eye(4), cam1=camera, T_cam1_cam0=np.eye(4))
+    for rig, says in ((Rig(camera, np.eye(4), imu=noise), "scale"), (stereo, "IMU")):
+        with pytest.raises(ValueError, match=says):
+            InertialTracker(rig, InertialConfig(), TrackerConfig())
