@@ -173,6 +173,19 @@ def apply(state: State, residual: F64, PHt: F64, S: F64) -> float:
     return float(white @ white)
 
 
+def rest(state: State, sigma: float, gate: float) -> bool:
+    """The body stands still: its velocity is 0, sigma m/s. Whether that was believed: where it contradicts
+    the state by more than `gate` (squared Mahalanobis distance, 3 degrees of freedom), nothing is done."""
+    H = np.zeros((3, state.size))
+    H[:, POSE][:, :3], H[:, VELOCITY] = -se3.hat(state.v), np.eye(3)
+    PHt = state.cov @ H.T
+    S = H @ PHt + sigma**2 * np.eye(3)
+    if state.v @ np.linalg.solve(S, state.v) > gate:
+        return False
+    apply(state, -state.v, PHt, S)
+    return True
+
+
 def _gain(PHt: F64, S: F64, residual: F64) -> tuple[F64, F64, F64]:
     """The error (n,) that the residual tells of, L^-1 H cov (m, n), L^-1 residual (m,) with L L' = S."""
     L, failed = lapack.dpotrf(S, lower=1, clean=1)

@@ -9,6 +9,8 @@ from share.geometry import se3
 from share.types import F64, ImuBatch
 
 _KEPT = 600
+_REST_S, _FEWEST = 0.5, 20  # samples of so long, and so many, tell rest
+_REST_SHAKE, _REST_TURN = 0.12, 0.02  # m/s^2 and rad/s, standard deviations: about twice a D435i's noise
 _REPEATED = 4  # samples at the end of the scale
 
 
@@ -40,6 +42,14 @@ class Samples:
         if len(part) == 0 or np.diff(np.r_[part, max(to_ns, int(part[-1]))]).max() > silent_ns:
             return None
         return ImuBatch(part, self.all.gyro[first:last], self.all.accel[first:last])
+
+    def still(self, now_ns: int) -> bool:
+        """Whether the IMU shows a body at rest, no motor running, since _REST_S before."""
+        last = self.all.stamps_ns > now_ns - round(_REST_S * 1e9)
+        if last.sum() < _FEWEST:
+            return False
+        shake, turn = self.all.accel[last].std(axis=0), self.all.gyro[last].std(axis=0)
+        return bool(np.linalg.norm(shake) < _REST_SHAKE and np.linalg.norm(turn) < _REST_TURN)
 
     def saturated(self, imu: ImuBatch) -> bool:
         """Whether an axis shows the most that it ever has several times: noise does not repeat itself."""

@@ -30,7 +30,9 @@ from share.vision.view import make_view
 _READY_RAD, _READY_M_S = np.radians(3.0), 0.3  # sigmas of tilt and velocity: a pose is worth telling
 _FAR_OFF_PX = 1.0  # median residual, from which derivatives are taken anew
 _MINORITY, _MAJORITY = 0.3, 0.7  # of the features found: believed after the IMU; agreeing against it
-_ASTRAY = 5  # frames in a row that show nothing of what they should: the filter is wrong, not the light
+_ASTRAY, _REFUSED_S = 3, 1.0  # frames with nothing of what should be there; time with nothing believed
+_REST_RATE, _REST_M_S = 0.03, 0.02  # rad/s of a body at rest; m/s of its velocity
+_SLOW_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to a filter that knows it moves
 _PATIENCE = 10  # frames without a sample of the IMU, after which we begin without
 _LEVEL_RAD = np.radians(3.0)  # sigma of tilt up to which others are told what is up
 
@@ -53,7 +55,7 @@ class InertialTracker:
         self._stamp_ns = 0
         self._rate = np.zeros(3)
         self._saturated = False
-        self._astray = 0  # frames in a row that show something, and nothing of what they should
+        self._astray, self._refused_s = 0, 0.0  # see `_stray`
         self._waited = 0  # frames, for the IMU
         self._ready = False
         self._knows_up = False  # the IMU said so
@@ -91,7 +93,7 @@ class InertialTracker:
         new_stretch, self._new_stretch = self._new_stretch, False
         s = scene.state
         view = make_view(frame, self._rig, self._config.view_features, scene.depths())
-        if not self._astray:
+        if not self._astray and not self._refused_s:
             self._places.add_keyframe(frame.image0, s.T @ s.T_body_cam)
             self._places.set_view(view)
         up = s.T[2, :3] if self._knows_up and self._tilt(s) < _LEVEL_RAD else np.zeros(3)
@@ -113,9 +115,9 @@ class InertialTracker:
             self._rate = _mean_rate(before, scene.state.T, frame.stamp_ns - self._stamp_ns)
         count = int(seen.sum())
         textured = count >= self._config.blind or corners.count(frame.image0) >= self._config.weak
-        self._astray = self._astray + 1 if textured and count < self._config.blind else 0
+        self._stray(frame, textured, len(seen), int(left.found.sum()), count)
         state = self._judge(scene.state, count, heard)
-        if not self._trusted(scene.state) or self._astray >= _ASTRAY:
+        if not self._trusted(scene.state) or self._gone_astray:
             return self._lose(frame)
         if state is TrackState.LOST:
             return TrackResult(state, None)
@@ -161,6 +163,9 @@ class InertialTracker:
         self._saturated = imu is not None and self._samples.saturated(imu)
         if imu is not None and not deaf:
             self._rate = ekf.propagate(s, imu, to_ns, self._noise, self._config.gravity)
+            slow = np.linalg.norm(self._rate) < _REST_RATE and np.linalg.norm(s.v) < _SLOW_M_S
+            if slow and self._samples.still(to_ns):
+                ekf.rest(s, _REST_M_S, self._config.gate)
             return True
         imu = coasting(s, self._rate, to_ns, self._config.gravity)
         ekf.propagate(s, imu, to_ns, self._coasting, self._config.gravity)
@@ -205,6 +210,19 @@ class InertialTracker:
         if not heard:
             return TrackState.VISION_ONLY
         return TrackState.OK if count >= config.weak else TrackState.WEAK
+
+    def _stray(self, frame: Frame, textured: bool, sought: int, found: int, seen: int) -> None:
+        """Frames that show something and nothing of what they should, or for long nothing that is believed:
+        then the filter is wrong, and not the light."""
+        config = self._config
+        if textured and sought >= config.weak:
+            self._astray = self._astray + 1 if found < config.blind else 0
+        refused = textured and seen < config.blind
+        self._refused_s = self._refused_s + (frame.stamp_ns - self._stamp_ns) * 1e-9 if refused else 0.0
+
+    @property
+    def _gone_astray(self) -> bool:
+        return self._astray >= _ASTRAY or self._refused_s > _REFUSED_S
 
     def _trusted(self, s: State) -> bool:
         """Finite, no faster than a person or robot can be, and not gone too far unseen."""
@@ -287,7 +305,8 @@ class InertialTracker:
 
     def _lose(self, frame: Frame) -> TrackResult:
         """What is left of the filter is worth nothing."""
-        self._scene, self._ready, self._lost_ns, self._astray = None, False, frame.stamp_ns, 0
+        self._scene, self._ready, self._lost_ns = None, False, frame.stamp_ns
+        self._astray, self._refused_s = 0, 0.0
         return TrackResult(TrackState.LOST, None)
 
     def _find_place(self, frame: Frame) -> F64 | None:
