@@ -84,6 +84,20 @@ def test_what_is_seen(state, right):
     assert np.allclose(S, H @ state.cov @ H.T + np.eye(20), atol=1e-14)
 
 
+def test_covariance_of_a_motion(state):
+    """Of T_a_b = T_a^-1 T_b, by differences."""
+
+    def motion(s):
+        return se3.inverse(s.poses[0]) @ s.poses[1]
+
+    J = np.zeros((6, state.size))
+    for k in range(state.size):
+        up, down = (motion(moved(state, sign * basis(state, k))) for sign in (1, -1))
+        J[:, k] = se3.log(se3.inverse(motion(state)) @ up) - se3.log(se3.inverse(motion(state)) @ down)
+    J /= 2 * STEP
+    assert np.allclose(ekf.motion_cov(state, 0, 1), J @ state.cov @ J.T, atol=1e-9, rtol=1e-5)
+
+
 def test_the_twist_is_how_the_pose_moves():
     path, t = Path(4), np.array([1.0])
     s = begin(0, path.poses(t)[0], path.velocity(t)[0], np.zeros(3), np.zeros(3), np.eye(4), np.ones(CORE))

@@ -30,6 +30,7 @@ from share.geometry.camera import ImuNoise
 from share.types import F64, I64, ImuBatch
 
 _MOVING = 15  # columns that propagation changes
+_LEAST_COV = 1e-10  # what differences of covariances lose
 _SETTLED = 1e-4  # rad, m, 1/m: a correction that changes no derivative
 
 
@@ -262,6 +263,14 @@ def drop_keyframes(state: State, keyframes: I64) -> None:
 def _keep_columns(state: State, keep: NDArray[np.bool_]) -> None:
     if not keep.all():
         state.cov = np.ascontiguousarray(state.cov[np.ix_(keep, keep)])
+
+
+def motion_cov(state: State, a: int, b: int) -> F64:
+    """Of T_a_b (6, 6) between keyframes number a and b of the state, perturbed on the right."""
+    P, i, j = state.cov, state.keyframe(a), state.keyframe(b)
+    Ad = se3.adjoint(se3.inverse(state.poses[b]))
+    out: F64 = Ad @ (P[i, i] + P[j, j] - P[i, j] - P[j, i]) @ Ad.T
+    return (out + out.T) / 2 + _LEAST_COV * np.eye(6)
 
 
 def pose_cov(state: State) -> F64:

@@ -63,6 +63,7 @@ class InertialTracker:
         self._keyframe_ns = 0
         self._T_keyframe = np.eye(4)
         self._keyframe_count = 0
+        self._shown = -1  # the last keyframe that others were told of
         self._places = LocalMap(places.max_keyframes)  # where to look for oneself when LOST
         self._places_config, self._seed, self._places_tried = places, seed, 0
         self._lost_ns: int | None = None
@@ -97,7 +98,14 @@ class InertialTracker:
             self._places.add_keyframe(frame.image0, s.T @ s.T_body_cam)
             self._places.set_view(view)
         up = s.T[2, :3] if self._knows_up and self._tilt(s) < _LEVEL_RAD else np.zeros(3)
-        return Candidate(s.T, ekf.pose_cov(s), up, view, new_stretch)
+        return Candidate(s.T, self._since_last(s), up, view, new_stretch)
+
+    def _since_last(self, s: State) -> F64:
+        """Covariance (6, 6) of the motion since the last keyframe that was shown, if the state still has that;
+        else of all since the beginning."""
+        last, self._shown = self._shown, int(s.keyframes[-1])
+        known = np.flatnonzero(s.keyframes[:-1] == last)
+        return ekf.motion_cov(s, int(known[0]), len(s.keyframes) - 1) if len(known) else ekf.pose_cov(s)
 
     # ------------------------------------------------------------------ the usual frame
 
