@@ -101,7 +101,7 @@ class InertialTracker:
         return Candidate(s.T, self._since_last(s), up, view, new_stretch)
 
     def _since_last(self, s: State) -> F64:
-        """Covariance (6, 6) of the motion since the last keyframe that was shown, if the state still has that;
+        """Covariance (6, 6) of the motion since the last keyframe that was shown, if the state still has it,
         else of all since the beginning."""
         last, self._shown = self._shown, int(s.keyframes[-1])
         known = np.flatnonzero(s.keyframes[:-1] == last)
