@@ -93,7 +93,6 @@ class InertialConfig:
     recall: int = 80  # features of earlier keyframes looked for again at a keyframe,
     recall_m: float = 1.5  # of keyframes no further away than this
     recall_rad: float = 0.7  # and turned by no more than this
-    view_features: int = 500  # ORB features of a keyframe, for other agents and for relocalisation
     weak: int = 25  # features seen; fewer: WEAK
     blind: int = 6  # fewer: INERTIAL_ONLY
     max_speed_m_s: float = 8.0  # a state that is faster is LOST
@@ -104,7 +103,7 @@ class InertialConfig:
 
     def __post_init__(self) -> None:
         _require_positive(self, "features", "spacing_px", "sigma_px", "gate", "imu_noise", "gravity")
-        _require_positive(self, "max_keyframes", "view_features")
+        _require_positive(self, "max_keyframes")
 
 
 @dataclass(frozen=True)

@@ -73,11 +73,10 @@ def meter(look: Look) -> F64:
     return np.array([float(w.renderer.radiance(camera, [sight.by(T_body_cam)]).mean()) for sight in sights])
 
 
-def shoot(take: Take) -> int:
-    """Draw the frames and write the chunk. How many bytes it has."""
+def shoot(take: Take) -> None:
+    """Draw the frames and write the chunk."""
     pictures = [picture for frame in _frames(_ready(), take) for picture in _developed(_ready(), take, frame)]
     write_chunk(take.file, pictures)
-    return sum(len(picture.data) for picture in pictures)
 
 
 @dataclass(frozen=True, eq=False)

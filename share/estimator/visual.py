@@ -12,8 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from share.columns import Columns
 from share.config import TrackerConfig
 from share.estimator import gravity, relocalise
 from share.estimator.localmap import LocalKeyframe, LocalMap
@@ -30,17 +30,11 @@ MIN_TO_LOOK_FOR = 8  # fewer points of an old keyframe are not worth an image py
 
 
 @dataclass(frozen=True, eq=False)
-class _Tracks:
+class _Tracks(Columns):
     """Points of the local map seen in the last image: ids (N,), px (N, 2)."""
 
     ids: I64
     px: F32
-
-    def take(self, keep: NDArray[np.bool_]) -> _Tracks:
-        return _Tracks(self.ids[keep], self.px[keep])
-
-    def join(self, other: _Tracks) -> _Tracks:
-        return _Tracks(np.concatenate([self.ids, other.ids]), np.concatenate([self.px, other.px]))
 
 
 _NO_TRACKS = _Tracks(np.zeros(0, np.int64), np.zeros((0, 2), np.float32))

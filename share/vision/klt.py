@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.types import F32, U8
+from share.vision.patches import sample
 
 _CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 
@@ -74,5 +75,4 @@ def _patches(image: U8, px: F32, half: int) -> F32:
     dx, dy = np.meshgrid(offset, offset)
     x = px[:, :1].astype(np.float32) + dx.ravel()
     y = px[:, 1:].astype(np.float32) + dy.ravel()
-    out: F32 = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
-    return out
+    return sample(image, x, y)

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from share.types import F32, F64, I64, U8
+from share.columns import Columns
+from share.types import F32, F64, U8
 
 HALF = 5  # px; patches are 11 x 11
 _SIDE = 2 * HALF + 1
@@ -24,7 +24,7 @@ _FLAT = 1e-3  # gray levels: a patch with less contrast is nothing
 
 
 @dataclass(frozen=True, eq=False)
-class Patches:
+class Patches(Columns):
     """N patches of S samples. gray (N, S): zero mean, unit norm; contrast (N,): the norm that it had.
     slope (N, 2, S): derivatives by x and y less what gain and bias explain, in gray levels a pixel;
     inverse (N, 2, 2): of their normal matrix."""
@@ -36,13 +36,6 @@ class Patches:
 
     def __len__(self) -> int:
         return len(self.gray)
-
-    def take(self, keep: NDArray[np.bool_] | I64) -> Patches:
-        return Patches(self.gray[keep], self.contrast[keep], self.slope[keep], self.inverse[keep])
-
-    def join(self, other: Patches) -> Patches:
-        pairs = ((getattr(self, name), getattr(other, name)) for name in self.__dataclass_fields__)
-        return Patches(*(np.concatenate(pair) for pair in pairs))
 
     @property
     def sigma_px(self) -> F32:
@@ -63,7 +56,7 @@ def cut(image: U8, px: F32) -> Patches:
         return empty()
     wide = np.arange(-HALF - 1, HALF + 2, dtype=np.float32)
     x, y = np.meshgrid(wide, wide)
-    grown = _sample(image, px[:, :1] + x.ravel(), px[:, 1:] + y.ravel())
+    grown = sample(image, px[:, :1] + x.ravel(), px[:, 1:] + y.ravel())
     grown = grown.reshape(-1, _SIDE + 2, _SIDE + 2)
     dx = (grown[:, 1:-1, 2:] - grown[:, 1:-1, :-2]) / 2
     dy = (grown[:, 2:, 1:-1] - grown[:, :-2, 1:-1]) / 2
@@ -99,7 +92,7 @@ def align(image: U8, patches: Patches, px: F64, warp: F64, most: int = 4, settle
             break
         part = patches if len(todo) == n else patches.take(todo)
         here = spread[todo]
-        seen, _ = _normed(_sample(image, at[todo, :1] + here[..., 0], at[todo, 1:] + here[..., 1]))
+        seen, _ = _normed(sample(image, at[todo, :1] + here[..., 0], at[todo, 1:] + here[..., 1]))
         alike[todo] = np.einsum("ns,ns->n", seen, part.gray)
         error = (seen - part.gray) * part.contrast[:, None]
         shift = part.inverse @ (part.slope @ error[:, :, None])
@@ -125,7 +118,7 @@ def slanted(patches: Patches, error: F32, along: F64) -> tuple[F64, F64]:
     return information, -(S @ error[:, :, None])[:, :, 0].astype(np.float64)
 
 
-def _sample(image: U8, x: F32, y: F32) -> F32:
+def sample(image: U8, x: F32, y: F32) -> F32:
     """Bilinear gray levels at (N, S) places."""
     out: F32 = cv2.remap(
         image,

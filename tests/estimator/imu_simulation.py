@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from imu_world import CAMERA, GRAVITY, NOISE, Path, imu_of, rig
 
-from share.estimator.inertial import ekf
+from share.estimator.inertial import ekf, observe
 from share.estimator.inertial.state import CORE, State, begin
 from share.geometry import se3
 from share.types import ImuBatch
@@ -129,12 +129,13 @@ class _World:
         inside = ~np.isnan(seen[0][:, 0]) & ~np.isnan(seen[1][:, 0])
         which = np.flatnonzero(inside)
         sigma = np.full(len(which), SIGMA_PX / CAMERA.focal)
-        rows = ekf.join(
-            *(
-                ekf.sight(state, which, CAMERA.normalise(px[which]), sigma, rate, T)
-                for px, T in zip(seen, (None, self._rig.T_cam1_cam0), strict=True)
+        left, right = (
+            ekf.sight(
+                state, which, observe.predict(state, which, T), CAMERA.normalise(px[which]), sigma, rate
             )
+            for px, T in zip(seen, (None, self._rig.T_cam1_cam0), strict=True)
         )
+        rows = left.join(right)
         rows = rows.take(np.argsort(rows.host, kind="stable"))
         level = 1.0
         if len(which):

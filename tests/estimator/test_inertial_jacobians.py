@@ -63,7 +63,8 @@ def test_what_is_seen(state, right):
     T = RIG.T_cam1_cam0 if right else None
     which = np.arange(10)
     rate = np.array([0.3, -0.2, 0.5])
-    rows = ekf.sight(state, which, np.zeros((10, 2)), np.ones(10), rate, T)
+    seen = observe.predict(state, which, T)
+    rows = ekf.sight(state, which, seen, np.zeros((10, 2)), np.ones(10), rate)
     H = np.zeros((20, state.size))
     H[:, :CORE] = rows.core.reshape(20, CORE)
     for i in range(10):

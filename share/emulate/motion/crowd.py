@@ -11,7 +11,7 @@ from share.emulate.motion import robot, walk
 from share.emulate.motion.gaze import Seen
 from share.emulate.motion.schedule import Other
 from share.emulate.motion.spline import SplinePath
-from share.emulate.motion.together import Course, Ground, Wish, move, nearest, obstacle
+from share.emulate.motion.together import PEOPLE_M, ROBOT_M, Course, Ground, Wish, move, nearest, obstacle
 from share.emulate.motion.track import Track, instants
 from share.emulate.types import START_NS, Path
 from share.errors import UsageError
@@ -62,7 +62,7 @@ def crowd(
             return paths
     names = ", ".join(m.name for m in members)
     raise UsageError(
-        f"{names}: found no paths that keep people {0.6} m and robots {0.5} m apart in this room; "
+        f"{names}: found no paths that keep people {PEOPLE_M} m and robots {ROBOT_M} m apart in this room; "
         "take fewer agents, lower speeds, a larger --size or another --seed"
     )
 

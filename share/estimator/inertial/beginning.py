@@ -81,15 +81,10 @@ def _learn_force(state: State, force: F64, sigma: float, g: float) -> None:
     Rt = state.T[:3, :3].T
     H = np.zeros((3, state.size))
     H[:, POSE][:, :3], H[:, ACCEL_BIAS] = Rt @ se3.hat(z), np.eye(3)
-    _learn(state, force - Rt @ z - state.ba, H, sigma)
+    ekf.learn(state, force - Rt @ z - state.ba, H, sigma)
 
 
 def _learn_rate(state: State, rate: F64) -> None:
     H = np.zeros((3, state.size))
     H[:, GYRO_BIAS] = np.eye(3)
-    _learn(state, rate - state.bg, H, _TREMOR)
-
-
-def _learn(state: State, residual: F64, H: F64, sigma: float) -> None:
-    PHt = state.cov @ H.T
-    ekf.apply(state, residual, PHt, H @ PHt + sigma**2 * np.eye(len(H)))
+    ekf.learn(state, rate - state.bg, H, _TREMOR)

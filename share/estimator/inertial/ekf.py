@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
-from share.estimator.inertial import observe
+from share.columns import Columns
 from share.estimator.inertial.imu import integrate
+from share.estimator.inertial.observe import Prediction
 from share.estimator.inertial.state import (
     ACCEL_BIAS,
     CORE,
@@ -35,7 +36,7 @@ _SETTLED = 1e-4  # rad, m, 1/m: a correction that changes no derivative
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class Sight(Columns):
     """Rows of an update: residual (M, 2) measured - predicted, and how it depends on the state: core
     (M, 2, 22), the pose (M, 2, 6) of keyframe number host (M,), inverse depth (M, 2) of feature number
     which (M,). sigma (M,) of one coordinate, as the residual: normalised coordinates."""
@@ -47,9 +48,6 @@ class Sight:
     by_host: F64
     by_rho: F64
     sigma: F64
-
-    def take(self, keep: NDArray[np.bool_] | I64) -> Sight:
-        return Sight(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
 
 
 def propagate(state: State, imu: ImuBatch, to_ns: int, noise: ImuNoise, gravity: float) -> F64:
@@ -71,19 +69,12 @@ def twist(state: State, rate: F64) -> F64:
     return np.concatenate([turning, state.v - np.cross(turning, state.T[:3, 3])])
 
 
-def sight(state: State, which: I64, uv: F64, sigma: F64, rate: F64, T_right_left: F64 | None = None) -> Sight:
-    """What was seen at uv (M, 2), sigma (M,), of features number `which` (M,), in cam0 or in cam1."""
-    seen = observe.predict(state, which, T_right_left)
+def sight(state: State, which: I64, seen: Prediction, uv: F64, sigma: F64, rate: F64) -> Sight:
+    """What was seen at uv (M, 2), sigma (M,), of features number `which` (M,), where `seen` was predicted."""
     core = np.zeros((len(which), 2, CORE))
     core[:, :, POSE], core[:, :, EXTRINSIC] = seen.by_pose, seen.by_extrinsic
     core[:, :, OFFSET] = seen.by_pose @ twist(state, rate)
     return Sight(which, state.host[which], uv - seen.uv, core, -seen.by_pose, seen.by_rho, sigma)
-
-
-def join(*sights: Sight) -> Sight:
-    """All rows of all of them."""
-    names = Sight.__dataclass_fields__
-    return Sight(*(np.concatenate([getattr(s, name) for s in sights]) for name in names))
 
 
 def gains(state: State, rows: Sight, common: F64 | None = None) -> tuple[F64, F64]:
@@ -174,17 +165,22 @@ def apply(state: State, residual: F64, PHt: F64, S: F64) -> float:
     return float(white @ white)
 
 
+def learn(state: State, residual: F64, H: F64, sigma: float, gate: float = np.inf) -> bool:
+    """Apply a few rows H (m, n) of any kind, sigma of each. Whether they were believed: where they contradict
+    the state by more than `gate`, a squared Mahalanobis distance, nothing is done."""
+    PHt = state.cov @ H.T
+    S = H @ PHt + sigma**2 * np.eye(len(H))
+    if residual @ np.linalg.solve(S, residual) > gate:
+        return False
+    apply(state, residual, PHt, S)
+    return True
+
+
 def rest(state: State, sigma: float, gate: float) -> bool:
-    """The body stands still: its velocity is 0, sigma m/s. Whether that was believed: where it contradicts
-    the state by more than `gate` (squared Mahalanobis distance, 3 degrees of freedom), nothing is done."""
+    """The body stands still: its velocity is 0, sigma m/s. Whether that was believed, see `learn`."""
     H = np.zeros((3, state.size))
     H[:, POSE][:, :3], H[:, VELOCITY] = -se3.hat(state.v), np.eye(3)
-    PHt = state.cov @ H.T
-    S = H @ PHt + sigma**2 * np.eye(3)
-    if state.v @ np.linalg.solve(S, state.v) > gate:
-        return False
-    apply(state, -state.v, PHt, S)
-    return True
+    return learn(state, -state.v, H, sigma, gate)
 
 
 def _gain(PHt: F64, S: F64, residual: F64) -> tuple[F64, F64, F64]:
@@ -267,10 +263,23 @@ def _keep_columns(state: State, keep: NDArray[np.bool_]) -> None:
 
 def motion_cov(state: State, a: int, b: int) -> F64:
     """Of T_a_b (6, 6) between keyframes number a and b of the state, perturbed on the right."""
-    P, i, j = state.cov, state.keyframe(a), state.keyframe(b)
     Ad = se3.adjoint(se3.inverse(state.poses[b]))
-    out: F64 = Ad @ (P[i, i] + P[j, j] - P[i, j] - P[j, i]) @ Ad.T
+    out: F64 = Ad @ _between(state, state.keyframe(a), state.keyframe(b)) @ Ad.T
     return (out + out.T) / 2 + _LEAST_COV * np.eye(6)
+
+
+def drift_m(state: State) -> float:
+    """Sigma of the body's position against the newest keyframe's, m."""
+    H = np.hstack([-se3.hat(state.T[:3, 3]), np.eye(3)])
+    D = _between(state, POSE, state.keyframe(len(state.keyframes) - 1))
+    return float(np.sqrt(max(np.trace(H @ D @ H.T), 0.0)))
+
+
+def _between(state: State, a: slice, b: slice) -> F64:
+    """Covariance (6, 6) of the difference of two poses' errors, in odom."""
+    P = state.cov
+    out: F64 = P[a, a] + P[b, b] - P[a, b] - P[b, a]
+    return out
 
 
 def pose_cov(state: State) -> F64:

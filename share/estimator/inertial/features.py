@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from share.columns import Columns
 from share.geometry.camera import Camera
 from share.types import F32, F64, I64, U8
 from share.vision import patches
@@ -22,29 +23,19 @@ _PATIENT = 0.3  # of what a frame says is taken: its errors are much like the ne
 
 
 @dataclass(frozen=True, eq=False)
-class Looks:
+class Looks(Columns):
     """patch of N features. spread (N, 2, 2): d ray / d px in the image that saw them first. slant (N, 2):
-    d rho / d px there, of the surface, and its information (N, 2, 2). px (N, 2): where each was seen
-    last; lag (N, 2): px by which it has lately run away from where the others say it should be. age (N,):
-    frames in which it was seen."""
+    d rho / d px there, of the surface, upright within a sigma of 1 / sqrt(upright (N,)). px (N, 2): where
+    each was seen last; lag (N, 2): px by which it has lately run away from where the others say it should
+    be. age (N,): frames in which it was seen."""
 
     patch: Patches
     spread: F64
     slant: F64
-    slant_information: F64
+    upright: F64
     px: F32
     lag: F64
     age: I64
-
-    def take(self, keep: NDArray[np.bool_] | I64) -> Looks:
-        return Looks(self.patch.take(keep), *(getattr(self, name)[keep] for name in _ARRAYS))
-
-    def join(self, other: Looks) -> Looks:
-        pairs = ((getattr(self, name), getattr(other, name)) for name in _ARRAYS)
-        return Looks(self.patch.join(other.patch), *(np.concatenate(pair) for pair in pairs))
-
-
-_ARRAYS = ("spread", "slant", "slant_information", "px", "lag", "age")
 
 
 def looks(image: U8, camera: Camera, px: F32, ray: F64, rho: F64) -> Looks:
@@ -52,19 +43,19 @@ def looks(image: U8, camera: Camera, px: F32, ray: F64, rho: F64) -> Looks:
     n = len(px)
     spread = np.asarray(np.linalg.inv(camera.jacobian(ray)), np.float64)
     sigma = _SLANT * np.maximum(rho, _FAR) / camera.focal
-    information = np.eye(2) / sigma[:, None, None] ** 2
     age = np.zeros(n, np.int64)
     nothing = np.zeros((n, 2))
-    return Looks(patches.cut(image, px), spread, nothing, information, px, nothing.copy(), age)
+    return Looks(patches.cut(image, px), spread, nothing, 1 / sigma**2, px, nothing.copy(), age)
 
 
 def learn_slant(looks: Looks, which: I64, error: F32, along: F64) -> None:
     """From how the patches of features `which` (M,) look where they were found: see `patches.slanted`."""
     information, step = patches.slanted(looks.patch.take(which), error, along)
     information, step = information / _NOISE**2, step / _NOISE**2
-    prior = looks.slant_information[which]
-    pull = step - (prior @ looks.slant[which][:, :, None])[:, :, 0]
-    looks.slant[which] += _PATIENT * np.linalg.solve(prior + information, pull[:, :, None])[:, :, 0]
+    prior = looks.upright[which, None]
+    total = information + prior[:, :, None] * np.eye(2)
+    pull = step - prior * looks.slant[which]
+    looks.slant[which] += _PATIENT * np.linalg.solve(total, pull[:, :, None])[:, :, 0]
 
 
 def runaways(looks: Looks, which: I64, residual: F64) -> NDArray[np.bool_]:
@@ -85,13 +76,13 @@ def runaways(looks: Looks, which: I64, residual: F64) -> NDArray[np.bool_]:
 
 
 def none() -> Looks:
-    empty = np.zeros((0, 2)), np.zeros((0, 2, 2))
+    pairs, one = np.zeros((0, 2)), np.zeros(0)
     return Looks(
         patches.empty(),
-        empty[1],
-        empty[0],
-        empty[1],
-        empty[0].astype(np.float32),
-        empty[0],
-        np.zeros(0, np.int64),
+        np.zeros((0, 2, 2)),
+        pairs,
+        one,
+        pairs.astype(np.float32),
+        pairs,
+        one.astype(np.int64),
     )

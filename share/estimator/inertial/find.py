@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from share.config import InertialConfig
 from share.estimator.inertial import observe
 from share.estimator.inertial.features import Looks
+from share.estimator.inertial.observe import Prediction
 from share.estimator.inertial.state import State
 from share.geometry.camera import Camera
 from share.types import F32, F64, I64, U8
@@ -24,11 +25,14 @@ _TINY = 1e-12 * np.eye(2)
 @dataclass(frozen=True, eq=False)
 class Sought:
     """Of all N features in one image: px (N, 2) and whether each was found; expected (N, 2), NaN behind the
-    camera. For `patches.slanted`: error (N, S), along (N, 2)."""
+    camera, what it is from, and how patches look there, (N, 2, 2) px by px. For `patches.slanted`: error
+    (N, S), along (N, 2)."""
 
     px: F32
     found: NDArray[np.bool_]
     expected: F64
+    prediction: Prediction
+    warp: F64
     error: F32
     along: F64
 
@@ -46,9 +50,10 @@ def seek(
     """In cam0's image, or with T_right_left in cam1's; of features from number `fresh` on. left: of the same
     frame; only what it found is sought, as far from where it was expected as there."""
     n = len(state.ids)
-    where, warp, along = _expected(camera, state, np.arange(n), looks, T_right_left)
+    seen, where, warp, along = _expected(camera, state, looks, T_right_left)
     nowhere = np.zeros((n, len(patches.OFFSETS)), np.float32)
-    out = Sought(np.nan_to_num(where, nan=-1e6).astype(np.float32), np.zeros(n, bool), where, nowhere, along)
+    px = np.nan_to_num(where, nan=-1e6).astype(np.float32)
+    out = Sought(px, np.zeros(n, bool), where, seen, warp, nowhere, along)
     start = where if left is None else where + (left.px - left.expected)
     inside = camera.inside(np.nan_to_num(start, nan=-1e6), _BORDER_PX) & (np.arange(n) >= fresh)
     todo = np.flatnonzero(inside if left is None else inside & left.found & _by_turns(looks))
@@ -64,7 +69,7 @@ def _by_turns(looks: Looks) -> NDArray[np.bool_]:
 
 
 def rescue(
-    before: U8, image: U8, camera: Camera, state: State, looks: Looks, sought: Sought, config: InertialConfig
+    before: U8, image: U8, camera: Camera, looks: Looks, sought: Sought, config: InertialConfig
 ) -> None:
     """Those of cam0 that were not found, followed from the image before to wherever they went."""
     inside = camera.inside(np.nan_to_num(sought.expected, nan=-1e6), _BORDER_PX)
@@ -74,19 +79,19 @@ def rescue(
     guess = sought.expected[todo].astype(np.float32)
     px, ok = klt.follow(before, image, looks.px[todo], guess, window=15, levels=2, back_check_px=1.0)
     todo = todo[ok]
-    _, warp, _ = _expected(camera, state, todo, looks, None)
-    _settle(image, looks, todo, px[ok].astype(np.float64), warp, config, _AGREE_PX, sought)
+    _settle(image, looks, todo, px[ok].astype(np.float64), sought.warp[todo], config, _AGREE_PX, sought)
 
 
 def _expected(
-    camera: Camera, state: State, which: I64, looks: Looks, T_right_left: F64 | None
-) -> tuple[F64, F64, F64]:
-    """px (N, 2), NaN behind the camera; warps (N, 2, 2) px by px; and by how many px of its first image a
-    feature moves for one unit more of inverse depth (N, 2)."""
+    camera: Camera, state: State, looks: Looks, T_right_left: F64 | None
+) -> tuple[Prediction, F64, F64, F64]:
+    """What is predicted; px (N, 2), NaN behind the camera; warps (N, 2, 2) px by px; and by how many px of
+    its first image a feature moves for one unit more of inverse depth (N, 2)."""
+    which = np.arange(len(state.ids))
     seen = observe.predict(state, which, T_right_left)
-    turned = observe.warp(state, which, looks.spread[which], looks.slant[which], T_right_left)
+    turned = observe.warp(state, which, looks.spread, looks.slant, T_right_left)
     along = np.linalg.solve(np.nan_to_num(turned) + _TINY, np.nan_to_num(seen.by_rho)[..., None])[..., 0]
-    return camera.distort(seen.uv), camera.jacobian(seen.uv) @ turned, np.asarray(along, np.float64)
+    return seen, camera.distort(seen.uv), camera.jacobian(seen.uv) @ turned, np.asarray(along, np.float64)
 
 
 def _settle(

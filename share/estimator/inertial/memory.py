@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from share.columns import Columns
 from share.estimator.inertial.features import Looks
 from share.estimator.inertial.state import State
 from share.geometry import se3
@@ -18,7 +18,7 @@ _MOST = 40  # of a keyframe
 
 
 @dataclass(frozen=True, eq=False)
-class Asleep:
+class Asleep(Columns):
     """Features: ids (N,), number of the host (N,), rays (N, 2), inverse depths and sigmas (N,), looks."""
 
     ids: I64
@@ -27,26 +27,6 @@ class Asleep:
     rho: F64
     sigma: F64
     looks: Looks
-
-    def take(self, keep: NDArray[np.bool_] | I64) -> Asleep:
-        return Asleep(
-            self.ids[keep],
-            self.host[keep],
-            self.ray[keep],
-            self.rho[keep],
-            self.sigma[keep],
-            self.looks.take(keep),
-        )
-
-    def join(self, other: Asleep) -> Asleep:
-        return Asleep(
-            np.concatenate([self.ids, other.ids]),
-            np.concatenate([self.host, other.host]),
-            np.concatenate([self.ray, other.ray]),
-            np.concatenate([self.rho, other.rho]),
-            np.concatenate([self.sigma, other.sigma]),
-            self.looks.join(other.looks),
-        )
 
 
 class Memory:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from share.columns import Columns
 from share.estimator.inertial.state import State
 from share.geometry import se3
 from share.geometry.camera import rays
@@ -19,7 +20,7 @@ _NEAREST = 0.02  # homogeneous depth below which nothing is seen
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class Prediction(Columns):
     """Of N features: uv (N, 2) normalised coordinates, NaN behind the camera; and its derivatives by the
     body's pose (N, 2, 6), the extrinsic (N, 2, 6), inverse depth (N, 2). That by the host's pose is the
     negative of that by the body's: only their difference is ever seen."""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.config import InertialConfig
-from share.estimator.inertial import ekf, features, find
+from share.estimator.inertial import ekf, features, find, observe
 from share.estimator.inertial.features import Looks
 from share.estimator.inertial.find import Sought
 from share.estimator.inertial.memory import Memory
@@ -36,15 +36,13 @@ class Scene:
         self._shunned: list[F32] = []
         self._next_feature = self._next_keyframe = 0
 
-    def add_keyframe(self, frame: Frame, rate: F64) -> int:
-        """The frame just tracked: its pose, features seen from about here before, and new ones. Its id."""
-        s, keyframe = self.state, self._next_keyframe
+    def add_keyframe(self, frame: Frame, rate: F64) -> None:
+        """The frame just tracked: its pose, features seen from about here before, and new ones."""
+        host = ekf.add_keyframe(self.state, self._next_keyframe, rate)
         self._next_keyframe += 1
-        host = ekf.add_keyframe(s, keyframe, rate)
         self._wake(frame, rate)
         self._add_features(frame, host)
         self._forget()
-        return keyframe
 
     def seen(self, left: Sought, seen: NDArray[np.bool_]) -> None:
         """Which features (N,) a frame showed. The others are gone, or asleep where they were not found."""
@@ -71,14 +69,18 @@ class Scene:
         """No new feature near px (N, 2) for a while: there goes somebody."""
         self._shunned = [*self._shunned[-_SHUN_FRAMES:], px]
 
-    def sight(self, sought: Sought, rate: F64, T_right_left: F64 | None = None) -> ekf.Sight:
-        """Rows for the filter of the features that were found in cam0, or with T_right_left in cam1."""
+    def sight(
+        self, sought: Sought, rate: F64, T_right_left: F64 | None = None, anew: bool = False
+    ) -> ekf.Sight:
+        """Rows for the filter of the features that were found in cam0, or with T_right_left in cam1.
+        anew: the state has moved since they were sought."""
         camera = self._rig.cam0 if T_right_left is None else self._rig.cam1
         assert camera is not None
         which = np.flatnonzero(sought.found)
         uv = camera.normalise(sought.px[which].astype(np.float64))
         sigma = np.full(len(which), self._config.sigma_px / camera.focal)
-        return ekf.sight(self.state, which, uv, sigma, rate, T_right_left)
+        seen = observe.predict(self.state, which, T_right_left) if anew else sought.prediction.take(which)
+        return ekf.sight(self.state, which, seen, uv, sigma, rate)
 
     def _add_features(self, frame: Frame, host: int) -> None:
         config, camera, s = self._config, self._rig.cam0, self.state

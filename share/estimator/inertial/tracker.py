@@ -17,13 +17,13 @@ from share.estimator.inertial.beginning import first_state, state_by_camera
 from share.estimator.inertial.features import Looks
 from share.estimator.inertial.samples import Samples, coasting
 from share.estimator.inertial.scene import Scene
-from share.estimator.inertial.state import POSE, VELOCITY, State
+from share.estimator.inertial.state import VELOCITY, State
 from share.estimator.localmap import LocalKeyframe, LocalMap
 from share.estimator.pose import consensus
 from share.estimator.result import TrackResult
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig, rays
-from share.types import F64, U8, Candidate, Frame, TrackState
+from share.types import F64, U8, Candidate, Frame, ImuBatch, TrackState
 from share.vision import corners
 from share.vision.view import make_view
 
@@ -54,7 +54,6 @@ class InertialTracker:
         self._image: U8 | None = None
         self._stamp_ns = 0
         self._rate = np.zeros(3)
-        self._saturated = False
         self._astray, self._refused_s = 0, 0.0  # see `_stray`
         self._waited = 0  # frames, for the IMU
         self._ready = False
@@ -93,7 +92,7 @@ class InertialTracker:
             self._anchor(frame, scene)
         new_stretch, self._new_stretch = self._new_stretch, False
         s = scene.state
-        view = make_view(frame, self._rig, self._config.view_features, scene.depths())
+        view = make_view(frame, self._rig, self._places_config.view_features, scene.depths())
         if not self._astray and not self._refused_s:
             self._places.add_keyframe(frame.image0, s.T @ s.T_body_cam)
             self._places.set_view(view)
@@ -110,14 +109,15 @@ class InertialTracker:
     # ------------------------------------------------------------------ the usual frame
 
     def _follow(self, frame: Frame, scene: Scene) -> TrackResult:
-        before, means, cov, stamp_ns = scene.state.T, *scene.state.snapshot()
-        heard = self._propagate(frame, scene.state)
+        before, imu = scene.state.T, self._heard(frame, scene.state)
+        kept = scene.state.copy() if imu is not None and self._samples.saturated(imu) else None
+        self._propagate(frame, scene.state, imu)
         left, seen = self._look(frame, scene)
-        if heard and self._contradicted(scene, left, seen):
-            scene.state.restore(means)
-            scene.state.cov, scene.state.stamp_ns = cov, stamp_ns
-            heard = self._propagate(frame, scene.state, deaf=True)
+        if kept is not None and self._contradicted(scene, left, seen):
+            scene.state, imu = kept, None
+            self._propagate(frame, scene.state, imu)
             left, seen = self._look(frame, scene)
+        heard = imu is not None
         scene.seen(left, seen)
         if not heard:
             self._rate = _mean_rate(before, scene.state.T, frame.stamp_ns - self._stamp_ns)
@@ -146,13 +146,13 @@ class InertialTracker:
         s, looks = scene.state, scene.looks
         left = find.seek(frame.image0, self._rig.cam0, s, looks, self._config)
         if self._image is not None:
-            find.rescue(self._image, frame.image0, self._rig.cam0, s, looks, left, self._config)
+            find.rescue(self._image, frame.image0, self._rig.cam0, looks, left, self._config)
         return left, self._update(frame, scene, left)
 
     def _contradicted(self, scene: Scene, left: find.Sought, seen: NDArray[np.bool_]) -> bool:
-        """Whether nearly all that is found agrees among itself and not with the IMU, which is saturated."""
+        """Whether nearly all that is found agrees among itself and not with the IMU."""
         which = np.flatnonzero(left.found)
-        if not self._saturated or len(which) < self._config.weak or seen.sum() > _MINORITY * len(which):
+        if len(which) < self._config.weak or seen.sum() > _MINORITY * len(which):
             return False
         s = scene.state
         T_odom_host = s.poses[s.host[which]] @ s.T_body_cam
@@ -162,22 +162,29 @@ class InertialTracker:
         agree = consensus(points, uv, self._rig.cam0.focal, self._places_config.ransac_px, self._seed)
         return agree is not None and bool(agree.inliers.mean() > _MAJORITY)
 
-    def _propagate(self, frame: Frame, s: State, deaf: bool = False) -> bool:
-        """To when the image was taken. Whether the IMU was heard."""
-        to_ns = frame.stamp_ns + round(s.offset_s * 1e9)
+    def _heard(self, frame: Frame, s: State) -> ImuBatch | None:
+        """What the IMU said until the image was taken; None if it was silent."""
+        to_ns = self._taken_ns(frame, s)
         if to_ns <= s.stamp_ns:
-            return True
-        imu = self._samples.between(s.stamp_ns, to_ns, round(self._config.silent_s * 1e9))
-        self._saturated = imu is not None and self._samples.saturated(imu)
-        if imu is not None and not deaf:
-            self._rate = ekf.propagate(s, imu, to_ns, self._noise, self._config.gravity)
-            slow = np.linalg.norm(self._rate) < _REST_RATE and np.linalg.norm(s.v) < _SLOW_M_S
-            if slow and self._samples.still(to_ns):
-                ekf.rest(s, _REST_M_S, self._config.gate)
-            return True
-        imu = coasting(s, self._rate, to_ns, self._config.gravity)
-        ekf.propagate(s, imu, to_ns, self._coasting, self._config.gravity)
-        return False
+            return ImuBatch.empty()
+        return self._samples.between(s.stamp_ns, to_ns, round(self._config.silent_s * 1e9))
+
+    def _propagate(self, frame: Frame, s: State, imu: ImuBatch | None) -> None:
+        """To when the image was taken; without an IMU, as the body went before."""
+        to_ns, gravity = self._taken_ns(frame, s), self._config.gravity
+        if to_ns <= s.stamp_ns:
+            return
+        if imu is None:
+            ekf.propagate(s, coasting(s, self._rate, to_ns, gravity), to_ns, self._coasting, gravity)
+            return
+        self._rate = ekf.propagate(s, imu, to_ns, self._noise, gravity)
+        slow = np.linalg.norm(self._rate) < _REST_RATE and np.linalg.norm(s.v) < _SLOW_M_S
+        if slow and self._samples.still(to_ns):
+            ekf.rest(s, _REST_M_S, self._config.gate)
+
+    def _taken_ns(self, frame: Frame, s: State) -> int:
+        """When the image was taken, IMU time."""
+        return frame.stamp_ns + round(s.offset_s * 1e9)
 
     def _update(self, frame: Frame, scene: Scene, left: find.Sought) -> NDArray[np.bool_]:
         """Which features (N,) were seen and believed."""
@@ -188,12 +195,13 @@ class InertialTracker:
             right = find.seek(frame.image1, self._rig.cam1, s, scene.looks, config, T, left=left)
             sought.append((right, T))
 
-        def rows_now() -> ekf.Sight:
-            rows = ekf.join(*(scene.sight(image, self._rate, T) for image, T in sought))
+        def rows_now(anew: bool = True) -> ekf.Sight:
+            first, *others = (scene.sight(image, self._rate, T, anew) for image, T in sought)
+            rows = first.join(*others)
             return rows.take(np.argsort(rows.host, kind="stable"))
 
         seen = np.zeros(len(s.ids), bool)
-        rows = rows_now()
+        rows = rows_now(anew=False)
         if len(rows.which) == 0:
             return seen
         if np.median(np.abs(rows.residual)) * self._rig.cam0.focal > _FAR_OFF_PX:
@@ -238,7 +246,7 @@ class InertialTracker:
         return bool(
             finite
             and np.linalg.norm(s.v) < self._config.max_speed_m_s
-            and self._drift_m(s) < self._config.lost_m
+            and ekf.drift_m(s) < self._config.lost_m
         )
 
     def _converged(self, s: State) -> bool:
@@ -248,14 +256,6 @@ class InertialTracker:
     def _tilt(self, s: State) -> float:
         """Sigma, rad."""
         return float(np.sqrt(s.cov[0, 0] + s.cov[1, 1]))
-
-    def _drift_m(self, s: State) -> float:
-        """Sigma of the position against the newest keyframe's."""
-        k = s.keyframe(len(s.keyframes) - 1)
-        P = s.cov
-        D = P[POSE, POSE] + P[k, k] - P[POSE, k] - P[k, POSE]
-        H = np.hstack([-se3.hat(s.T[:3, 3]), np.eye(3)])
-        return float(np.sqrt(max(np.trace(H @ D @ H.T), 0.0)))
 
     def _pose(self, s: State) -> F64:
         """At the frame's stamp, IMU time: the state is where the image was taken."""
