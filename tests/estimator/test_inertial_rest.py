@@ -4,7 +4,7 @@ import numpy as np
 from imu_world import NOISE, Path, imu_of
 
 from share.estimator.inertial import ekf
-from share.estimator.inertial.samples import Samples
+from share.estimator.inertial.samples import Samples, unclipped
 from share.estimator.inertial.state import CORE, VELOCITY, begin
 from share.types import ImuBatch
 
@@ -51,7 +51,14 @@ def test_nothing_heard_lately_is_not_rest():
 def test_an_axis_at_the_end_of_its_scale():
     t, rng = np.arange(0, 1, 1 / NOISE.rate_hz), np.random.default_rng(6)
     imu = imu_of(Path(2, turn=3.0), t, rng=rng)[0]
-    assert not heard(imu).saturated(imu)
+    assert not heard(imu).clipped(imu).any()
     most = np.abs(imu.gyro).max() / 2
     cut = ImuBatch(imu.stamps_ns, imu.gyro.clip(-most, most), imu.accel)
-    assert heard(cut).saturated(cut)
+    assert heard(cut).clipped(cut)[:3].any()
+    assert not heard(cut).clipped(cut)[3:].any()
+
+
+def test_a_clipped_axis_goes_on_as_it_did():
+    imu = ImuBatch(np.arange(2), np.array([[1.0, -1.0, 1.0], [1.0, 0.2, 1.0]]), np.zeros((2, 3)))
+    out = unclipped(imu, np.array([True, True, False]), np.array([1.5, -2.0, 9.0]))
+    assert out.gyro.tolist() == [[1.5, -2.0, 1.0], [1.5, 0.2, 1.0]]

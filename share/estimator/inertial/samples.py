@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from numpy.typing import NDArray
 
 from share.estimator.inertial.state import State
 from share.geometry import se3
@@ -11,7 +14,8 @@ from share.types import F64, ImuBatch
 _KEPT = 600
 _REST_S, _FEWEST = 0.5, 20  # samples of so long, and so many, tell rest
 _REST_SHAKE, _REST_TURN = 0.12, 0.02  # m/s^2 and rad/s, standard deviations: about twice a D435i's noise
-_REPEATED = 4  # samples at the end of the scale
+_REPEATED = 4  # samples at the end of the scale,
+_MUCH = np.repeat([0.5, 11.0], 3)  # rad/s and m/s^2, which no scale ends below
 
 
 class Samples:
@@ -51,9 +55,19 @@ class Samples:
         shake, turn = self.all.accel[last].std(axis=0), self.all.gyro[last].std(axis=0)
         return bool(np.linalg.norm(shake) < _REST_SHAKE and np.linalg.norm(turn) < _REST_TURN)
 
-    def saturated(self, imu: ImuBatch) -> bool:
-        """Whether an axis shows the most that it ever has several times: noise does not repeat itself."""
-        return bool((np.abs(np.hstack([imu.gyro, imu.accel])) == self._most).sum(axis=0).max() >= _REPEATED)
+    def clipped(self, imu: ImuBatch) -> NDArray[np.bool_]:
+        """Which axes (6,), gyro then accelerometer, are at the end of their scale: they show the most
+        that they ever have several times, and much. Noise does not repeat itself."""
+        size = np.abs(np.hstack([imu.gyro, imu.accel]))
+        out: NDArray[np.bool_] = ((size == self._most) & (size > _MUCH)).sum(axis=0) >= _REPEATED
+        return out
+
+
+def unclipped(imu: ImuBatch, axes: NDArray[np.bool_], rate: F64) -> ImuBatch:
+    """Gyro axes (3,) that are at the end of their scale turn on as they did, rate (3,) rad/s as a gyro says
+    it, if that is more."""
+    more = axes & (np.abs(rate) > np.abs(imu.gyro)) & (rate * imu.gyro > 0)
+    return replace(imu, gyro=np.where(more, rate, imu.gyro))
 
 
 def coasting(state: State, rate: F64, to_ns: int, gravity: float) -> ImuBatch:

@@ -7,6 +7,8 @@ Without the IMU the body is taken to go on as it does, without sight the IMU car
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,21 +17,19 @@ from share.estimator import relocalise
 from share.estimator.inertial import ekf, find
 from share.estimator.inertial.beginning import first_state, state_by_camera
 from share.estimator.inertial.features import Looks
-from share.estimator.inertial.samples import Samples, coasting
+from share.estimator.inertial.samples import Samples, coasting, unclipped
 from share.estimator.inertial.scene import Scene
 from share.estimator.inertial.state import VELOCITY, State
 from share.estimator.localmap import LocalKeyframe, LocalMap
-from share.estimator.pose import consensus
 from share.estimator.result import TrackResult
 from share.geometry import se3
-from share.geometry.camera import ImuNoise, Rig, rays
+from share.geometry.camera import ImuNoise, Rig
 from share.types import F64, U8, Candidate, Frame, ImuBatch, TrackState
 from share.vision import corners
 from share.vision.view import make_view
 
 _READY_RAD, _READY_M_S = np.radians(3.0), 0.3  # sigmas of tilt and velocity: a pose is worth telling
 _FAR_OFF_PX = 1.0  # median residual, from which derivatives are taken anew
-_MINORITY, _MAJORITY = 0.3, 0.7  # of the features found: believed after the IMU; agreeing against it
 _ASTRAY, _REFUSED_S = 3, 1.0  # frames with nothing of what should be there; time with nothing believed
 _REST_RATE, _REST_M_S = 0.03, 0.02  # rad/s of a body at rest; m/s of its velocity
 _SLOW_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to a filter that knows it moves
@@ -110,16 +110,11 @@ class InertialTracker:
 
     def _follow(self, frame: Frame, scene: Scene) -> TrackResult:
         before, imu = scene.state.T, self._heard(frame, scene.state)
-        kept = scene.state.copy() if imu is not None and self._samples.saturated(imu) else None
-        self._propagate(frame, scene.state, imu)
+        measured = self._propagate(frame, scene.state, imu)
         left, seen = self._look(frame, scene)
-        if kept is not None and self._contradicted(scene, left, seen):
-            scene.state, imu = kept, None
-            self._propagate(frame, scene.state, imu)
-            left, seen = self._look(frame, scene)
         heard = imu is not None
         scene.seen(left, seen)
-        if not heard:
+        if not measured:
             self._rate = _mean_rate(before, scene.state.T, frame.stamp_ns - self._stamp_ns)
         count = int(seen.sum())
         textured = count >= self._config.blind or corners.count(frame.image0) >= self._config.weak
@@ -149,19 +144,6 @@ class InertialTracker:
             find.rescue(self._image, frame.image0, self._rig.cam0, looks, left, self._config)
         return left, self._update(frame, scene, left)
 
-    def _contradicted(self, scene: Scene, left: find.Sought, seen: NDArray[np.bool_]) -> bool:
-        """Whether nearly all that is found agrees among itself and not with the IMU."""
-        which = np.flatnonzero(left.found)
-        if len(which) < self._config.weak or seen.sum() > _MINORITY * len(which):
-            return False
-        s = scene.state
-        T_odom_host = s.poses[s.host[which]] @ s.T_body_cam
-        in_host = rays(s.ray[which]) / np.maximum(s.rho[which, None], 1e-3)
-        points = (T_odom_host[:, :3, :3] @ in_host[:, :, None])[:, :, 0] + T_odom_host[:, :3, 3]
-        uv = self._rig.cam0.normalise(left.px[which].astype(np.float64))
-        agree = consensus(points, uv, self._rig.cam0.focal, self._places_config.ransac_px, self._seed)
-        return agree is not None and bool(agree.inliers.mean() > _MAJORITY)
-
     def _heard(self, frame: Frame, s: State) -> ImuBatch | None:
         """What the IMU said until the image was taken; None if it was silent."""
         to_ns = self._taken_ns(frame, s)
@@ -169,18 +151,23 @@ class InertialTracker:
             return ImuBatch.empty()
         return self._samples.between(s.stamp_ns, to_ns, round(self._config.silent_s * 1e9))
 
-    def _propagate(self, frame: Frame, s: State, imu: ImuBatch | None) -> None:
-        """To when the image was taken; without an IMU, as the body went before."""
+    def _propagate(self, frame: Frame, s: State, imu: ImuBatch | None) -> bool:
+        """To when the image was taken; without an IMU, as the body went before. Whether the IMU measured how
+        it turns."""
         to_ns, gravity = self._taken_ns(frame, s), self._config.gravity
         if to_ns <= s.stamp_ns:
-            return
+            return True
         if imu is None:
             ekf.propagate(s, coasting(s, self._rate, to_ns, gravity), to_ns, self._coasting, gravity)
-            return
-        self._rate = ekf.propagate(s, imu, to_ns, self._noise, gravity)
+            return False
+        clipped = self._samples.clipped(imu)
+        noise = _without(self._noise, self._coasting, clipped)
+        imu = unclipped(imu, clipped[:3], self._rate + s.bg)
+        self._rate = ekf.propagate(s, imu, to_ns, noise, gravity)
         slow = np.linalg.norm(self._rate) < _REST_RATE and np.linalg.norm(s.v) < _SLOW_M_S
         if slow and self._samples.still(to_ns):
             ekf.rest(s, _REST_M_S, self._config.gate)
+        return not clipped[:3].any()
 
     def _taken_ns(self, frame: Frame, s: State) -> int:
         """When the image was taken, IMU time."""
@@ -333,6 +320,15 @@ def _mean_rate(before: F64, after: F64, dt_ns: int) -> F64:
     """rad/s (3,), in the body."""
     out: F64 = se3.so3_log(before[:3, :3].T @ after[:3, :3]) / max(dt_ns * 1e-9, 1e-3)
     return out
+
+
+def _without(imu: ImuNoise, coasting: ImuNoise, clipped: NDArray[np.bool_]) -> ImuNoise:
+    """Noise of an IMU of whose axes (6,) some are at the end of their scale."""
+    return replace(
+        imu,
+        gyro_density=coasting.gyro_density if clipped[:3].any() else imu.gyro_density,
+        accel_density=coasting.accel_density if clipped[3:].any() else imu.accel_density,
+    )
 
 
 def _louder(imu: ImuNoise, times: float) -> ImuNoise:
