@@ -39,6 +39,11 @@ def live(count: int, depth_scale: float = 1000.0) -> Iterator[Measurement]:
 def frames(source: Source) -> list[Frame]:
     counters = SequencerCounters()
     bundles = sequence(
-        source.measurements(), streams_of(source.rig), source.rate_hz, SequencerConfig(), counters
+        source.measurements(),
+        streams_of(source.rig),
+        source.rate_hz,
+        SequencerConfig(),
+        counters,
+        source.rig.timeshift_ns,
     )
     return [load(bundle) for bundle in bundles]

@@ -132,6 +132,8 @@ def _text(d: dict[str, Any]) -> str:
             lines.append(f"  {name:<6} {_camera(d['calibration'][name])}")
     if "baseline_m" in d["calibration"]:
         lines.append(f"  baseline {100 * d['calibration']['baseline_m']:.2f} cm")
+    if shift := d["calibration"].get("timeshift_s", 0.0):
+        lines.append(f"  IMU time less camera time {1e3 * shift:.3f} ms")
     truth = d["truth"]
     lines.append(
         f"  truth  {truth['poses']} poses, {truth['length_m']:.2f} m in {truth['duration_s']:.1f} s"

@@ -65,13 +65,15 @@ def sequence(
     rate_hz: float,
     config: SequencerConfig,
     counters: SequencerCounters,
+    imu_shift_ns: int = 0,
 ) -> Iterator[Bundle]:
-    """Merge by time. `streams` as `streams_of` gives them; rate_hz: the frame rate, 0 if unknown.
+    """Merge by time. `streams` as `streams_of` gives them; rate_hz: the frame rate, 0 if unknown;
+    imu_shift_ns: IMU time less camera time, by which a frame's IMU samples are later stamped than it.
 
     Streams may be out of step with each other by up to imu_silent_ms, and within themselves by
     reorder_ms: such disorder does not change the bundles. Memory is bounded by these times.
     """
-    repair, merger = StampRepair(config.max_jump_s), _Merger(streams, rate_hz, config, counters)
+    repair, merger = StampRepair(config.max_jump_s), _Merger(streams, rate_hz, config, counters, imu_shift_ns)
     for measurement in measurements:
         if measurement.stream in merger.buffers:
             for stamp, usable in repair.feed(measurement):
@@ -130,7 +132,12 @@ class _Buffer:
 
 class _Merger:
     def __init__(
-        self, streams: Collection[str], rate_hz: float, config: SequencerConfig, counters: SequencerCounters
+        self,
+        streams: Collection[str],
+        rate_hz: float,
+        config: SequencerConfig,
+        counters: SequencerCounters,
+        imu_shift_ns: int = 0,
     ) -> None:
         self.buffers = {name: _Buffer(_ns(config.reorder_ms)) for name in streams}
         self.backward = 0
@@ -142,6 +149,7 @@ class _Merger:
         self._counters = counters
         self._tolerance = _ns(config.sync_tolerance_ms)
         self._wait = _ns(config.imu_silent_ms) + _ns(config.reorder_ms)
+        self._shift, self._ahead = imu_shift_ns, max(imu_shift_ns, 0)
         self._keep = int(config.max_jump_s * 1e9)
         self._gap = config.gap_factor / rate_hz * 1e9 if rate_hz > 0 else float("inf")
 
@@ -175,12 +183,12 @@ class _Merger:
 
     def _settled(self, stamp: int) -> bool:
         """Whether waiting longer can change nothing in the frame at `stamp`, or has lasted too long."""
-        if self._now >= stamp + self._wait + self._tolerance:
+        if self._now >= stamp + self._wait + self._tolerance + self._ahead:
             return True
         return (
             self._images.reached >= stamp
             and all(self._has_partner(buffer, stamp) for buffer in self._partners)
-            and self._imu_reached(stamp)
+            and self._imu_reached(stamp + self._shift)
         )
 
     def _has_partner(self, buffer: _Buffer, stamp: int) -> bool:
@@ -213,7 +221,7 @@ class _Merger:
             image0=image0,
             image1=images.get(CAM1),
             depth=images.get(DEPTH),
-            imu=self._take_imu(stamp),
+            imu=self._take_imu(stamp + self._shift),
             gap_ns=gap,
         )
         self._last = stamp
@@ -236,7 +244,7 @@ class _Merger:
 
     def _forget(self) -> None:
         """Drop what no frame can want any more, so that a stream without frames does not fill memory."""
-        oldest = self._now - 2 * (self._wait + self._tolerance)
+        oldest = self._now - 2 * (self._wait + self._tolerance) - self._ahead
         for buffer in self._partners:
             if buffer.items and buffer.items[0][0] < oldest:
                 self._counters.unpaired += len(buffer.pop_until(oldest))

@@ -6,11 +6,13 @@ plumb-bob model k1 k2 p1 p2 [k3] (Brown 1966), Kalibr's `radtan` and EuRoC's `ra
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from share.types import F64, checked_pose
+
+MOST_TIMESHIFT_S = 1.0
 
 
 def rays(uv: F64) -> F64:
@@ -135,7 +137,9 @@ class ImuNoise:
 class Rig:
     """All cameras of one agent in its body frame (the IMU's; cam0's where there is no IMU).
 
-    cam1 makes it stereo, depth makes it RGB-D; a depth camera need not be registered to cam0.
+    cam1 makes it stereo, depth makes it RGB-D; a depth camera need not be registered to cam0. timeshift_s:
+    IMU time less camera time, s, at most 1 s; what the camera stamps t happened when the IMU stamped
+    t + timeshift_s (Kalibr's timeshift_cam_imu).
     """
 
     cam0: Camera
@@ -145,6 +149,7 @@ class Rig:
     depth: Camera | None = None
     T_depth_cam0: F64 | None = None
     imu: ImuNoise | None = None
+    timeshift_s: float = 0.0
 
     def __post_init__(self) -> None:
         if (self.cam1 is None) != (self.T_cam1_cam0 is None):
@@ -155,12 +160,23 @@ class Rig:
             T = getattr(self, name)
             if T is not None:
                 object.__setattr__(self, name, checked_pose(name, T))
+        if not abs(self.timeshift_s) <= MOST_TIMESHIFT_S:
+            raise ValueError(f"timeshift_s: {self.timeshift_s} is not within {MOST_TIMESHIFT_S:g} s")
+
+    def without_imu(self) -> Rig:
+        """The same cameras where no IMU was recorded: the body is cam0."""
+        return replace(self, imu=None, T_body_cam0=np.eye(4), timeshift_s=0.0)
 
     @property
     def kind(self) -> str:
         """`stereo`, `rgbd` or `mono`, with `+imu` where there is one."""
         eyes = "stereo" if self.cam1 else "rgbd" if self.depth else "mono"
         return eyes + ("+imu" if self.imu else "")
+
+    @property
+    def timeshift_ns(self) -> int:
+        """`timeshift_s` in ns."""
+        return round(self.timeshift_s * 1e9)
 
     @property
     def baseline(self) -> float:

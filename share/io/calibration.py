@@ -14,13 +14,15 @@ import numpy as np
 
 from share.errors import ConfigError
 from share.geometry import se3
-from share.geometry.camera import Camera, ImuNoise, Rig
+from share.geometry.camera import MOST_TIMESHIFT_S, Camera, ImuNoise, Rig
 from share.io.section import Section, read_yaml
 from share.types import F64
 
 CAMCHAIN = "kalibr_imucam_chain.yaml"
 IMU_CHAIN = "kalibr_imu_chain.yaml"
 _RADTAN = ("radtan", "radial-tangential", "plumb_bob")
+TIMESHIFT = "timeshift_cam_imu"
+_AGREE_S = 1e-3  # timeshifts of two cameras that look together
 _DEPTH_SCALE = 1000.0  # 16-bit depth in millimetres, as ROS and RealSense have it
 
 
@@ -58,6 +60,7 @@ def kalibr(chain: Section, imu: Section | None) -> Calibration:
         cam0=_camera(cam0),
         T_body_cam0=kalibr_T_imu_cam(cam0) if imu else np.eye(4),
         imu=imu_noise(imu, "update_rate") if imu else None,
+        timeshift_s=_timeshift_s([cams[name] for name in ("cam0", "cam1") if name in cams]) if imu else 0.0,
     )
     if "cam1" in cams:
         T_cam1_cam0 = _kalibr_T_cam1_cam0(cam0, cams["cam1"])
@@ -167,6 +170,27 @@ def kalibr_T_imu_cam(cam: Section) -> F64:
     if "T_imu_cam" in cam:
         return cam.pose("T_imu_cam")
     raise ConfigError(f"{cam.where}: has no extrinsics to the IMU; add T_cam_imu (or T_imu_cam)")
+
+
+def _timeshift_s(cams: list[Section]) -> float:
+    """IMU time less camera time, s: the mean of what the cameras say, 0 where they say nothing."""
+    said = [_one_timeshift_s(cam) for cam in cams if TIMESHIFT in cam]
+    if said and max(said) - min(said) > _AGREE_S:
+        raise ConfigError(
+            f"{cams[-1].where}: {TIMESHIFT}: {said[-1]:g} s, but {said[0]:g} s of cam0; both look at "
+            f"the same time, so these must agree within {_AGREE_S:g} s"
+        )
+    return float(np.mean(said)) if said else 0.0
+
+
+def _one_timeshift_s(cam: Section) -> float:
+    shift = cam.number(TIMESHIFT)
+    if abs(shift) > MOST_TIMESHIFT_S:
+        raise ConfigError(
+            f"{cam.where}: {TIMESHIFT}: {shift:g} s is more than {MOST_TIMESHIFT_S:g} s; "
+            "it is given in seconds"
+        )
+    return shift
 
 
 def _kalibr_T_cam1_cam0(cam0: Section, cam1: Section) -> F64:

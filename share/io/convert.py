@@ -46,6 +46,8 @@ def to_euroc(source: Source, out: Path, progress: Progress) -> None:
     """Write a stereo or mono source as `out`/mav0. On error: nothing. Raises UsageError."""
     if source.rig.depth:
         raise UsageError("--format euroc: an ASL folder has no place for depth images; use mcap")
+    if source.rig.timeshift_s:
+        raise UsageError("--format euroc: an ASL folder has no place for the cameras' timeshift; use mcap")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is not an empty folder; give a new name")
     writable_dir(out.parent)

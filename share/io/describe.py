@@ -54,6 +54,7 @@ def describe_rig(rig: Rig) -> dict[str, Any]:
         out["baseline_m"] = round(rig.baseline, 6)
     if rig.imu:
         out["imu"] = {name: getattr(rig.imu, name) for name in rig.imu.__dataclass_fields__}
+        out["timeshift_s"] = rig.timeshift_s
     return out
 
 

@@ -6,7 +6,6 @@ Format: Burri et al., *The EuRoC micro aerial vehicle datasets*, IJRR 35(10), 20
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +50,7 @@ def fit(rig: Rig, root: Path) -> Rig:
             f"{root}: the calibration has {missing}, the recording has not; give another --calib"
         )
     if rig.imu and not (root / "imu0").is_dir():
-        return replace(rig, imu=None, T_body_cam0=np.eye(4))
+        return rig.without_imu()
     return rig
 
 

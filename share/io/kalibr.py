@@ -6,18 +6,20 @@ from typing import Any
 
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
+from share.io.calibration import TIMESHIFT
 
 _DEPTH_SCALE = 1000.0  # 16-bit depth in millimetres
 
 
 def to_kalibr(rig: Rig) -> dict[str, Any]:
     """cam0, cam1, depth (ours) and imu0 of the rig, as plain data for a YAML file."""
-    out = {"cam0": _camera(rig.cam0)}
+    shift = {TIMESHIFT: rig.timeshift_s} if rig.timeshift_s else {}  # 0 is what its absence means
+    out = {"cam0": _camera(rig.cam0) | shift}
     if rig.imu is not None:
         out["cam0"]["T_cam_imu"] = se3.inverse(rig.T_body_cam0).tolist()
         out["imu0"] = _imu(rig.imu)
     if rig.cam1 is not None and rig.T_cam1_cam0 is not None:
-        out["cam1"] = _camera(rig.cam1) | {"T_cn_cnm1": rig.T_cam1_cam0.tolist()}
+        out["cam1"] = _camera(rig.cam1) | shift | {"T_cn_cnm1": rig.T_cam1_cam0.tolist()}
     if rig.depth is not None and rig.T_depth_cam0 is not None:
         T = rig.T_depth_cam0.tolist()
         out["depth"] = _camera(rig.depth) | {"T_depth_cam0": T, "depth_scale": _DEPTH_SCALE}

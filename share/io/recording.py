@@ -64,8 +64,9 @@ class Span(NamedTuple):
 _EVER = 2**62
 
 
-def span_of(cam0: I64, frames: slice | None, where: str) -> Span:
-    """The span of cam0's images number `frames`, with the IMU samples since the image before them.
+def span_of(cam0: I64, frames: slice | None, where: str, imu_shift_ns: int = 0) -> Span:
+    """The span of cam0's images number `frames`, with the IMU samples since the image before them, whose
+    stamps are imu_shift_ns later than those of images taken with them.
 
     Raises UsageError if nothing is left or the slice has a step.
     """
@@ -80,8 +81,8 @@ def span_of(cam0: I64, frames: slice | None, where: str) -> Span:
     return Span(
         image_from=(before + int(cam0[first])) // 2 if first else -_EVER,
         image_to=(until + int(cam0[last])) // 2 if last < len(cam0) else _EVER,
-        imu_from=before,
-        imu_to=until if last < len(cam0) else _EVER,
+        imu_from=before + imu_shift_ns,
+        imu_to=until + imu_shift_ns if last < len(cam0) else _EVER,
     )
 
 
@@ -112,7 +113,7 @@ class FolderSource(Source):
         """The same recording, only the frames number `frames` of cam0."""
         if not self.images[CAM0]:
             raise DataError(f"{self.name}: has no images")
-        span = span_of(self.stamps()[CAM0], frames, self.name)
+        span = span_of(self.stamps()[CAM0], frames, self.name, self.rig.timeshift_ns)
         lo, hi = span.limits(CAM0)
         images = {
             name: [(stamp, image) for stamp, image in items if lo < stamp <= hi]

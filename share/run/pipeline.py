@@ -28,8 +28,10 @@ def frames_of(
 
     `spent` is told the CPU time of each frame's decoding on this thread.
     """
-    streams = streams_of(source.rig)
-    bundles = sequence(source.measurements(), streams, source.rate_hz, config.sequencer, counters)
+    rig = source.rig
+    bundles = sequence(
+        source.measurements(), streams_of(rig), source.rate_hz, config.sequencer, counters, rig.timeshift_ns
+    )
     for bundle in bundles:
         began = time.thread_time()
         try:

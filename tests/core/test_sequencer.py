@@ -121,6 +121,27 @@ def test_a_frame_goes_out_as_soon_as_it_is_whole():
     assert all(now == stamp for stamp, now in out[:-1])
 
 
+@pytest.mark.parametrize("shift", [20 * MS, -20 * MS, 300 * MS])
+def test_an_imu_with_a_shifted_clock_gives_the_same_samples(shift):
+    """A frame waits until the IMU has reached the time when its image was taken, and no longer."""
+    expected, _ = run(recording(12))
+    late = [replace(m, stamp_ns=m.stamp_ns + shift) if m.stream == "imu" else m for m in recording(12)]
+    counters, newest = SequencerCounters(), [0]
+
+    def feed():
+        for m in in_order(late):
+            newest.append(m.stamp_ns)
+            yield m
+
+    for b, e in zip(
+        sequence(feed(), STEREO_IMU, RATE, CONFIG, counters, imu_shift_ns=shift), expected, strict=True
+    ):
+        assert (b.stamp_ns, b.image0, b.image1) == (e.stamp_ns, e.image0, e.image1)
+        assert (b.imu.stamps_ns - shift).tolist() == e.imu.stamps_ns.tolist()
+        assert newest[-1] == b.stamp_ns + max(shift, 0)
+    assert counters == SequencerCounters(frames=12, imu_samples=12 * 10 + 1)
+
+
 def test_duplicates_and_steps_back_are_dropped_and_counted():
     ordered = recording(6)
     again = [m for m in ordered for _ in range(2)]

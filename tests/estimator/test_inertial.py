@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from share.config import Config, InertialConfig, TrackerConfig
+from share.core.measurement import IMU
 from share.core.sequencer import SequencerCounters
 from share.estimator.inertial.tracker import InertialTracker
 from share.geometry.camera import Camera, ImuNoise, Rig
@@ -84,6 +85,37 @@ def test_up_is_up(walk):
     up = truth.T[np.argmin(np.abs(truth.stamps_ns - last))][2, :3]
     assert np.degrees(np.arccos(tracker.state.T[2, :3] @ up)) < 1.5
     assert np.linalg.norm(candidates[-1].up) == pytest.approx(1)
+
+
+class Late:
+    """A source whose IMU has a clock of its own, as its calibration says."""
+
+    def __init__(self, source, shift_s):
+        self.rig, self.rate_hz = dataclasses.replace(source.rig, timeshift_s=shift_s), source.rate_hz
+        self._source = source
+
+    def measurements(self):
+        shift = self.rig.timeshift_ns
+        late = (
+            dataclasses.replace(m, stamp_ns=m.stamp_ns + shift) if m.stream == IMU else m
+            for m in self._source.measurements()
+        )
+        return iter(sorted(late, key=lambda m: m.stamp_ns))
+
+
+@pytest.mark.parametrize("shift_s", [0.02, -0.02])
+def test_a_timeshift_that_the_calibration_tells_costs_nothing(walk, plain_session, shift_s):
+    """Poses are of when the IMU's clock shows the stamp, so the truth is shifted too."""
+    source = Late(open_source(f"{plain_session}/ar1"), shift_s)
+    frames = list(frames_of(source, Config(), SequencerCounters()))
+    truth = Trajectory(walk[2].stamps_ns + source.rig.timeshift_ns, walk[2].T)
+    results, _, tracker = run((None, source.rig, truth), frames)
+    assert tracker.state.offset_s == pytest.approx(shift_s, abs=1e-3)
+    assert states(results)[3:] == [OK] * (len(frames) - 3)
+    clean = error_m(walk, walk[0], run(walk, walk[0])[0])
+    assert error_m((None, None, truth), frames, results) < clean + 0.001
+    deceived, _, _ = run((None, dataclasses.replace(source.rig, timeshift_s=0.0), truth), frames)
+    assert error_m((None, None, truth), frames, deceived) > 2 * clean
 
 
 def test_same_frames_same_bits(walk):

@@ -64,6 +64,12 @@ def test_rig_wants_extrinsics_with_every_second_camera():
         Rig(PLAIN, 2 * np.eye(4))
 
 
+@pytest.mark.parametrize("seconds", [1.1, -20.0, float("nan"), float("inf")])
+def test_rig_wants_a_timeshift_of_at_most_a_second(seconds):
+    with pytest.raises(ValueError, match="timeshift_s"):
+        Rig(PLAIN, np.eye(4), timeshift_s=seconds)
+
+
 def test_rig_says_what_it_is():
     T = np.eye(4)
     T[0, 3] = -0.05

@@ -7,7 +7,9 @@ import pytest
 
 from share.errors import ConfigError
 from share.geometry import se3
-from share.io.calibration import CAMCHAIN, IMU_CHAIN, read_calibration, read_camera_yaml
+from share.io.calibration import CAMCHAIN, IMU_CHAIN, kalibr, read_calibration, read_camera_yaml
+from share.io.kalibr import to_kalibr
+from share.io.section import Section
 
 CAM = """
   camera_model: pinhole
@@ -102,6 +104,57 @@ GOOD0 = f"  T_cam_imu: {matrix(T_CAM0_IMU)}\n"
 def test_what_is_wrong_is_said_with_file_and_key(tmp_path, text, complaint):
     with pytest.raises(ConfigError, match=rf"(?s){CAMCHAIN}.*{complaint}"):
         read_calibration(write(tmp_path, text))
+
+
+SHIFT0 = GOOD0 + "  timeshift_cam_imu: {}\n"
+SHIFT1 = f"  T_cn_cnm1: {matrix(T_CAM1_CAM0)}\n" + "  timeshift_cam_imu: {}\n"
+
+
+@pytest.mark.parametrize(
+    ("camchain", "seconds"),
+    [
+        (chain(GOOD0), 0.0),
+        (chain(SHIFT0.format(-0.0123)), -0.0123),
+        (chain(SHIFT0.format("2e-3"), SHIFT1.format(0.0028)), 0.0024),
+        (chain(GOOD0, SHIFT1.format(0.005)), 0.005),
+    ],
+)
+def test_timeshift_is_the_cameras_mean(tmp_path, camchain, seconds):
+    rig = read_calibration(write(tmp_path, camchain)).rig
+    assert rig.timeshift_s == pytest.approx(seconds, abs=1e-15)
+    assert rig.without_imu().timeshift_s == 0
+    alone = read_calibration(tmp_path / CAMCHAIN).rig
+    assert (alone.kind.endswith("imu"), alone.timeshift_s) == (False, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("camchain", "complaint"),
+    [
+        (chain(SHIFT0.format(20)), "cam0: timeshift_cam_imu: 20 s is more than 1 s; it is given in seconds"),
+        (chain(SHIFT0.format(".nan")), "cam0: timeshift_cam_imu: has values that are not finite"),
+        (chain(SHIFT0.format("late")), "cam0: timeshift_cam_imu: expected numbers, found .'late'."),
+        (
+            chain(SHIFT0.format(0.004), SHIFT1.format(0.0055)),
+            "cam1: timeshift_cam_imu: 0.0055 s, but 0.004 s of cam0; .* must agree within 0.001 s",
+        ),
+    ],
+)
+def test_a_timeshift_that_cannot_be(tmp_path, camchain, complaint):
+    with pytest.raises(ConfigError, match=rf"{CAMCHAIN}: {complaint}") as error:
+        read_calibration(write(tmp_path, camchain))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("seconds", [0.0, -0.02])
+def test_a_rig_written_under_kalibrs_names_is_read_as_it_was(tmp_path, seconds):
+    text = chain(SHIFT0.format(seconds), SHIFT1.format(seconds))
+    rig = read_calibration(write(tmp_path, text)).rig
+    written = Section(to_kalibr(rig), "written")
+    for name in ("cam0", "cam1"):
+        assert ("timeshift_cam_imu" in written.section(name)) == (seconds != 0)
+    back = kalibr(written, written.section("imu0")).rig
+    assert (back.cam0, back.cam1, back.imu, back.timeshift_s) == (rig.cam0, rig.cam1, rig.imu, seconds)
+    np.testing.assert_allclose(back.T_body_cam0, rig.T_body_cam0, atol=1e-12)
 
 
 def test_imu_chain_and_missing_files(tmp_path):

@@ -1,6 +1,7 @@
 """MCAP: what is recorded comes back bit for bit, others can read it, others' files can be read, and a
 killed recorder's file can be recovered."""
 
+import dataclasses
 import os
 import time
 from pathlib import Path
@@ -38,7 +39,7 @@ def assert_same(a, b):
 
 
 def assert_same_rig(a: Rig, b: Rig):
-    assert (a.cam0, a.cam1, a.depth, a.imu) == (b.cam0, b.cam1, b.depth, b.imu)
+    assert (a.cam0, a.cam1, a.depth, a.imu, a.timeshift_s) == (b.cam0, b.cam1, b.depth, b.imu, b.timeshift_s)
     for name in ("T_body_cam0", "T_cam1_cam0", "T_depth_cam0"):
         x, y = getattr(a, name), getattr(b, name)
         assert (x is None and y is None) or np.array_equal(x, y)
@@ -85,6 +86,22 @@ def test_asl_folder_comes_back(tmp_path):
     with pytest.raises(UsageError, match="no place for depth"):
         to_euroc(open_source(str(make_tum(tmp_path / "rgbd"))), tmp_path / "x", nothing)
     assert not (tmp_path / "x").exists()
+    shifted = dataclasses.replace(source, rig=dataclasses.replace(source.rig, timeshift_s=0.02))
+    with pytest.raises(UsageError, match="no place for the cameras' timeshift"):
+        to_euroc(shifted, tmp_path / "x", nothing)
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_part_of_a_recording_with_a_timeshift(tmp_path):
+    """Its IMU samples are those between its images by the IMU's clock, in a folder as in MCAP."""
+    source = open_source(str(make_euroc(tmp_path / "walk")))
+    shifted = dataclasses.replace(source, rig=dataclasses.replace(source.rig, timeshift_s=0.02))
+    to_mcap(shifted, tmp_path / "walk.mcap", None, nothing)
+    whole = frames(shifted)
+    part = frames(open_source(str(tmp_path / "walk.mcap"), frames=slice(2, 4)))
+    assert_same(part, whole[2:4])
+    assert_same(frames(shifted.part(slice(2, 4))), part)
+    assert part[-1].imu.stamps_ns[-1] == part[-1].stamp_ns + 20_000_000
 
 
 def test_rosbags_reads_it_as_ros_2(folder, tmp_path):
@@ -136,6 +153,13 @@ def test_jpeg_is_close_and_small(tmp_path):
                 recorder.write(m)
     image = frames(open_source(str(tmp_path / "jpeg.mcap")))[0].image0
     assert 0 < np.abs(image.astype(int) - picture(0)).mean() < 4
+
+
+def test_the_rigs_timeshift_is_recorded_with_it():
+    shifted = dataclasses.replace(RIG, timeshift_s=-0.0123456789)
+    assert_same_rig(ros_rig.from_json(ros_rig.to_json(shifted), "x"), shifted)
+    with pytest.raises(DataError, match="timeshift_s: 2 is not within 1 s"):
+        ros_rig.from_json(ros_rig.to_json(RIG)[:-1] + ', "timeshift_s": 2}', "x")
 
 
 def test_the_rig_survives_as_ros_messages():

@@ -44,7 +44,7 @@ def first_state(stamp_ns: int, imu: ImuBatch, rig: Rig, config: InertialConfig) 
     force, rate = accel.mean(axis=0), gyro.mean(axis=0)
     still = _still(gyro, accel)
     T = gravity.level(force, rig.T_body_cam0[:3, 2])
-    state = begin(stamp_ns, T, np.zeros(3), np.zeros(3), np.zeros(3), rig.T_body_cam0, _sigmas(still, config))
+    state = _begun(stamp_ns, T, rig, _sigmas(still, config))
     _learn_force(state, force, _SHAKE if still else _WALKING, config.gravity)
     if still:
         _learn_rate(state, rate)
@@ -54,10 +54,18 @@ def first_state(stamp_ns: int, imu: ImuBatch, rig: Rig, config: InertialConfig) 
 def state_by_camera(stamp_ns: int, rig: Rig, config: InertialConfig) -> State:
     """For a body whose IMU says nothing: up is where the top of the image is, more or less."""
     up = rig.T_body_cam0[:3, :3] @ np.array([0.0, -1.0, 0.0])
-    T, zero = gravity.level(up, rig.T_body_cam0[:3, 2]), np.zeros(3)
+    T = gravity.level(up, rig.T_body_cam0[:3, 2])
     sigma = _sigmas(False, config)
     sigma[0:2] = _SAME  # a body that coasts tells nothing of gravity
-    return begin(stamp_ns, T, zero, zero, zero, rig.T_body_cam0, sigma)
+    return _begun(stamp_ns, T, rig, sigma)
+
+
+def _begun(stamp_ns: int, T: F64, rig: Rig, sigma: F64) -> State:
+    """When the image with this stamp was taken, by the IMU's clock."""
+    zero = np.zeros(3)
+    state = begin(stamp_ns + rig.timeshift_ns, T, zero, zero, zero, rig.T_body_cam0, sigma)
+    state.offset_s = rig.timeshift_s
+    return state
 
 
 def _still(gyro: F64, accel: F64) -> bool:

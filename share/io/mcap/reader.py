@@ -7,7 +7,6 @@ rig is our own record of it, else CameraInfo and /tf_static; --calib goes before
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -124,7 +123,8 @@ class McapSource(Source):
         times = self._file.log_times[self._topics[CAM0]]
         if len(times) == 0:
             raise DataError(f"{self._file.path}: {self._topics[CAM0]} has no images")
-        return span_of(times if frames is None else self._header_stamps(), frames, str(self._file.path))
+        stamps = times if frames is None else self._header_stamps()
+        return span_of(stamps, frames, str(self._file.path), self.rig.timeshift_ns)
 
     def _header_stamps(self) -> I64:
         """Of cam0; one pass over its messages that decodes nothing but the stamp."""
@@ -241,7 +241,7 @@ def _fit(rig: Rig, topics: dict[str, str], path: Path) -> Rig:
                 f"{path}: the calibration has {stream}, the recording has not; give another --calib"
             )
     if rig.imu and IMU not in topics:
-        return replace(rig, imu=None, T_body_cam0=np.eye(4))
+        return rig.without_imu()
     return rig
 
 

@@ -36,6 +36,7 @@ def to_json(rig: Rig) -> str:
         {name: asdict(camera) for name, camera in cameras(rig).items()}
         | {name: T.tolist() for name, T in poses.items() if T is not None}
         | ({"imu": asdict(rig.imu)} if rig.imu else {})
+        | ({"timeshift_s": rig.timeshift_s} if rig.timeshift_s else {})
     )
 
 
