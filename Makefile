@@ -3,7 +3,7 @@ PYTHON ?= $(shell python3.11 -c "" 2>/dev/null && echo python3.11 || echo python
 BIN := .venv/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
-.PHONY: install demo test lint type bench slow freeze
+.PHONY: install demo test lint type bench slow freeze vio-figures
 
 install: .venv/installed
 .venv/installed: setup.cfg pyproject.toml
@@ -24,6 +24,8 @@ type: install
 	$(BIN)/mypy
 bench: install
 	$(BIN)/python tools/bench.py
+vio-figures: install
+	$(BIN)/python tools/measure_vio.py
 freeze: install
 	$(PIP) -e '.[freeze]'
 	$(BIN)/pyinstaller --noconfirm --log-level ERROR tools/share.spec

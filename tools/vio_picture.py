@@ -1,0 +1,85 @@
+"""One picture a sequence: errors over time between what the filter says is three sigma."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from share.types import F64, I64
+
+_COLOURS = ("#00798c", "#d1495b", "#b8860b")
+_GAP_S = 0.2  # where nothing was told for longer, no line is drawn
+_BEGINNING_S, _ROOM = 5.0, 1.08  # the scale is that of what comes later, and a little more
+
+
+class Curves(NamedTuple):
+    """Of one run: t_s (N,) since its first frame; errors and sigmas (N, 6) rad, then m; stretch (N,)."""
+
+    label: str
+    t_s: F64
+    errors: F64
+    sigmas: F64
+    stretch: I64
+
+
+def draw(path: Path, title: str, runs: list[Curves]) -> None:
+    """PNG, all runs in every panel: position at the left, orientation at the right, an axis a row."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    style = {"font.size": 11, "axes.spines.top": False, "axes.spines.right": False}
+    with pyplot.rc_context(style):
+        figure, panels = pyplot.subplots(3, 2, figsize=(13, 7.8), sharex=True, layout="constrained")
+        _column(panels[:, 0], runs, 3, 100.0, "position, told less true", ("x [cm]", "y [cm]", "z, up [cm]"))
+        around = ("about x [°]", "about y [°]", "heading [°]")
+        _column(panels[:, 1], runs, 0, float(np.degrees(1)), "orientation, told less true", around)
+        handles = [line for line in panels[0, 0].lines if not line.get_label().startswith("_")]
+        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+        figure.suptitle(title, fontsize=13)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=90)
+        pyplot.close(figure)
+
+
+def _column(
+    panels: Any, runs: list[Curves], first: int, scale: float, what: str, labels: tuple[str, ...]
+) -> None:
+    """Three axes on one scale: that of what comes after the beginning; what is larger then is said."""
+    columns = slice(first, first + 3)
+    limit, largest = (scale * largest_of(runs, columns, since) for since in (_BEGINNING_S, 0.0))
+    beyond = f"\n(first {_BEGINNING_S:g} s: up to {largest:.2g})" if largest > _ROOM * limit else ""
+    panels[0].set_title(f"{what}; shaded: ± 3σ as told{beyond}", fontsize=11)
+    for axis, panel in enumerate(panels):
+        for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
+            _curve(panel, run, first + axis, scale, colour)
+        panel.set_ylabel(labels[axis])
+        panel.set_ylim(-_ROOM * limit, _ROOM * limit)
+        panel.axhline(0, color="black", linewidth=0.6)
+        panel.grid(alpha=0.3)
+        panel.margins(x=0.01)
+    panels[-1].set_xlabel("time [s]")
+
+
+def _curve(panel: Any, run: Curves, column: int, scale: float, colour: str) -> None:
+    t, error, sigma = (broken(run, values) for values in (run.t_s, run.errors, run.sigmas))
+    band = 3 * scale * sigma[:, column]
+    panel.fill_between(t, -band, band, color=colour, alpha=0.10, linewidth=0)
+    panel.plot(t, np.stack([-band, band], axis=1), color=colour, alpha=0.5, linewidth=0.8, linestyle="--")
+    panel.plot(t, scale * error[:, column], color=colour, linewidth=1.4, label=run.label)
+
+
+def largest_of(runs: list[Curves], columns: slice, since_s: float) -> float:
+    """Error or three sigma, whatever is more, from `since_s` on."""
+    each = [np.maximum(np.abs(run.errors), 3 * run.sigmas)[run.t_s >= since_s, columns] for run in runs]
+    return max((float(values.max()) for values in each if values.size), default=1.0)
+
+
+def broken(run: Curves, values: F64) -> F64:
+    """values (N, …) with NaN between where the run has a gap or begins a new stretch."""
+    gaps = np.flatnonzero((np.diff(run.t_s) > _GAP_S) | (np.diff(run.stretch) != 0)) + 1
+    out: F64 = np.insert(values, gaps, np.nan, axis=0)
+    return out

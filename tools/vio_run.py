@@ -1,0 +1,139 @@
+"""One run of the inertial tracker over one recording: what it told of every frame, and figures of that."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from share.config import Config
+from share.core.sequencer import SequencerCounters
+from share.errors import DataError
+from share.estimator.result import TrackResult
+from share.io.source import Source
+from share.io.trajectory import Trajectory
+from share.metrics.association import associate
+from share.metrics.ate import ate
+from share.metrics.consistency import Deviations, deviations, inside, nees
+from share.metrics.rpe import rpe_time
+from share.metrics.runlog import RunLog
+from share.run.pipeline import frames_of, tracker_for
+from share.types import F64, I64, TrackState
+
+ACCURACY = (
+    *("ate_cm", "worst_cm", "rpe_1s_cm", "rpe_1s_deg"),
+    *("nees_position", "inside_position", "nees_orientation", "inside_orientation"),
+)
+
+
+@dataclass
+class Told:
+    """Of the frames that had a pose: stamps, poses, covariances, number of the unbroken stretch.
+    CPU ms of every frame and of every keyframe."""
+
+    stamps: list[int] = field(default_factory=list)
+    poses: list[F64] = field(default_factory=list)
+    covs: list[F64] = field(default_factory=list)
+    stretches: list[int] = field(default_factory=list)
+    track_ms: list[float] = field(default_factory=list)
+    keyframe_ms: list[float] = field(default_factory=list)
+    log: RunLog = field(default_factory=RunLog)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        return Trajectory(np.array(self.stamps, np.int64), np.array(self.poses).reshape(-1, 4, 4))
+
+    def add(self, stamp_ns: int, result: TrackResult) -> None:
+        self.log.stretches += result.new_stretch
+        self.log.add(stamp_ns, self.track_ms[-1], result.state, result.keyframe)
+        if result.T_odom_body is not None:
+            assert result.cov is not None  # the inertial tracker always tells it
+            self.stamps.append(stamp_ns)
+            self.poses.append(result.T_odom_body)
+            self.covs.append(result.cov)
+            self.stretches.append(self.log.stretches)
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Over the frames with a pose and a truth: stamps (N,), their stretch (N,), deviations."""
+
+    stamps_ns: I64
+    stretch: I64
+    deviations: Deviations
+
+
+def follow(source: Source, settings: Config) -> Told:
+    """Track every frame in turn, causal. Decoding is not counted."""
+    tracker, told = tracker_for(source, settings), Told()
+    for frame in frames_of(source, settings, SequencerCounters()):
+        began = time.process_time()
+        result = tracker.track(frame)
+        told.track_ms.append(1e3 * (time.process_time() - began))
+        if result.keyframe:
+            began = time.process_time()
+            tracker.keyframe(frame)
+            told.keyframe_ms.append(1e3 * (time.process_time() - began))
+        told.add(frame.stamp_ns, result)
+    return told
+
+
+def series(source: Source, told: Told) -> Series:
+    truth, (stamps, _) = source.truth(), told.trajectory
+    assert truth is not None  # the emulator writes it
+    at, poses, true = associate(told.trajectory, truth)
+    chosen = np.isin(stamps, at)
+    stretch = np.array(told.stretches, np.int64)[chosen]
+    covs = np.array(told.covs).reshape(-1, 6, 6)[chosen]
+    return Series(at, stretch, deviations(poses, covs, true, stretch))
+
+
+def figures(source: Source, told: Told, found: Series) -> dict[str, Any]:
+    """All of a run's; accuracies are None where there are too few poses to speak of any."""
+    report, states = told.log.report(), [row.state for row in told.log.rows]
+    return {
+        "frames": report["frames"],
+        "told": report["tracked"] / report["frames"],
+        "with_truth": len(found.stamps_ns),
+        **accuracy(source, told, found),
+        "states": {str(state): states.count(state) / len(states) for state in TrackState},
+        "lost_s": report["lost_s"],
+        "init_s": report["init_s"],
+        "new_stretches": max(report["stretches"] - 1, 0),
+        "track_ms": _percentile(told.track_ms, 50),
+        "track_p99_ms": _percentile(told.track_ms, 99),
+        "keyframes": report["keyframes"],
+        "keyframe_ms": _percentile(told.keyframe_ms, 50),
+        "keyframe_p99_ms": _percentile(told.keyframe_ms, 99),
+    }
+
+
+def accuracy(source: Source, told: Told, found: Series) -> dict[str, float | None]:
+    """One alignment over all frames: a break of odometry shows in the ATE."""
+    estimate, truth = told.trajectory, source.truth()
+    assert truth is not None
+    try:
+        absolute, relative = ate(estimate, truth), rpe_time(estimate, truth)
+    except DataError:
+        return dict.fromkeys(ACCURACY)
+    values = (absolute.rmse, absolute.max, relative.translation.rmse)
+    degrees = float(np.degrees(relative.rotation.rmse))
+    return dict(
+        zip(ACCURACY, [*(100 * v for v in values), degrees, *consistency(found.deviations)], strict=True)
+    )
+
+
+def consistency(found: Deviations) -> Iterator[float]:
+    """Of position, then orientation: mean NEES of three axes (3 is right) and share of frames within 3 sigma
+    on each axis. The first pose, which truth is laid over, says nothing and is left out."""
+    for part in (slice(3, 6), slice(0, 3)):
+        errors, cov = found.errors[1:, part], found.cov[1:, part, part]
+        yield float(nees(errors, cov).mean())
+        yield inside(errors, found.sigmas[1:, part])
+
+
+def _percentile(values: list[float], q: float) -> float | None:
+    return float(np.percentile(values, q)) if values else None
