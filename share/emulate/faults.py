@@ -175,9 +175,14 @@ def mover_along(frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
     return _moving(frames, rig, truth, _CARD, mover.along)
 
 
-def mover_starts(frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
+def mover_rests(frames: Frames, rig: Rig, truth: Trajectory) -> Frames:
+    """Shows that what moves does harm, and not how it is drawn."""
+    return mover_starts(frames, rig, truth, speed=0.0)
+
+
+def mover_starts(frames: Frames, rig: Rig, truth: Trajectory, speed: float = 0.15) -> Frames:
     def path(t: F64, T_world_cam: F64, begin: float, last: float) -> F64:
-        return mover.starting(t, T_world_cam, rig.cam0, _LARGE, last)
+        return mover.starting(t, T_world_cam, rig.cam0, _LARGE, last, speed)
 
     return _moving(frames, rig, truth, _LARGE, path)
 
@@ -283,6 +288,7 @@ FAULTS: dict[str, Fault] = {
     "imu_dead": Fault("no IMU any more", imu_dead),
     "imu_never": Fault("no IMU at all", imu_never),
     "saturating": Fault("gyro and accelerometer end where 5 % of their samples are beyond", saturating),
+    "mover_rests": Fault("a panel that is part of the room, and stays: no fault at all", mover_rests),
     "mover_comes": Fault("a panel comes in, stays 1 m before the camera for 10 s, to and fro", mover_comes),
     "mover_starts": Fault("a panel that was part of the room goes off at 0.15 m/s for 10 s", mover_starts),
     "mover_along": Fault("a panel goes along with the camera, fixed in its view, for 10 s", mover_along),

@@ -13,7 +13,6 @@ from share.types import F64
 
 _CROSS_S, _SWAY_S = 1.5, 4.0  # how long it takes to come in; a sway to and fro
 _AHEAD_M, _ASIDE_M, _SWAY_M = 1.0, 1.7, 0.3
-_SLOW_M_S = 0.15
 _ENOUGH, _MUCH = 0.4, 0.6  # share of the view that it should have, and not go beyond
 _CLEAR_M = 0.4  # how near it may come to the camera
 _BEFORE_S, _AFTER_S = 3.0, 6.0  # of its starting to move it should be seen
@@ -39,13 +38,13 @@ def along(t: F64, T_world_cam: F64, begin: float, last: float) -> F64:
     return np.asarray(T, np.float64)
 
 
-def starting(t: F64, T_world_cam: F64, camera: Camera, panel: Panel, last: float) -> F64:
+def starting(t: F64, T_world_cam: F64, camera: Camera, panel: Panel, last: float, speed: float = 0.15) -> F64:
     """T_world_panel (N, 4, 4) of what is part of the room until 30 to 55 % of the recording, then
-    goes aside at 0.15 m/s for `last` seconds, and rests again: where and when it has about 40 % of the view.
+    goes aside at `speed` (m/s) for `last` seconds, and rests: where and when it has some 40 % of the view.
     Raises ValueError where the camera leaves no place for it."""
     best, found = -np.inf, None
     for begin, T in _placings(t, T_world_cam):
-        gone = _SLOW_M_S * (t - begin).clip(0, last)
+        gone = speed * (t - begin).clip(0, last)
         path = np.tile(T, (len(t), 1, 1))
         path[:, :3, 3] += gone[:, None] * T[:3, 0]
         if _clearance(panel, se3.inverse(path) @ T_world_cam) < _CLEAR_M:

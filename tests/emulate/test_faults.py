@@ -298,6 +298,8 @@ def test_what_was_part_of_the_room_goes_off_slowly(ride):
     seen = share_of_view(CAMERA, panel, se3.inverse(T_world_cam) @ T)
     assert seen[(t > begin - 3) & (t < begin + 5)].min() > 0.2
     assert np.linalg.norm(T[:, :3, 3] - T_world_cam[:, :3, 3], axis=1).min() > 0.4
+    stays = mover.starting(t, T_world_cam, CAMERA, panel, 5.0, speed=0.0)
+    assert np.ptp(stays, axis=0).max() == 0
 
 
 def test_no_place_for_a_panel(ride):
