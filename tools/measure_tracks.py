@@ -147,8 +147,9 @@ class TrueRoom:
         depth = self._renderer.depth(self._camera, Moment(self.T_world_cam(stamp_ns)))
         square = np.ones((2 * patches.HALF + 1,) * 2, np.uint8)
         span = (cv2.dilate(depth, square) - cv2.erode(depth, square)) / depth
-        x, y = np.rint(px).astype(int).T
-        return one_surface(np.float32(1) / depth, px), span[y, x].astype(np.float64)
+        inside = np.clip(px, 0, (self._camera.width - 1.001, self._camera.height - 1.001))  # or just beyond
+        x, y = np.rint(inside).astype(int).T
+        return one_surface(np.float32(1) / depth, inside), span[y, x].astype(np.float64)
 
 
 def recipe_of(about: Row) -> Recipe:
