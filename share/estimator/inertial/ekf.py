@@ -268,11 +268,16 @@ def motion_cov(state: State, a: int, b: int) -> F64:
     return (out + out.T) / 2 + _LEAST_COV * np.eye(6)
 
 
+def motion_since(state: State) -> F64:
+    """Covariance (6, 6) of the body's motion since the newest keyframe, perturbed on the right."""
+    Ad = se3.adjoint(se3.inverse(state.T))
+    out: F64 = Ad @ _between(state, POSE, state.keyframe(len(state.keyframes) - 1)) @ Ad.T
+    return (out + out.T) / 2
+
+
 def drift_m(state: State) -> float:
     """Sigma of the body's position against the newest keyframe's, m."""
-    H = np.hstack([-se3.hat(state.T[:3, 3]), np.eye(3)])
-    D = _between(state, POSE, state.keyframe(len(state.keyframes) - 1))
-    return float(np.sqrt(max(np.trace(H @ D @ H.T), 0.0)))
+    return float(np.sqrt(max(np.trace(motion_since(state)[3:, 3:]), 0.0)))
 
 
 def _between(state: State, a: slice, b: slice) -> F64:

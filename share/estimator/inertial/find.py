@@ -24,12 +24,13 @@ _TINY = 1e-12 * np.eye(2)
 
 @dataclass(frozen=True, eq=False)
 class Sought:
-    """Of all N features in one image: px (N, 2) and whether each was found; expected (N, 2), NaN behind the
-    camera, what it is from, and how patches look there, (N, 2, 2) px by px. For `patches.slanted`: error
-    (N, S), along (N, 2)."""
+    """Of all N features in one image: px (N, 2) and whether each was found, and, for others to say, went its
+    own way; expected (N, 2), NaN behind the camera, what it is from, and how patches look there, (N, 2, 2) px
+    by px. For `patches.slanted`: error (N, S), along (N, 2)."""
 
     px: F32
     found: NDArray[np.bool_]
+    astray: NDArray[np.bool_]
     expected: F64
     prediction: Prediction
     warp: F64
@@ -53,10 +54,10 @@ def seek(
     seen, where, warp, along = _expected(camera, state, looks, T_right_left)
     nowhere = np.zeros((n, len(patches.OFFSETS)), np.float32)
     px = np.nan_to_num(where, nan=-1e6).astype(np.float32)
-    out = Sought(px, np.zeros(n, bool), where, seen, warp, nowhere, along)
+    out = Sought(px, np.zeros(n, bool), np.zeros(n, bool), where, seen, warp, nowhere, along)
     start = where if left is None else where + (left.px - left.expected)
     inside = camera.inside(np.nan_to_num(start, nan=-1e6), _BORDER_PX) & (np.arange(n) >= fresh)
-    todo = np.flatnonzero(inside if left is None else inside & left.found & _by_turns(looks))
+    todo = np.flatnonzero(inside if left is None else inside & left.found & ~left.astray & _by_turns(looks))
     _settle(image, looks, todo, start[todo], warp[todo], config, config.reach_px, out)
     return out
 

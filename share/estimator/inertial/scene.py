@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,7 +15,7 @@ from share.estimator.inertial.memory import Memory
 from share.estimator.inertial.state import State
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
-from share.types import F32, F64, Frame
+from share.types import F32, F64, I64, Frame
 from share.vision import corners
 from share.vision.depth import from_depth_camera, from_stereo
 
@@ -21,6 +23,8 @@ _DEPTH_SIGMA_PX, _DEPTH_BASELINE = 0.3, 0.05  # of the stereo pair inside a dept
 _NOISE = 3.0  # gray levels of an image
 _SHARPEST_PX = 0.5  # error by noise alone, beyond which a patch is no feature
 _SHUN_FRAMES = 30  # for which nothing new is sought where something moved by itself
+_CROWD, _WARY_FRAMES = 5, 60  # features at a time that went astray: somebody moves in the view
+_PROBATION, _UNPROVEN = 10, 5.0  # frames in which a feature proves itself, and times its sigma until then
 _SLANT_EVERY = 2  # frames in which a feature's slant is learnt
 _FARTHEST, _NEAREST_M = 0.03, 0.2  # 1/m; m
 _FAR = 100.0  # redundancy that features in view are worth
@@ -34,6 +38,7 @@ class Scene:
         self.looks: Looks = features.none()
         self._memory = Memory()
         self._shunned: list[F32] = []
+        self._wary = 0  # frames for which new features have to prove themselves
         self._next_feature = self._next_keyframe = 0
 
     def add_keyframe(self, frame: Frame, rate: F64) -> None:
@@ -51,7 +56,9 @@ class Scene:
         which = np.flatnonzero(seen)
         away = which[features.runaways(self.looks, which, left.px[which] - left.expected[which])]
         seen[away] = False
-        self._shun(left.px[away])
+        left.astray[away] = True
+        self._shun(left.px[left.astray])
+        self._wary = _WARY_FRAMES if left.astray.sum() >= _CROWD else max(self._wary - 1, 0)
         turn = np.flatnonzero(seen & ((self.looks.age + np.arange(len(seen))) % _SLANT_EVERY == 0))
         features.learn_slant(self.looks, turn, left.error[turn], left.along[turn])
         self._memory.sleep(self.state, self.looks, np.flatnonzero(~left.found))
@@ -76,11 +83,21 @@ class Scene:
         anew: the state has moved since they were sought."""
         camera = self._rig.cam0 if T_right_left is None else self._rig.cam1
         assert camera is not None
-        which = np.flatnonzero(sought.found)
+        which = np.flatnonzero(sought.found & ~sought.astray)
         uv = camera.normalise(sought.px[which].astype(np.float64))
         sigma = np.full(len(which), self._config.sigma_px / camera.focal)
         seen = observe.predict(self.state, which, T_right_left) if anew else sought.prediction.take(which)
         return ekf.sight(self.state, which, seen, uv, sigma, rate)
+
+    def with_doubt(self, rows: ekf.Sight) -> ekf.Sight:
+        """While somebody moves in the view, what is new in it counts little."""
+        unproven = (self._wary > 0) & ~self.proven(rows.which)
+        return replace(rows, sigma=np.where(unproven, _UNPROVEN, 1.0) * rows.sigma)
+
+    def proven(self, which: I64) -> NDArray[np.bool_]:
+        """Which of features `which` (M,) have long done as they should."""
+        out: NDArray[np.bool_] = self.looks.age[which] >= _PROBATION
+        return out
 
     def _add_features(self, frame: Frame, host: int) -> None:
         config, camera, s = self._config, self._rig.cam0, self.state

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from share.config import InertialConfig, TrackerConfig
 from share.estimator import relocalise
-from share.estimator.inertial import ekf, find
+from share.estimator.inertial import ekf, find, parsac
 from share.estimator.inertial.beginning import first_state, state_by_camera
 from share.estimator.inertial.features import Looks
 from share.estimator.inertial.samples import Samples, coasting, unclipped
@@ -24,7 +24,7 @@ from share.estimator.localmap import LocalKeyframe, LocalMap
 from share.estimator.result import TrackResult
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
-from share.types import F64, U8, Candidate, Frame, ImuBatch, TrackState
+from share.types import F64, I64, U8, Candidate, Frame, ImuBatch, TrackState
 from share.vision import corners
 from share.vision.view import make_view
 
@@ -139,10 +139,18 @@ class InertialTracker:
     def _look(self, frame: Frame, scene: Scene) -> tuple[find.Sought, NDArray[np.bool_]]:
         """Where cam0 shows the features, and which (N,) were seen and believed."""
         s, looks = scene.state, scene.looks
-        left = find.seek(frame.image0, self._rig.cam0, s, looks, self._config)
+        camera = self._rig.cam0
+        left = find.seek(frame.image0, camera, s, looks, self._config)
         if self._image is not None:
-            find.rescue(self._image, frame.image0, self._rig.cam0, looks, left, self._config)
+            find.rescue(self._image, frame.image0, camera, looks, left, self._config)
+        left.astray[self._movers(scene, left)] = True
         return left, self._update(frame, scene, left)
+
+    def _movers(self, scene: Scene, left: find.Sought) -> I64:
+        """Numbers of features that were found and are no part of the room."""
+        which = np.flatnonzero(left.found)
+        rows, size = scene.sight(left, self._rate), (self._rig.cam0.width, self._rig.cam0.height)
+        return which[~parsac.of_the_room(scene.state, rows, left.px[which], scene.proven(which), size)]
 
     def _heard(self, frame: Frame, s: State) -> ImuBatch | None:
         """What the IMU said until the image was taken; None if it was silent."""
@@ -184,7 +192,7 @@ class InertialTracker:
 
         def rows_now(anew: bool = True) -> ekf.Sight:
             first, *others = (scene.sight(image, self._rate, T, anew) for image, T in sought)
-            rows = first.join(*others)
+            rows = scene.with_doubt(first.join(*others))
             return rows.take(np.argsort(rows.host, kind="stable"))
 
         seen = np.zeros(len(s.ids), bool)

@@ -1,0 +1,107 @@
+"""Which features belong to the room, where some move by themselves: consensus guided by the IMU.
+
+A person or robot that fills much of the view is as rigid as the room, so counting votes decides nothing.
+What decides is what the IMU says of the motion, and how much of the image agrees. After IMU-PARSAC of
+RD-VIO (Li et al. 2024), with a prior in place of its thresholds and no random numbers: every part of the
+image proposes a motion, every feature judges it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from share.estimator.inertial import ekf
+from share.estimator.inertial.ekf import Sight
+from share.estimator.inertial.state import POSE, State
+from share.geometry import se3
+from share.types import F32, F64, I64
+
+_AGREES = 3.0  # sigmas of a feature's own
+_SPLIT = 0.15  # of the features may disagree with the rest before anybody is asked
+_REGIONS, _CELLS = (4, 3), (8, 6)  # of the image: who proposes, and what counts
+_FEWEST = 4  # features that propose
+_LOOSE = 10.0  # times the prior's sigmas: what a proposal may be off
+_DOUBT = 2.0  # times the prior's sigmas: what the filter is really worth
+_MOST = 12.0  # cells that a surprise can cost
+_ROUNDS = 3
+_FLOOR = np.repeat([1e-4, 2e-4], 3) ** 2  # rad^2, m^2
+
+
+def of_the_room(
+    state: State, rows: Sight, px: F32, proven: NDArray[np.bool_], size: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Which rows (M,) of one camera move with the room; all where there is no doubt. px (M, 2): where they
+    are seen, in an image of size (width, height). proven (M,): whose word counts."""
+    everything = np.ones(len(rows.which), bool)
+    if len(rows.which) < 2 * _FEWEST:
+        return everything
+    fit = _Fit(state, rows)
+    agree = fit.agree(fit.robust())
+    if agree.mean() > 1 - _SPLIT:
+        return everything
+    region, cell = _grid(px, size, _REGIONS), _grid(px, size, _CELLS)
+    proposals = [agree, *(_grown(fit, region == k) for k in np.unique(region))]
+    scores = [len(np.unique(cell[group & proven])) - fit.surprise(group) for group in proposals]
+    return proposals[int(np.argmax(scores))]
+
+
+def _grown(fit: _Fit, group: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """All that agree with the motion of a group (M,), that of all that agree with that, and so on."""
+    if group.sum() < _FEWEST:
+        return np.zeros(len(group), bool)
+    for _ in range(_ROUNDS):
+        group = fit.agree(fit.motion(group, _LOOSE))
+        if group.sum() < _FEWEST:
+            break
+    return group
+
+
+def _grid(px: F32, size: tuple[int, int], shape: tuple[int, int]) -> I64:
+    """The cell (M,) of each."""
+    at = (px * shape / size).astype(np.int64).clip(0, np.array(shape) - 1)
+    out: I64 = at[:, 1] * shape[0] + at[:, 0]
+    return out
+
+
+class _Fit:
+    """A common motion e (6,) of the camera: rows' residuals = J e + their own noise, e being about 0 by IMU.
+    In units of the prior's sigmas."""
+
+    def __init__(self, state: State, rows: Sight) -> None:
+        prior = ekf.motion_since(state) + np.diag(_FLOOR)
+        J = rows.core[:, :, POSE] @ se3.adjoint(state.T) @ np.linalg.cholesky(prior)
+        at = state.features_at + rows.which
+        rho = rows.by_rho[:, :, None] * rows.by_rho[:, None, :] * state.cov[at, at][:, None, None]
+        white = np.linalg.inv(np.linalg.cholesky(rho + rows.sigma[:, None, None] ** 2 * np.eye(2)))
+        self._J, self._r = white @ J, (white @ rows.residual[:, :, None])[:, :, 0]
+
+    def motion(self, group: NDArray[np.bool_], sigmas: float, weight: F64 | None = None) -> F64:
+        """The best (6,) of a group (M,) of rows."""
+        J, r = self._J[group].reshape(-1, 6), self._r[group].ravel()
+        weighted = J if weight is None else J * np.repeat(weight[group], 2)[:, None]
+        out: F64 = np.linalg.solve(weighted.T @ J + np.eye(6) / sigmas**2, weighted.T @ r)
+        return out
+
+    def robust(self) -> F64:
+        """Of all rows, from what the IMU says, those that are off counting less (Cauchy)."""
+        everything, e = np.ones(len(self._r), bool), np.zeros(6)
+        for _ in range(_ROUNDS):
+            e = self.motion(everything, _DOUBT, 1 / (1 + (self.off(e) / _AGREES) ** 2))
+        return e
+
+    def off(self, e: F64) -> F64:
+        """(M,) sigmas."""
+        out: F64 = np.linalg.norm(self._r - self._J @ e, axis=1)
+        return out
+
+    def agree(self, e: F64) -> NDArray[np.bool_]:
+        out: NDArray[np.bool_] = self.off(e) < _AGREES
+        return out
+
+    def surprise(self, group: NDArray[np.bool_]) -> float:
+        """How unlikely the IMU finds a group's motion, up to _MOST."""
+        if group.sum() < _FEWEST:
+            return np.inf
+        e = self.motion(group, _LOOSE) / _DOUBT
+        return min(float(e @ e) / 2, _MOST)

@@ -1,0 +1,90 @@
+"""Which features belong to the room: a half of the view that moves by itself, and what the IMU says of it."""
+
+import numpy as np
+import pytest
+from imu_world import CAMERA, rig
+
+from share.estimator.inertial import ekf, observe, parsac
+from share.estimator.inertial.state import CORE, VELOCITY, begin
+
+RIG, SIZE = rig(), (CAMERA.width, CAMERA.height)
+SIGMA = 0.5 / CAMERA.focal
+N = 100
+
+
+@pytest.fixture
+def state():
+    """A body that has gone on a little since its only keyframe, and knows where it is to a few mm."""
+    rng, sigma = np.random.default_rng(1), np.full(CORE, 1e-4)
+    sigma[VELOCITY] = 0.01
+    s = begin(0, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), RIG.T_body_cam0, sigma)
+    host = ekf.add_keyframe(s, 0, np.zeros(3))
+    px = np.stack(np.meshgrid(np.linspace(40, SIZE[0] - 40, 10), np.linspace(40, SIZE[1] - 40, 10)), -1)
+    ray = RIG.cam0.normalise(px.reshape(-1, 2))
+    ekf.add_features(s, np.arange(N), np.full(N, host), ray, rng.uniform(0.2, 1.0, N), np.full(N, 1e-3))
+    s.cov[:6, :6] += np.diag(np.repeat([1e-3, 2e-3], 3) ** 2)
+    return s
+
+
+def judged(state, shift_px, proven=None, noise=0.3):
+    """Which of the features are taken for the room that are seen shift_px (N, 2) from where they should be."""
+    seen = observe.predict(state, np.arange(N))
+    rng = np.random.default_rng(2)
+    uv = seen.uv + (shift_px + noise * rng.normal(size=(N, 2))) / CAMERA.focal
+    rows = ekf.sight(state, np.arange(N), seen, uv, np.full(N, SIGMA), np.zeros(3))
+    px = RIG.cam0.distort(uv).astype(np.float32)
+    return parsac.of_the_room(state, rows, px, np.ones(N, bool) if proven is None else proven, SIZE)
+
+
+def mistaken(room, mover):
+    """Features on the wrong side, (N,) both."""
+    return (room == mover).sum()
+
+
+def part(state, left_of):
+    """Features in the left part of the image."""
+    return RIG.cam0.distort(observe.predict(state, np.arange(N)).uv)[:, 0] < left_of * SIZE[0]
+
+
+def test_noise_is_no_reason_to_doubt(state):
+    assert judged(state, np.zeros(2)).all()
+
+
+def test_a_few_outliers_are_left_to_the_gate(state):
+    shift = np.zeros((N, 2))
+    shift[:10] = 20.0
+    assert judged(state, shift).all()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.45])
+def test_what_moves_by_itself_is_found(state, share):
+    mover = part(state, share)
+    shift = np.where(mover[:, None], [4.0, 2.0], [0.0, 0.0])
+    assert mistaken(judged(state, shift), mover) <= 2
+
+
+def test_even_if_it_is_most_of_the_view_and_the_imu_knows_better(state):
+    mover = part(state, 0.6)
+    shift = np.where(mover[:, None], [12.0, 0.0], [0.0, 0.0])
+    assert mistaken(judged(state, shift), mover) <= 2
+
+
+def test_what_is_new_has_no_vote(state):
+    mover = part(state, 0.6)
+    shift = np.where(mover[:, None], [3.0, 0.0], [0.0, 0.0])
+    assert mistaken(judged(state, shift, proven=~mover), mover) <= 2
+
+
+def test_a_motion_that_the_imu_missed_is_no_split(state):
+    """All of the room shifts alike, by what the filter holds for possible."""
+    seen = observe.predict(state, np.arange(N))
+    shift = seen.by_pose[:, :, 3:] @ np.array([2e-3, -2e-3, 1e-3]) * CAMERA.focal
+    assert np.abs(shift).max() > 1.0
+    assert judged(state, shift).all()
+
+
+def test_too_few_are_believed(state):
+    few = np.arange(5)
+    seen = observe.predict(state, few)
+    rows = ekf.sight(state, few, seen, seen.uv + 1.0, np.full(5, SIGMA), np.zeros(3))
+    assert parsac.of_the_room(state, rows, np.zeros((5, 2), np.float32), np.ones(5, bool), SIZE).all()
