@@ -2,11 +2,15 @@
 
     python tools/bench_track.py [--frames N] [--recording SOURCE]
 
-On a headset (stereo) and a robot (RGB-D) in the plain room, recorded for the purpose, and on a real
-recording; without --recording that is the kitchen beside the checkout, if it is there. Making and
-decoding images are not counted.
-`track_ms` is by the clock, all else CPU time. A stage's `median` is of one call; `per_frame` spreads all
-its calls over all frames.
+With cameras and IMU: a walker with each of two stereo rigs in the warehouse; where there is no OpenGL, in the
+plain room, and without the rig whose lens that room does not have. By cameras alone: a robot (RGB-D) in the
+plain room, and the kitchen if it is beside the checkout; instead of that SOURCE, as `share track` would.
+Making and decoding images are not counted. Sessions with an IMU are kept for the next time.
+
+`track_ms` is by the clock, all else CPU time. `cpu_ms`: of a frame until its pose is out (`pose`), of what a
+keyframe costs after that (`keyframe`), of both (`all`, `mean`). A stage's `median` and `p99` are of one call;
+`per_frame` spreads all its calls over all frames. ` cam1`: what is done with the second camera's image.
+`rest`: what is in no stage.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ import json
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import wraps
 from itertools import islice
 from pathlib import Path
@@ -31,121 +35,161 @@ import poselib  # noqa: E402, F401 -- else the first frame would pay for it
 
 from share.config import Config, TrackerConfig  # noqa: E402
 from share.core.sequencer import SequencerCounters  # noqa: E402
+from share.emulate.demo import FALLBACK, SCENE  # noqa: E402
 from share.emulate.recipe import Recipe  # noqa: E402
-from share.emulate.session import make_session  # noqa: E402
+from share.emulate.render.context import missing  # noqa: E402
+from share.emulate.session import cached_session, make_session  # noqa: E402
+from share.estimator.inertial import ekf, features, find, tracker  # noqa: E402
+from share.estimator.inertial.scene import Scene  # noqa: E402
+from share.estimator.inertial.tracker import InertialTracker  # noqa: E402
 from share.estimator.visual import VisualTracker  # noqa: E402
-from share.geometry.camera import Rig  # noqa: E402
-from share.io.source import open_source  # noqa: E402
-from share.run.pipeline import frames_of  # noqa: E402
-from share.types import Frame  # noqa: E402
+from share.io.source import Source, open_source  # noqa: E402
+from share.run.pipeline import frames_of, tracker_for  # noqa: E402
+from share.types import F64  # noqa: E402
+from share.vision import corners, patches  # noqa: E402
 
-MOTIONS = ("ar1=walk:speed=0.65", "robot=robot:speed=0.3")
-PROFILE, RATE_HZ = "d435i:640x480@15", 15
+STEREO = {"euroc_752x480": ("euroc", 20), "d435i_848x480": ("d435i:848x480@30", 30)}  # profile, Hz
+NEEDS_LENS = "euroc_752x480"  # which the plain room does not have
+ROBOT, ROBOT_PROFILE, ROBOT_HZ = "robot=robot:speed=0.3", "d435i:640x480@15", 15
 SHORTEST_S = 3  # of a session
 KITCHEN = Path(__file__).resolve().parents[2] / "shared" / "data" / "real" / "redkitchen_0000_0499"
-STAGES = {
-    "_find": "klt",
-    "_pose": "pose",
-    "_reobserve": "reobservation",
-    "_add_corners": "corners",
-    "_recover": "relocalisation",
-    "keyframe": "view",
-}
-Spent = dict[str, list[float]]  # CPU ms of every call, by stage
+STAGES: tuple[tuple[Any, str, str], ...] = (
+    (ekf, "propagate", "imu"),
+    (find, "_expected", "expect"),
+    (patches, "align", "align"),
+    (find, "rescue", "rescue"),
+    (Scene, "sight", "rows"),
+    (ekf, "relinearised", "anew where far off"),
+    (ekf, "gains", "gains"),
+    (ekf, "update", "update"),
+    (Scene, "seen", "slant and runaways"),
+    (Scene, "_wake", "keyframe: wake"),
+    (Scene, "_forget", "keyframe: forget"),
+    (Scene, "_inverse_depth", "keyframe: depth"),
+    (features, "looks", "keyframe: patches"),
+    (tracker, "make_view", "keyframe: view"),
+    (corners, "detect", "keyframe: corners"),
+    (VisualTracker, "_find", "klt"),
+    (VisualTracker, "_pose", "pose"),
+    (VisualTracker, "_reobserve", "reobservation"),
+    (VisualTracker, "_add_corners", "corners"),
+    (VisualTracker, "_recover", "relocalisation"),
+    (VisualTracker, "keyframe", "view"),
+)
+Tracker = VisualTracker | InertialTracker
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--frames", type=int, default=200, help=f"of the room ({RATE_HZ} Hz)")
-    parser.add_argument("--recording", type=Path, help="any SOURCE that `share track` takes")
-    options = parser.parse_args()
-    spent = watch_stages()
-    report = bench_room(options.frames, spent)
-    print(json.dumps(report | bench_recording(options.recording, spent), indent=2))
+class Stages:
+    """CPU ms of every call, by stage, of the trackers' stages from now on. A stage within a stage counts as
+    the outer one."""
 
+    def __init__(self) -> None:
+        self.spent: dict[str, list[float]] = defaultdict(list)
+        self.second: tuple[Any, ...] = ()  # the second camera and its image: whoever is given one works there
+        self._open = 0
+        for owner, name, stage in STAGES:
+            setattr(owner, name, self._timed(getattr(owner, name), stage))
 
-def bench_room(frames: int, spent: Spent) -> dict[str, Any]:
-    recipe = Recipe("plain", MOTIONS, max(SHORTEST_S, frames / RATE_HZ), profiles={"": PROFILE})
-    with tempfile.TemporaryDirectory() as folder:
-        session = make_session(recipe, Path(folder) / "room")
-        return {
-            f"room_{name}": bench_source(session / name, spent, frames)
-            for name in (motion.partition("=")[0] for motion in MOTIONS)
-        }
-
-
-def bench_recording(given: Path | None, spent: Spent) -> dict[str, Any]:
-    path = given or KITCHEN
-    if not given and not path.exists():
-        return {"recording": "the kitchen is not beside this checkout; name another with --recording"}
-    return {path.name: bench_source(path, spent)}
-
-
-def bench_source(path: Path, spent: Spent, frames: int | None = None) -> dict[str, Any]:
-    source = open_source(str(path))
-    return bench(source.rig, islice(frames_of(source, Config(), SequencerCounters()), frames), spent)
-
-
-def bench(rig: Rig, frames: Iterable[Frame], spent: Spent) -> dict[str, Any]:
-    """One tracker over `frames`, one thread."""
-    spent.clear()
-    tracker = VisualTracker(rig, TrackerConfig())
-    tracked, keyframe = 0, []
-    track_ms: list[float] = []
-    cpu_ms: list[float] = []
-    for frame in frames:
-        began, cpu_began = time.perf_counter(), time.process_time()
-        result = tracker.track(frame)
-        track_ms.append(1e3 * (time.perf_counter() - began))
-        if result.keyframe:
-            tracker.keyframe(frame)
-        cpu_ms.append(1e3 * (time.process_time() - cpu_began))
-        keyframe.append(result.keyframe)
-        tracked += result.T_odom_body is not None
-    cpu, chosen = np.array(cpu_ms), np.array(keyframe)
-    return {
-        "frames": len(cpu),
-        "tracked": tracked,
-        "keyframes": int(chosen.sum()),
-        "track_ms": {"median": _round(np.median(track_ms)), "p95": _round(np.percentile(track_ms, 95))},
-        "cpu_ms_per_frame": {
-            "all": _round(cpu.mean()),
-            "no_keyframe": _round(cpu[~chosen].mean()),
-            "keyframe": _round(cpu[chosen].mean()),
-        },
-        "stages": {
-            stage: {
-                "calls": len(ms),
-                "median": _round(np.median(ms)),
-                "per_frame": _round(sum(ms) / len(cpu)),
-            }
-            for stage, ms in spent.items()
-        },
-    }
-
-
-def watch_stages() -> Spent:
-    """Has the tracker's stages timed from now on. A stage within a stage counts as the outer one."""
-    spent: Spent = defaultdict(list)
-    open_stages: list[str] = []
-
-    def timed(method: Callable[..., Any], stage: str) -> Callable[..., Any]:
+    def _timed(self, method: Callable[..., Any], stage: str) -> Callable[..., Any]:
         @wraps(method)
         def call(*arguments: Any, **named: Any) -> Any:
-            open_stages.append(stage)
+            self._open += 1
             began = time.process_time()
             try:
                 return method(*arguments, **named)
             finally:
-                open_stages.pop()
-                if not open_stages:
-                    spent[stage].append(1e3 * (time.process_time() - began))
+                self._open -= 1
+                if not self._open:
+                    there = any(a is b for a in arguments for b in self.second)
+                    self.spent[stage + there * " cam1"].append(1e3 * (time.process_time() - began))
 
         return call
 
-    for name, stage in STAGES.items():
-        setattr(VisualTracker, name, timed(getattr(VisualTracker, name), stage))
-    return spent
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--frames", type=int, default=200, help="of each emulated session")
+    parser.add_argument("--recording", type=Path, help="any SOURCE that `share track` takes")
+    options = parser.parse_args()
+    stages = Stages()
+    report = bench_stereo(options.frames, stages) | bench_robot(options.frames, stages)
+    print(json.dumps(report | bench_recording(options.recording, stages), indent=2))
+
+
+def bench_stereo(frames: int, stages: Stages) -> dict[str, Any]:
+    """With an IMU."""
+    reason = missing()
+    report: dict[str, Any] = {"scene": SCENE if reason is None else f"{FALLBACK}, because {reason}"}
+    for name, (profile, rate_hz) in STEREO.items():
+        if reason is not None and name == NEEDS_LENS:
+            report[name] = "the plain room has no lens distortion"
+            continue
+        seconds = max(SHORTEST_S, frames / rate_hz)
+        recipe = Recipe(FALLBACK if reason else SCENE, ("a=walk:",), seconds, profiles={"": profile})
+        source = open_source(str(cached_session(recipe) / "a"))
+        report[name] = bench(source, tracker_for(source, Config()), stages, frames)
+    return report
+
+
+def bench_robot(frames: int, stages: Stages) -> dict[str, Any]:
+    """RGB-D, by its camera alone."""
+    recipe = Recipe(FALLBACK, (ROBOT,), max(SHORTEST_S, frames / ROBOT_HZ), profiles={"": ROBOT_PROFILE})
+    with tempfile.TemporaryDirectory() as folder:
+        source = open_source(str(make_session(recipe, Path(folder) / "room") / "robot"))
+        return {"room_robot": bench(source, VisualTracker(source.rig, TrackerConfig()), stages, frames)}
+
+
+def bench_recording(given: Path | None, stages: Stages) -> dict[str, Any]:
+    path = given or KITCHEN
+    if not given and not path.exists():
+        return {"recording": "the kitchen is not beside this checkout; name another with --recording"}
+    source = open_source(str(path))
+    return {path.name: bench(source, tracker_for(source, Config()), stages)}
+
+
+def bench(source: Source, estimator: Tracker, stages: Stages, most: int | None = None) -> dict[str, Any]:
+    """Over the first frames of `source`, one thread."""
+    stages.spent.clear()
+    tracked, track_ms, pose_ms, keyframe_ms = 0, [], [], []
+    for frame in islice(frames_of(source, Config(), SequencerCounters()), most):
+        stages.second = tuple(x for x in (source.rig.cam1, frame.image1) if x is not None)
+        began, cpu_began = time.perf_counter(), time.process_time()
+        result = estimator.track(frame)
+        track_ms.append(1e3 * (time.perf_counter() - began))
+        pose_out = time.process_time()
+        if result.keyframe:
+            estimator.keyframe(frame)
+        pose_ms.append(1e3 * (pose_out - cpu_began))
+        keyframe_ms.append(1e3 * (time.process_time() - pose_out) if result.keyframe else np.nan)
+        tracked += result.T_odom_body is not None
+    return {"tracker": type(estimator).__name__, "frames": len(pose_ms), "tracked": tracked} | report_of(
+        np.array(track_ms), np.array(pose_ms), np.array(keyframe_ms), stages.spent
+    )
+
+
+def report_of(track: F64, pose: F64, keyframe: F64, spent: dict[str, list[float]]) -> dict[str, Any]:
+    """Of times (N,) ms of frames; keyframe: NaN where it was none."""
+    whole = pose + np.nan_to_num(keyframe)
+    in_stages = sum(sum(ms) for ms in spent.values())
+    return {
+        "keyframes": int(np.isfinite(keyframe).sum()),
+        "track_ms": spread(track),
+        "cpu_ms": {
+            "pose": spread(pose),
+            "keyframe": spread(keyframe[np.isfinite(keyframe)]),
+            "all": spread(whole),
+            "mean": _round(whole.mean()),
+        },
+        "stages": {
+            stage: {"calls": len(ms), **spread(np.array(ms)), "per_frame": _round(sum(ms) / len(whole))}
+            for stage, ms in spent.items()
+        }
+        | {"rest": {"per_frame": _round((whole.sum() - in_stages) / len(whole))}},
+    }
+
+
+def spread(ms: F64) -> dict[str, float]:
+    return {"median": _round(np.median(ms)), "p99": _round(np.percentile(ms, 99))}
 
 
 def _round(ms: float) -> float:
