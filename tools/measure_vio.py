@@ -24,7 +24,7 @@ process.prepare()
 import numpy as np  # noqa: E402
 from vio_picture import Curves, draw  # noqa: E402
 from vio_run import figures, follow, series  # noqa: E402
-from vio_sequences import SEQUENCES, Sequence  # noqa: E402
+from vio_sequences import SECONDS, SEQUENCES, Sequence  # noqa: E402
 from vio_table import Row, table  # noqa: E402
 
 import share  # noqa: E402
@@ -122,8 +122,8 @@ def picture(sequence: Sequence, rows: list[Row], options: argparse.Namespace) ->
     for row in rows:
         with np.load(_file(options.out, sequence.name, row["seed"]).with_suffix(".npz")) as kept:
             runs.append(Curves(f"seed {row['seed']}: ATE {_cm(row)}", **kept))
-    title = f"{sequence.motion.rstrip(':')} in {sequence.scene}, {sequence.profile}"
-    draw(options.pictures / f"{sequence.name}.png", title, runs)
+    what = f"{sequence.motion.rstrip(':')} in {sequence.scene}, {sequence.profile}, {SECONDS:g} s"
+    draw(options.pictures / f"{sequence.name}.png", f"{sequence.name}: {what}", runs)
 
 
 def code_version() -> str:

@@ -11,7 +11,7 @@ from share.types import F64, I64
 
 _COLOURS = ("#00798c", "#d1495b", "#b8860b")
 _GAP_S = 0.2  # where nothing was told for longer, no line is drawn
-_BEGINNING_S, _ROOM = 5.0, 1.08  # the scale is that of what comes later, and a little more
+_BEGINNING_S, _ROOM = 10.0, 1.08  # the scale is that of what comes later, and a little more
 
 
 class Curves(NamedTuple):
@@ -24,6 +24,22 @@ class Curves(NamedTuple):
     stretch: I64
 
 
+class Part(NamedTuple):
+    """columns: of the errors; scale: from their unit to the one shown."""
+
+    name: str
+    columns: slice
+    scale: float
+    unit: str
+    axes: tuple[str, str, str]
+
+
+PARTS = (
+    Part("position", slice(3, 6), 100.0, "cm", ("x", "y", "z, up")),
+    Part("orientation", slice(0, 3), float(np.degrees(1)), "°", ("about x", "about y", "heading")),
+)
+
+
 def draw(path: Path, title: str, runs: list[Curves]) -> None:
     """PNG, all runs in every panel: position at the left, orientation at the right, an axis a row."""
     import matplotlib
@@ -34,9 +50,8 @@ def draw(path: Path, title: str, runs: list[Curves]) -> None:
     style = {"font.size": 11, "axes.spines.top": False, "axes.spines.right": False}
     with pyplot.rc_context(style):
         figure, panels = pyplot.subplots(3, 2, figsize=(13, 7.8), sharex=True, layout="constrained")
-        _column(panels[:, 0], runs, 3, 100.0, "position, told less true", ("x [cm]", "y [cm]", "z, up [cm]"))
-        around = ("about x [°]", "about y [°]", "heading [°]")
-        _column(panels[:, 1], runs, 0, float(np.degrees(1)), "orientation, told less true", around)
+        for column, part in enumerate(PARTS):
+            _column(panels[:, column], runs, part)
         handles = [line for line in panels[0, 0].lines if not line.get_label().startswith("_")]
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
         figure.suptitle(title, fontsize=13)
@@ -45,18 +60,16 @@ def draw(path: Path, title: str, runs: list[Curves]) -> None:
         pyplot.close(figure)
 
 
-def _column(
-    panels: Any, runs: list[Curves], first: int, scale: float, what: str, labels: tuple[str, ...]
-) -> None:
+def _column(panels: Any, runs: list[Curves], part: Part) -> None:
     """Three axes on one scale: that of what comes after the beginning; what is larger then is said."""
-    columns = slice(first, first + 3)
-    limit, largest = (scale * largest_of(runs, columns, since) for since in (_BEGINNING_S, 0.0))
-    beyond = f"\n(first {_BEGINNING_S:g} s: up to {largest:.2g})" if largest > _ROOM * limit else ""
-    panels[0].set_title(f"{what}; shaded: ± 3σ as told{beyond}", fontsize=11)
+    limit, largest = (part.scale * largest_of(runs, part.columns, since) for since in (_BEGINNING_S, 0.0))
+    outside = f"\n(in the first {_BEGINNING_S:g} s up to {largest:.2g} {part.unit})"
+    beyond = outside if largest > _ROOM * limit else ""
+    panels[0].set_title(f"{part.name}, told less true; shaded: ± 3σ as told{beyond}", fontsize=11)
     for axis, panel in enumerate(panels):
         for run, colour in zip(runs, _COLOURS * len(runs), strict=False):
-            _curve(panel, run, first + axis, scale, colour)
-        panel.set_ylabel(labels[axis])
+            _curve(panel, run, part.columns.start + axis, part.scale, colour)
+        panel.set_ylabel(f"{part.axes[axis]} [{part.unit}]")
         panel.set_ylim(-_ROOM * limit, _ROOM * limit)
         panel.axhline(0, color="black", linewidth=0.6)
         panel.grid(alpha=0.3)
