@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -47,7 +48,7 @@ from share.emulate.room_file import open_renderer  # noqa: E402
 from share.emulate.sensor.effects import NONE, Effects  # noqa: E402
 from share.emulate.session import cached_session  # noqa: E402
 from share.emulate.types import Moment  # noqa: E402
-from share.errors import UsageError  # noqa: E402
+from share.errors import ShareError, UsageError  # noqa: E402
 from share.estimator.inertial.state import State  # noqa: E402
 from share.estimator.inertial.tracker import InertialTracker  # noqa: E402
 from share.geometry import se3  # noqa: E402
@@ -72,10 +73,13 @@ def main() -> None:
     parser.add_argument("sessions", nargs="*", metavar="SESSION/NAME")
     parser.add_argument("--seconds", type=float, default=20.0, help="of the sessions that it makes")
     options = parser.parse_args()
-    found: list[Row] = []
-    for name in options.sessions or own_sessions(options.seconds):
-        found.append(of_session(name))
-        print(json.dumps(found[-1]), flush=True)
+    found, spent = [], watch_alignment()
+    try:
+        for name in options.sessions or own_sessions(options.seconds):
+            found.append(of_session(name, spent))
+            print(json.dumps(found[-1]), flush=True)
+    except ShareError as error:
+        sys.exit(f"measure_tracks: {error}")
     print("\n" + table(found))
 
 
@@ -91,9 +95,10 @@ def own_sessions(seconds: float) -> Iterator[str]:
                 yield str(cached_session(recipe) / "a")
 
 
-def of_session(name: str) -> Row:
-    """One agent of a session. Raises UsageError for what was not emulated, or with others in the room."""
-    source, room, spent = open_source(name), TrueRoom(Path(name)), watch_alignment()
+def of_session(name: str, spent: list[float]) -> Row:
+    """One agent of a session. spent: see `watch_alignment`. Raises UsageError for what was not emulated, or
+    with others in the room."""
+    source, room = open_source(name), TrueRoom(Path(name))
     tracker, tracks = (
         InertialTracker(source.rig, Config().inertial, Config().tracker),
         Tracks(source.rig.cam0),
@@ -110,6 +115,7 @@ def of_session(name: str) -> Row:
     return {
         "session": name,
         "scene": room.recipe.scene,
+        "motion": room.recipe.motions[0].partition(":")[0].split("=")[-1],
         "seed": room.recipe.seed,
         "effects": "none" if room.recipe.effects == NONE else "device",
         "frames": len(align_ms),
@@ -311,10 +317,10 @@ def watch_alignment() -> list[float]:
 
 def table(rows: list[Row]) -> str:
     """Markdown: median / p90 / p99 px, (n)."""
-    lines = ["| room, seed, effects | features | " + " | ".join(f"age {age}" for age in AGES) + " |"]
+    lines = ["| room, motion, seed, effects | features | " + " | ".join(f"age {age}" for age in AGES) + " |"]
     lines.append("|---" * (2 + len(AGES)) + "|")
     for row in rows:
-        where = f"{row['scene']}, {row['seed']}, {row['effects']}"
+        where = ", ".join(str(row[key]) for key in ("scene", "motion", "seed", "effects"))
         for group, ages in row["error_px"].items():
             lines.append(f"| {where} | {group} | " + " | ".join(map(cell, ages.values())) + " |")
     return "\n".join(lines)
