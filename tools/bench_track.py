@@ -58,6 +58,7 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (find, "_expected", "expect"),
     (patches, "align", "align"),
     (find, "rescue", "rescue"),
+    (InertialTracker, "_movers", "movers"),
     (Scene, "sight", "rows"),
     (ekf, "relinearised", "anew where far off"),
     (ekf, "gains", "gains"),
