@@ -106,6 +106,7 @@ def arguments() -> argparse.Namespace:
         "--part", action="append", choices=("pairs", "kitchen", "rooms"), help="may be repeated"
     )
     parser.add_argument("--data", type=Path, default=DATA, help="holds real/ and motion/")
+    parser.add_argument("--cache", type=Path, help="of emulated rooms (default: the user's)")
     parser.add_argument("--apart", type=float, default=1.0, help="list pairs up to so many s apart (1)")
     parser.add_argument("--start", type=float, default=20.0, help="of a room's motion, s (20)")
     parser.add_argument("--seconds", type=float, default=20.0, help="of each room (20)")
@@ -209,7 +210,7 @@ def rooms(options: argparse.Namespace) -> Iterator[str]:
 
 def room_session(folder: Path, options: argparse.Namespace) -> Source:
     motion = f"ann=tumvi:{folder},start={options.start:g},seconds={options.seconds:g}"
-    session = cached_session(Recipe(SCENE, (motion,), options.seconds, SEED))
+    session = cached_session(Recipe(SCENE, (motion,), options.seconds, SEED), options.cache)
     return open_source(f"{session}/ann")
 
 
