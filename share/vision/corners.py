@@ -5,27 +5,74 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from share.types import F32, U8
+from share.types import F32, I64, U8
+
+_BLOCK = 5  # px, of a corner
+_LEAST = 4e-4  # of its least eigenvalue: above the noise of an image
+_NEAR = 9  # px, within which only the strongest counts
+_BORDER = 6  # px
+_CELLS = (8, 6)  # of the image
 
 
-def detect(image: U8, taken: F32, count: int, spacing: float, quality: float = 0.005) -> F32:
+def detect(image: U8, taken: F32, count: int, spacing: float) -> F32:
     """Up to `count` new corners (N, 2) px, at least `spacing` px from each other and from `taken` (M, 2).
 
-    Minimum-eigenvalue corners (Shi and Tomasi 1994), refined to a fraction of a pixel. The mask
-    round `taken` makes new corners fill what the tracked ones leave empty.
+    Minimum-eigenvalue corners (Shi and Tomasi 1994), refined to a fraction of a pixel. Parts of the image that
+    have few come first, so that no bright poster takes them all; `taken` ones count.
     """
     if count <= 0:
         return np.zeros((0, 2), np.float32)
-    mask = np.full(image.shape, 255, np.uint8)
-    for x, y in np.rint(taken).astype(int):
-        cv2.circle(mask, (int(x), int(y)), round(spacing), 0, -1)
-    corners = cv2.goodFeaturesToTrack(image, count, quality, spacing, mask=mask, blockSize=5)
-    if corners is None:
+    px, strength = _peaks(image)
+    chosen = _apart(px[_evenly(px, strength, taken, image.shape)], taken, count, spacing, image.shape)
+    if len(chosen) == 0:
         return np.zeros((0, 2), np.float32)
-    corners = np.ascontiguousarray(corners.reshape(-1, 1, 2), np.float32)
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 0.03)
-    refined: F32 = cv2.cornerSubPix(image, corners, (3, 3), (-1, -1), criteria).reshape(-1, 2)
+    start = np.ascontiguousarray(chosen.reshape(-1, 1, 2), np.float32)
+    refined: F32 = cv2.cornerSubPix(image, start, (3, 3), (-1, -1), criteria).reshape(-1, 2)
     return refined
+
+
+def _peaks(image: U8) -> tuple[I64, F32]:
+    """Corners (N, 2) px that are the strongest ones near, and how strong (N,)."""
+    strength = cv2.cornerMinEigenVal(image, _BLOCK)
+    highest = cv2.dilate(strength, np.ones((_NEAR, _NEAR), np.uint8))
+    peak = (strength == highest) & (strength > _LEAST)
+    peak[:_BORDER], peak[-_BORDER:], peak[:, :_BORDER], peak[:, -_BORDER:] = False, False, False, False
+    y, x = np.nonzero(peak)
+    return np.stack([x, y], axis=1), strength[y, x]
+
+
+def _evenly(px: I64, strength: F32, taken: F32, shape: tuple[int, ...]) -> I64:
+    """An order (N,): the best of each cell of the image, then the second best, where the taken ones are the
+    best."""
+    cell = _cell(px, shape)
+    order = np.lexsort((-strength, cell))
+    first = np.searchsorted(cell[order], np.arange(_CELLS[0] * _CELLS[1]))
+    filled = np.bincount(_cell(taken, shape), minlength=len(first))
+    rank = np.arange(len(px)) - first[cell[order]] + filled[cell[order]]
+    out: I64 = order[np.lexsort((-strength[order], rank))]
+    return out
+
+
+def _cell(px: F32 | I64, shape: tuple[int, ...]) -> I64:
+    at = (px * _CELLS / (shape[1], shape[0])).astype(np.int64).clip(0, np.array(_CELLS) - 1)
+    out: I64 = at[:, 1] * _CELLS[0] + at[:, 0]
+    return out
+
+
+def _apart(px: I64, taken: F32, count: int, spacing: float, shape: tuple[int, ...]) -> I64:
+    """The first `count` of px (N, 2), in order, that keep their distance."""
+    free = np.full(shape, 255, np.uint8)
+    for x, y in np.rint(taken).astype(int).tolist():
+        cv2.circle(free, (x, y), round(spacing), 0, -1)
+    chosen = []
+    for x, y in px.tolist():
+        if free[y, x]:
+            chosen.append((x, y))
+            if len(chosen) == count:
+                break
+            cv2.circle(free, (x, y), round(spacing), 0, -1)
+    return np.array(chosen, np.int64).reshape(-1, 2)
 
 
 def count(image: U8, contrast: int = 12) -> int:

@@ -27,7 +27,7 @@ def state():
 
 
 def judged(state, shift_px, proven=None, noise=0.3):
-    """Which of the features are taken for the room that are seen shift_px (N, 2) from where they should be."""
+    """Which of the features are taken for the room seen shift_px (N, 2) from where they should be."""
     seen = observe.predict(state, np.arange(N))
     rng = np.random.default_rng(2)
     uv = seen.uv + (shift_px + noise * rng.normal(size=(N, 2))) / CAMERA.focal
