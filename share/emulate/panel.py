@@ -18,7 +18,7 @@ from share.geometry.camera import Camera, Rig, rays
 from share.types import F32, F64, U8, Frame
 
 _PX_M, _NOISE = 400, 1.5  # texture's pixels a metre; gray levels, as an imager's
-_NEAREST_M = 0.05
+_NEAREST_M, _FAR_M = 0.05, 1e4
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def _meet(ways: F32, T_panel_cam: F64) -> tuple[F64, F64, np.ndarray]:
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         z = -start[..., 2] / way[..., 2]
         xy = start[..., :2] + z[..., None] * way[..., :2]
-    return np.nan_to_num(xy), z, np.isfinite(z) & (z > _NEAREST_M)
+    return np.nan_to_num(xy).clip(-_FAR_M, _FAR_M), z, np.isfinite(z) & (z > _NEAREST_M)
 
 
 @lru_cache(maxsize=8)

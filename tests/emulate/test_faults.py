@@ -280,6 +280,14 @@ def test_a_panel_that_is_not_there_or_behind_is_not_drawn(frames):
     assert after[1] is frames[1]
 
 
+def test_a_panel_seen_from_its_edge(frames):
+    """Some ways run along it and never meet it."""
+    edge_on = se3.compose(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.array([0.005, -0.005, 1.0]))
+    (after,) = drawn(frames[:1], RIG, Panel(0.4, 0.4), (RIG.T_body_cam0 @ edge_on)[None])
+    assert (after.depth != frames[0].depth).mean() < 0.02
+    assert share_of_view(CAMERA, Panel(0.4, 0.4), edge_on[None], 1)[0] < 0.02
+
+
 @pytest.fixture
 def ride(frames, truth):
     """Seconds, T_world_cam."""
