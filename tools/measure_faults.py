@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -33,7 +34,7 @@ from share.config import Config  # noqa: E402
 from share.core.measurement import Measurement  # noqa: E402
 from share.core.sequencer import SequencerCounters  # noqa: E402
 from share.emulate.faults import FAULTS, Arriving, Fault, apply  # noqa: E402
-from share.errors import UsageError  # noqa: E402
+from share.errors import ShareError, UsageError  # noqa: E402
 from share.estimator.inertial.tracker import InertialTracker  # noqa: E402
 from share.estimator.result import TrackResult  # noqa: E402
 from share.geometry import se3  # noqa: E402
@@ -271,4 +272,7 @@ def _faults(text: str) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except ShareError as error:
+        sys.exit(str(error))
