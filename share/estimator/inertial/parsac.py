@@ -23,7 +23,8 @@ _REGIONS, _CELLS = (4, 3), (8, 6)  # of the image: who proposes, and what counts
 _FEWEST = 4  # features that propose
 _LOOSE = 10.0  # times the prior's sigmas: what a proposal may be off
 _DOUBT = 2.0  # times the prior's sigmas: what the filter is really worth
-_MOST = 12.0  # cells that a surprise can cost
+_UNLIKELY = 4.0  # a surprise that asks for a second look,
+_MOST = 12.0  # and cells that one can cost
 _ROUNDS = 3
 _FLOOR = np.repeat([1e-4, 2e-4], 3) ** 2  # rad^2, m^2
 
@@ -37,8 +38,8 @@ def of_the_room(
     if len(rows.which) < 2 * _FEWEST:
         return everything
     fit = _Fit(state, rows)
-    agree = fit.agree(fit.robust())
-    if agree.mean() > 1 - _SPLIT:
+    agree = fit.agree(fit.robust(proven if proven.sum() >= 2 * _FEWEST else everything))
+    if agree.mean() > 1 - _SPLIT and fit.surprise(agree) < _UNLIKELY:
         return everything
     region, cell = _grid(px, size, _REGIONS), _grid(px, size, _CELLS)
     proposals = [agree, *(_grown(fit, region == k) for k in np.unique(region))]
@@ -83,11 +84,11 @@ class _Fit:
         out: F64 = np.linalg.solve(weighted.T @ J + np.eye(6) / sigmas**2, weighted.T @ r)
         return out
 
-    def robust(self) -> F64:
-        """Of all rows, from what the IMU says, those that are off counting less (Cauchy)."""
-        everything, e = np.ones(len(self._r), bool), np.zeros(6)
+    def robust(self, group: NDArray[np.bool_]) -> F64:
+        """Of a group (M,), from what the IMU says, those that are off counting less (Cauchy)."""
+        e = np.zeros(6)
         for _ in range(_ROUNDS):
-            e = self.motion(everything, _DOUBT, 1 / (1 + (self.off(e) / _AGREES) ** 2))
+            e = self.motion(group, _DOUBT, 1 / (1 + (self.off(e) / _AGREES) ** 2))
         return e
 
     def off(self, e: F64) -> F64:
