@@ -17,8 +17,8 @@ _CELLS = (8, 6)  # of the image
 def detect(image: U8, taken: F32, count: int, spacing: float) -> F32:
     """Up to `count` new corners (N, 2) px, at least `spacing` px from each other and from `taken` (M, 2).
 
-    Minimum-eigenvalue corners (Shi and Tomasi 1994), refined to a fraction of a pixel. Parts of the image that
-    have few come first, so that no bright poster takes them all; `taken` ones count.
+    Minimum-eigenvalue corners (Shi and Tomasi 1994), refined to a fraction of a pixel. Parts of the image
+    that have few come first, so that no bright poster takes them all; `taken` ones count.
     """
     if count <= 0:
         return np.zeros((0, 2), np.float32)

@@ -9,6 +9,7 @@ from share.config import Config, InertialConfig, TrackerConfig
 from share.core.measurement import IMU
 from share.core.sequencer import SequencerCounters
 from share.estimator.inertial.tracker import InertialTracker
+from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.io.source import open_source
 from share.io.trajectory import Trajectory
@@ -197,6 +198,26 @@ def test_memory_is_bounded(walk):
     assert len(tracker.state.keyframes) <= 4
     assert tracker.state.size < 22 + 6 * 4 + 2 * config.features
     assert results[-1].state is OK
+
+
+def test_a_renderer_knows_the_pose_between_frames(walk):
+    """Two frames ahead, 133 ms: by the IMU to a few mm, without it as far as a head keeps its ways."""
+    frames, _, truth = walk
+    _, _, tracker = run(walk, frames[:40])
+    to = frames[41].stamp_ns
+    imu = ImuBatch(
+        *(np.concatenate([getattr(f.imu, n) for f in frames[40:42]]) for n in ("stamps_ns", "gyro", "accel"))
+    )
+    at = {int(t): T for t, T in zip(truth.stamps_ns, truth.T, strict=True)}
+    true = se3.inverse(at[frames[39].stamp_ns]) @ at[to]
+    before = tracker.state.T
+    for samples, far_rad, far_m in ((imu, 0.003, 0.005), (None, 0.1, 0.03)):
+        ahead = tracker.predict(to, samples)
+        off = se3.log(se3.inverse(true) @ se3.inverse(before) @ ahead)
+        assert np.linalg.norm(off[:3]) < far_rad
+        assert np.linalg.norm(off[3:]) < far_m
+    assert (before == tracker.state.T).all()
+    assert InertialTracker(walk[1], InertialConfig(), TrackerConfig()).predict(to) is None
 
 
 def test_what_it_cannot_track_is_refused():

@@ -36,6 +36,18 @@ class Samples:
             np.concatenate([old.accel[-_KEPT:], imu.accel[start:]]),
         )
 
+    def with_more(self, imu: ImuBatch) -> Samples:
+        """These and later ones; this one stays as it is."""
+        out = Samples()
+        out.all, out._most = self.all, self._most
+        out.add(imu)
+        return out
+
+    @property
+    def last_ns(self) -> int:
+        """Of the newest one; 0 where there is none."""
+        return int(self.all.stamps_ns[-1]) if len(self.all) else 0
+
     def between(self, from_ns: int, to_ns: int, silent_ns: int) -> ImuBatch | None:
         """Those inside and one beyond each end, where there is one; None where it says nothing for longer
         than `silent_ns`."""

@@ -17,6 +17,7 @@ from share.estimator import relocalise
 from share.estimator.inertial import ekf, find, parsac
 from share.estimator.inertial.beginning import first_state, state_by_camera
 from share.estimator.inertial.features import Looks
+from share.estimator.inertial.imu import integrate
 from share.estimator.inertial.samples import Samples, coasting, unclipped
 from share.estimator.inertial.scene import Scene
 from share.estimator.inertial.state import VELOCITY, State
@@ -98,6 +99,20 @@ class InertialTracker:
             self._places.set_view(view)
         up = s.T[2, :3] if self._knows_up and self._tilt(s) < _LEVEL_RAD else np.zeros(3)
         return Candidate(s.T, self._since_last(s), up, view, new_stretch)
+
+    def predict(self, t_ns: int, imu: ImuBatch | None = None) -> F64 | None:
+        """T_odom_body (4, 4) at a time after the last frame's, IMU time: for renderers, between frames.
+
+        imu: samples that came since that frame, if there are any. From the last one on the body is taken to
+        turn and to accelerate as it did then. None where there is no pose to go on from.
+        """
+        if self._scene is None or not self._ready:
+            return None
+        s, known = self._scene.state, self._samples.with_more(imu or ImuBatch.empty())
+        silent_ns, gravity = round(self._config.silent_s * 1e9), self._config.gravity
+        heard = known.between(s.stamp_ns, min(t_ns, known.last_ns), silent_ns)
+        going_on = coasting(s, self._rate, t_ns, gravity) if heard is None else heard
+        return integrate(s.T, s.v, s.bg, s.ba, going_on, s.stamp_ns, t_ns, self._noise, gravity).T
 
     def _since_last(self, s: State) -> F64:
         """Covariance (6, 6) of the motion since the last keyframe that was shown, if the state still has it,
