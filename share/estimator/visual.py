@@ -204,7 +204,7 @@ class VisualTracker:
     def _add_corners(self, frame: Frame, host: int) -> None:
         assert self._T_odom_cam is not None
         wanted = self._config.corners - len(self._tracks.ids)
-        px = corners.detect(frame.image0, self._tracks.px, wanted, self._config.spacing_px)
+        px = corners.strongest(frame.image0, self._tracks.px, wanted, self._config.spacing_px)
         uv = self._rig.cam0.normalise(px.astype(np.float64))
         z = depth_at(frame, self._rig, px, uv)
         known = ~np.isnan(z)

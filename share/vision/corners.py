@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from share.types import F32, I64, U8
 
@@ -26,10 +27,26 @@ def detect(image: U8, taken: F32, count: int, spacing: float) -> F32:
     chosen = _apart(px[_evenly(px, strength, taken, image.shape)], taken, count, spacing, image.shape)
     if len(chosen) == 0:
         return np.zeros((0, 2), np.float32)
+    return _refined(image, chosen)
+
+
+def strongest(image: U8, taken: F32, count: int, spacing: float, quality: float = 0.005) -> F32:
+    """As `detect`, wherever they are: those down to `quality` times the best. Few good ones are worth more
+    than many where no IMU helps (0.5 cm less in the kitchen of docs/tracking.md)."""
+    if count <= 0:
+        return np.zeros((0, 2), np.float32)
+    found = cv2.goodFeaturesToTrack(
+        image, count, quality, spacing, mask=_free(taken, spacing, image.shape), blockSize=_BLOCK
+    )
+    return np.zeros((0, 2), np.float32) if found is None else _refined(image, found)
+
+
+def _refined(image: U8, px: NDArray[np.generic]) -> F32:
+    """To a fraction of a pixel."""
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 0.03)
-    start = np.ascontiguousarray(chosen.reshape(-1, 1, 2), np.float32)
-    refined: F32 = cv2.cornerSubPix(image, start, (3, 3), (-1, -1), criteria).reshape(-1, 2)
-    return refined
+    start = np.ascontiguousarray(px.reshape(-1, 1, 2), np.float32)
+    out: F32 = cv2.cornerSubPix(image, start, (3, 3), (-1, -1), criteria).reshape(-1, 2)
+    return out
 
 
 def _peaks(image: U8) -> tuple[I64, F32]:
@@ -62,10 +79,7 @@ def _cell(px: F32 | I64, shape: tuple[int, ...]) -> I64:
 
 def _apart(px: I64, taken: F32, count: int, spacing: float, shape: tuple[int, ...]) -> I64:
     """The first `count` of px (N, 2), in order, that keep their distance."""
-    free = np.full(shape, 255, np.uint8)
-    for x, y in np.rint(taken).astype(int).tolist():
-        cv2.circle(free, (x, y), round(spacing), 0, -1)
-    chosen = []
+    free, chosen = _free(taken, spacing, shape), []
     for x, y in px.tolist():
         if free[y, x]:
             chosen.append((x, y))
@@ -73,6 +87,14 @@ def _apart(px: I64, taken: F32, count: int, spacing: float, shape: tuple[int, ..
                 break
             cv2.circle(free, (x, y), round(spacing), 0, -1)
     return np.array(chosen, np.int64).reshape(-1, 2)
+
+
+def _free(taken: F32, spacing: float, shape: tuple[int, ...]) -> U8:
+    """A mask, 255 where there is room."""
+    free = np.full(shape, 255, np.uint8)
+    for x, y in np.rint(taken).astype(int).tolist():
+        cv2.circle(free, (x, y), round(spacing), 0, -1)
+    return free
 
 
 def count(image: U8, contrast: int = 12) -> int:

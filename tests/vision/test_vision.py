@@ -1,5 +1,6 @@
 """Front-end parts against images whose geometry is known exactly."""
 
+import cv2
 import numpy as np
 import pytest
 from plain_walk import CAMERA, T_CAM1_CAM0
@@ -27,19 +28,33 @@ def scene():
     return left, exact, right, other, se3.inverse(near) @ T
 
 
-def test_corners_fill_what_is_empty(scene):
+@pytest.mark.parametrize("detect", [corners.detect, corners.strongest])
+def test_corners_fill_what_is_empty(scene, detect):
     image = scene[0]
-    first = corners.detect(image, np.zeros((0, 2), np.float32), 100, 15)
-    more = corners.detect(image, first, 100, 15)
+    first = detect(image, np.zeros((0, 2), np.float32), 100, 15)
+    more = detect(image, first, 100, 15)
     gap = np.linalg.norm(more[:, None] - first[None], axis=2).min()
     assert len(first) == 100
     assert len(more) > 20
     assert gap > 12  # spacing, less what sub-pixel refinement moves
 
 
+def test_a_bright_poster_does_not_take_all_corners():
+    rng = np.random.default_rng(1)
+    room = cv2.resize(rng.integers(100, 130, (60, 80), np.uint8), (640, 480), interpolation=cv2.INTER_CUBIC)
+    room[100:260, 100:260] = cv2.resize(rng.integers(0, 255, (20, 20), np.uint8), (160, 160))
+    on_poster = [
+        ((px > 95) & (px < 265)).all(axis=1).mean()
+        for px in (f(room, np.zeros((0, 2), np.float32), 60, 15) for f in (corners.detect, corners.strongest))
+    ]
+    assert on_poster[0] < 0.2
+    assert on_poster[1] > 0.5
+
+
 def test_no_corners_on_a_blank_wall():
     blank = np.full((480, 640), 128, np.uint8)
-    assert corners.detect(blank, np.zeros((0, 2), np.float32), 100, 15).shape == (0, 2)
+    for detect in (corners.detect, corners.strongest):
+        assert detect(blank, np.zeros((0, 2), np.float32), 100, 15).shape == (0, 2)
     assert orb(blank, 100)[0].shape == (0, 2)
 
 
