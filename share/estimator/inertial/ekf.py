@@ -183,6 +183,13 @@ def rest(state: State, sigma: float, gate: float) -> bool:
     return learn(state, -state.v, H, sigma, gate)
 
 
+def doubt(state: State, turn: float, shift: float, speed: float) -> None:
+    """Nobody knows why, but pose and velocity may be off by so much, rad, m, m/s."""
+    Ad = se3.adjoint(state.T)
+    state.cov[POSE, POSE] += Ad @ np.diag(np.repeat([turn**2, shift**2], 3)) @ Ad.T
+    state.cov[VELOCITY, VELOCITY] += speed**2 * np.eye(3)
+
+
 def _gain(PHt: F64, S: F64, residual: F64) -> tuple[F64, F64, F64]:
     """The error (n,) that the residual tells of, L^-1 H cov (m, n), L^-1 residual (m,) with L L' = S."""
     L, failed = lapack.dpotrf(S, lower=1, clean=1)

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from share.estimator.inertial import ekf
 from share.estimator.inertial.ekf import Sight
 from share.estimator.inertial.state import POSE, State
+from share.estimator.pose import consensus
 from share.geometry import se3
+from share.geometry.camera import Camera, rays
 from share.types import F32, F64, I64
 
 _AGREES = 3.0  # sigmas of a feature's own
@@ -26,18 +28,23 @@ _DOUBT = 2.0  # times the prior's sigmas: what the filter is really worth
 _UNLIKELY = 4.0  # a surprise that asks for a second look,
 _MOST = 12.0  # and cells that one can cost
 _ROUNDS = 3
+_VAGUE = 6.0  # times a feature's sigma: where the filter knows a place no better, it is no help
+_VOTE_PX = 3.0
+_FARTHEST = 1e-3  # 1/m
 _FLOOR = np.repeat([1e-4, 2e-4], 3) ** 2  # rad^2, m^2
 
 
 def of_the_room(
-    state: State, rows: Sight, px: F32, proven: NDArray[np.bool_], size: tuple[int, int]
+    state: State, rows: Sight, px: F32, proven: NDArray[np.bool_], camera: Camera
 ) -> NDArray[np.bool_]:
     """Which rows (M,) of one camera move with the room; all where there is no doubt. px (M, 2): where they
-    are seen, in an image of size (width, height). proven (M,): whose word counts."""
-    everything = np.ones(len(rows.which), bool)
+    are seen. proven (M,): whose word counts."""
+    everything, size = np.ones(len(rows.which), bool), (camera.width, camera.height)
     if len(rows.which) < 2 * _FEWEST:
         return everything
     fit = _Fit(state, rows)
+    if fit.looseness > _VAGUE:
+        return by_votes(state, rows.which, px, camera)
     agree = fit.agree(fit.robust(proven if proven.sum() >= 2 * _FEWEST else everything))
     if agree.mean() > 1 - _SPLIT and fit.surprise(agree) < _UNLIKELY:
         return everything
@@ -45,6 +52,17 @@ def of_the_room(
     proposals = [agree, *(_grown(fit, region == k) for k in np.unique(region))]
     scores = [len(np.unique(cell[group & proven])) - fit.surprise(group) for group in proposals]
     return proposals[int(np.argmax(scores))]
+
+
+def by_votes(state: State, which: I64, px: F32, camera: Camera) -> NDArray[np.bool_]:
+    """Which of features `which` (M,), seen at px (M, 2), agree on a pose, whatever the filter expects; all where
+    less than half do."""
+    T_odom_host = state.poses[state.host[which]] @ state.T_body_cam
+    in_host = rays(state.ray[which]) / np.maximum(state.rho[which, None], _FARTHEST)
+    points = (T_odom_host[:, :3, :3] @ in_host[:, :, None])[:, :, 0] + T_odom_host[:, :3, 3]
+    agree = consensus(points, camera.normalise(px.astype(np.float64)), camera.focal, _VOTE_PX, seed=0)
+    few = agree is None or agree.inliers.mean() < 0.5
+    return np.ones(len(which), bool) if agree is None or few else agree.inliers
 
 
 def _grown(fit: _Fit, group: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -76,6 +94,11 @@ class _Fit:
         rho = rows.by_rho[:, :, None] * rows.by_rho[:, None, :] * state.cov[at, at][:, None, None]
         white = np.linalg.inv(np.linalg.cholesky(rho + rows.sigma[:, None, None] ** 2 * np.eye(2)))
         self._J, self._r = white @ J, (white @ rows.residual[:, :, None])[:, :, 0]
+
+    @property
+    def looseness(self) -> float:
+        """How well the places of features are known beforehand, median, in sigmas of what is seen."""
+        return float(np.median(np.linalg.norm(self._J, axis=(1, 2)))) / np.sqrt(2)
 
     def motion(self, group: NDArray[np.bool_], sigmas: float, weight: F64 | None = None) -> F64:
         """The best (6,) of a group (M,) of rows."""

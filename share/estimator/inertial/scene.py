@@ -24,7 +24,7 @@ _NOISE = 3.0  # gray levels of an image
 _SHARPEST_PX = 0.5  # error by noise alone, beyond which a patch is no feature
 _SHUN_FRAMES = 30  # for which nothing new is sought where something moved by itself
 _CROWD, _WARY_FRAMES = 5, 60  # features at a time that went astray: somebody moves in the view
-_PROBATION, _UNPROVEN = 10, 5.0  # frames in which a feature proves itself, and times its sigma until then
+_PROBATION_S, _UNPROVEN = 0.34, 5.0  # in which a feature proves itself, and times its sigma until then
 _SLANT_EVERY = 2  # frames in which a feature's slant is learnt
 _FARTHEST, _NEAREST_M = 0.03, 0.2  # 1/m; m
 _FAR = 100.0  # redundancy that features in view are worth
@@ -38,6 +38,7 @@ class Scene:
         self.looks: Looks = features.none()
         self._memory = Memory()
         self._shunned: list[F32] = []
+        self._probation = 0  # frames that _PROBATION_S are
         self._wary = 0  # frames for which new features have to prove themselves
         self._next_feature = self._next_keyframe = 0
 
@@ -48,6 +49,10 @@ class Scene:
         self._wake(frame, rate)
         self._add_features(frame, host)
         self._forget()
+
+    def step(self, seconds: float) -> None:
+        """Since the frame before."""
+        self._probation = int(_PROBATION_S / max(seconds, 1e-3))
 
     def seen(self, left: Sought, seen: NDArray[np.bool_]) -> None:
         """Which features (N,) a frame showed. The others are gone, or asleep where they were not found."""
@@ -96,7 +101,7 @@ class Scene:
 
     def proven(self, which: I64) -> NDArray[np.bool_]:
         """Which of features `which` (M,) have long done as they should."""
-        out: NDArray[np.bool_] = self.looks.age[which] >= _PROBATION
+        out: NDArray[np.bool_] = self.looks.age[which] >= self._probation
         return out
 
     def _add_features(self, frame: Frame, host: int) -> None:

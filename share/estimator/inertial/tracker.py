@@ -7,6 +7,7 @@ Without the IMU the body is taken to go on as it does, without sight the IMU car
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -31,6 +32,9 @@ from share.vision.view import make_view
 
 _READY_RAD, _READY_M_S = np.radians(3.0), 0.3  # sigmas of tilt and velocity: a pose is worth telling
 _FAR_OFF_PX = 1.0  # median residual, from which derivatives are taken anew
+_MINORITY, _MAJORITY = 0.3, 0.7  # of what is found: believed by the filter; agreeing among itself
+_GAP_NS = 250_000_000  # between frames: more than an IMU of this sort is modelled for,
+_DOUBT = 0.02, 0.1, 0.3  # rad, m, m/s: how wrong the filter may be after it that believes nobody
 _ASTRAY, _REFUSED_S = 3, 1.0  # frames with nothing of what should be there; time with nothing believed
 _REST_RATE, _REST_M_S = 0.03, 0.02  # rad/s of a body at rest; m/s of its velocity
 _SLOW_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to a filter that knows it moves
@@ -125,6 +129,7 @@ class InertialTracker:
 
     def _follow(self, frame: Frame, scene: Scene) -> TrackResult:
         before, imu = scene.state.T, self._heard(frame, scene.state)
+        scene.step((frame.stamp_ns - self._stamp_ns) * 1e-9)
         measured = self._propagate(frame, scene.state, imu)
         left, seen = self._look(frame, scene)
         heard = imu is not None
@@ -164,8 +169,8 @@ class InertialTracker:
     def _movers(self, scene: Scene, left: find.Sought) -> I64:
         """Numbers of features that were found and are no part of the room."""
         which = np.flatnonzero(left.found)
-        rows, size = scene.sight(left, self._rate), (self._rig.cam0.width, self._rig.cam0.height)
-        return which[~parsac.of_the_room(scene.state, rows, left.px[which], scene.proven(which), size)]
+        rows, px, proven = scene.sight(left, self._rate), left.px[which], scene.proven(which)
+        return which[~parsac.of_the_room(scene.state, rows, px, proven, self._rig.cam0)]
 
     def _heard(self, frame: Frame, s: State) -> ImuBatch | None:
         """What the IMU said until the image was taken; None if it was silent."""
@@ -214,11 +219,11 @@ class InertialTracker:
         rows = rows_now(anew=False)
         if len(rows.which) == 0:
             return seen
-        if np.median(np.abs(rows.residual)) * self._rig.cam0.focal > _FAR_OFF_PX:
-            rows = ekf.relinearised(s, rows_now, self._common)
-        PHt, S = ekf.gains(s, rows, self._common)
-        doubted = rows.which[ekf.surprise(rows, S) >= config.gate]
-        good = ~np.isin(rows.which, doubted)  # one camera's doubt is enough
+        rows, good, PHt, S = self._judged(s, rows, rows_now)
+        gap = frame.stamp_ns - self._stamp_ns > _GAP_NS
+        if gap and good.mean() < _MINORITY and self._agreed(s, left):
+            ekf.doubt(s, *_DOUBT)
+            rows, good, PHt, S = self._judged(s, rows, rows_now)
         if good.all():
             ekf.update(s, rows, PHt, S)
         elif good.any():
@@ -226,6 +231,23 @@ class InertialTracker:
             ekf.update(s, rows.take(good), PHt[:, twice], S[np.ix_(twice, twice)])
         seen[rows.which[good]] = True
         return seen
+
+    def _judged(
+        self, s: State, rows: ekf.Sight, rows_now: Callable[[], ekf.Sight]
+    ) -> tuple[ekf.Sight, NDArray[np.bool_], F64, F64]:
+        """Rows at the best linearisation, which of them the filter believes, and its `ekf.gains`."""
+        if np.median(np.abs(rows.residual)) * self._rig.cam0.focal > _FAR_OFF_PX:
+            rows = ekf.relinearised(s, rows_now, self._common)
+        PHt, S = ekf.gains(s, rows, self._common)
+        doubted = rows.which[ekf.surprise(rows, S) >= self._config.gate]
+        return rows, ~np.isin(rows.which, doubted), PHt, S  # one camera's doubt is enough
+
+    def _agreed(self, s: State, left: find.Sought) -> bool:
+        """Whether nearly all that cam0 shows agrees among itself."""
+        which = np.flatnonzero(left.found & ~left.astray)
+        if len(which) < self._config.weak:
+            return False
+        return bool(parsac.by_votes(s, which, left.px[which], self._rig.cam0).mean() > _MAJORITY)
 
     def _judge(self, s: State, count: int, heard: bool) -> TrackState:
         config = self._config
