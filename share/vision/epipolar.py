@@ -9,7 +9,7 @@ from share.types import F32, F64, U8
 from share.vision.patches import sample
 
 _NEAREST_M = 0.3
-_STEP_PX = 1.0  # between places on the line
+_STEP_PX = 1.5  # between places on the line
 _AXIS = np.arange(-4, 5, dtype=np.float32)
 _OFFSETS: F32 = np.stack(np.meshgrid(_AXIS, _AXIS), axis=-1).reshape(-1, 2)
 _ALIKE, _CLEAR = 0.75, 0.03  # correlation of the best place, and by how much it beats the others
@@ -51,4 +51,5 @@ def _patches(image: U8, px: F32) -> F32:
     """(N, S) of zero mean and unit norm."""
     gray = sample(image, px[:, :1] + _OFFSETS[:, 0], px[:, 1:] + _OFFSETS[:, 1])
     gray = gray - gray.mean(axis=1, keepdims=True)
-    return gray / np.maximum(np.linalg.norm(gray, axis=1, keepdims=True), 1e-3)
+    out: F32 = gray / np.maximum(np.linalg.norm(gray, axis=1, keepdims=True), np.float32(1e-3))
+    return out

@@ -11,7 +11,7 @@ from share.emulate.plain.room import make_room
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.types import Frame
-from share.vision import corners, depth, klt
+from share.vision import corners, depth, epipolar, klt
 from share.vision.view import make_view, orb
 
 
@@ -85,6 +85,26 @@ def test_stereo_depth(scene):
     assert known.mean() > 0.8
     assert np.median(disparity_error) < 0.1  # px
     assert (disparity_error < 1).mean() > 0.95
+
+
+def test_the_whole_line_is_searched(scene):
+    left, exact, right, _, _ = scene
+    rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
+    px = corners.detect(left, np.zeros((0, 2), np.float32), 200, 15)
+    z = epipolar.search(left, right, rig, px, CAMERA.normalise(px.astype(float)))
+    truth = exact[np.rint(px[:, 1]).astype(int), np.rint(px[:, 0]).astype(int)]
+    known = ~np.isnan(z)
+    assert known.mean() > 0.7
+    assert (np.abs(385 * 0.05 * (1 / z - 1 / truth))[known] < 1.5).mean() > 0.95
+
+
+def test_what_repeats_along_the_line_has_no_depth():
+    stripes = np.tile(np.repeat(np.array([60, 190], np.uint8), 6), (480, 640))[:, :640]
+    image = stripes + np.linspace(0, 20, 480).astype(np.uint8)[:, None]
+    rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
+    px = np.array([[300.0, 200.0], [400.0, 300.0]], np.float32)
+    assert np.isnan(epipolar.search(image, image, rig, px, CAMERA.normalise(px.astype(float)))).all()
+    assert len(epipolar.search(image, image, rig, px[:0], np.zeros((0, 2)))) == 0
 
 
 def test_depth_of_an_unregistered_camera():

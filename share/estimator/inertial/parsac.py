@@ -55,8 +55,8 @@ def of_the_room(
 
 
 def by_votes(state: State, which: I64, px: F32, camera: Camera) -> NDArray[np.bool_]:
-    """Which of features `which` (M,), seen at px (M, 2), agree on a pose, whatever the filter expects; all where
-    less than half do."""
+    """Which of features `which` (M,), seen at px (M, 2), agree on a pose, whatever the filter expects; all
+    where less than half do."""
     T_odom_host = state.poses[state.host[which]] @ state.T_body_cam
     in_host = rays(state.ray[which]) / np.maximum(state.rho[which, None], _FARTHEST)
     points = (T_odom_host[:, :3, :3] @ in_host[:, :, None])[:, :, 0] + T_odom_host[:, :3, 3]
@@ -98,7 +98,7 @@ class _Fit:
     @property
     def looseness(self) -> float:
         """How well the places of features are known beforehand, median, in sigmas of what is seen."""
-        return float(np.median(np.linalg.norm(self._J, axis=(1, 2)))) / np.sqrt(2)
+        return float(np.median(np.linalg.norm(self._J, axis=(1, 2))) / np.sqrt(2))
 
     def motion(self, group: NDArray[np.bool_], sigmas: float, weight: F64 | None = None) -> F64:
         """The best (6,) of a group (M,) of rows."""

@@ -15,13 +15,14 @@ from share.estimator.inertial.memory import Memory
 from share.estimator.inertial.state import State
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
-from share.types import F32, F64, I64, Frame
-from share.vision import corners
+from share.types import F32, F64, I64, U8, Frame
+from share.vision import corners, epipolar
 from share.vision.depth import from_depth_camera, from_stereo
 
 _DEPTH_SIGMA_PX, _DEPTH_BASELINE = 0.3, 0.05  # of the stereo pair inside a depth camera, m
 _NOISE = 3.0  # gray levels of an image
 _SHARPEST_PX = 0.5  # error by noise alone, beyond which a patch is no feature
+_SAME_PLACE_PX = 2.0  # of disparity
 _SHUN_FRAMES = 30  # for which nothing new is sought where something moved by itself
 _CROWD, _WARY_FRAMES = 5, 60  # features at a time that went astray: somebody moves in the view
 _PROBATION_S, _UNPROVEN = 0.34, 5.0  # in which a feature proves itself, and times its sigma until then
@@ -121,7 +122,7 @@ class Scene:
         """1/m (N,), NaN unknown, and sigma (N,)."""
         focal = self._rig.cam0.focal
         if frame.image1 is not None and self._rig.cam1 is not None:
-            z = from_stereo(frame.image0, frame.image1, self._rig, px, ray)
+            z = self._stereo_depth(frame.image0, frame.image1, px, ray)
             sigma = self._config.sigma_px / focal / self._rig.baseline
         elif frame.depth is not None:
             z = from_depth_camera(frame.depth, self._rig, ray)
@@ -129,6 +130,14 @@ class Scene:
         else:
             z, sigma = np.full(len(px), np.nan), 1.0
         return 1 / z, np.full(len(z), sigma)
+
+    def _stereo_depth(self, image0: U8, image1: U8, px: F32, ray: F64) -> F64:
+        """m (N,), NaN where the pair does not agree on one: the clearest place on each line, then to a
+        fraction of a pixel."""
+        about = epipolar.search(image0, image1, self._rig, px, ray)
+        z = from_stereo(image0, image1, self._rig, px, ray, about)
+        off_px = np.abs(1 / z - 1 / about) * self._rig.cam0.focal * self._rig.baseline
+        return np.where(off_px < _SAME_PLACE_PX, z, np.nan)
 
     def _wake(self, frame: Frame, rate: F64) -> None:
         """Features seen from about here before, where they lie as near as the filter knows."""
