@@ -330,14 +330,17 @@ def test_a_stranger_with_a_free_hand_stays_outside(house: House) -> None:
         rogue.send(b"let me in")
         sockets.append(rogue)
     house.greets(house.agent(1, house.ann), 1)
-    end = time.monotonic() + 3
-    count = 0
+    end = time.monotonic() + 10
+    count, strangers = 0, []
     while count < 20 and time.monotonic() < end:
-        assert house.edge.receive(10) is None
+        message = house.edge.receive(10)
+        if message is not None and message[1] != [b"hello"]:  # ann may have had to say it twice
+            strangers.append(message)
         count += len(house.edge.refusals())
     for rogue in sockets:
         rogue.close()
     context.term()
+    assert not strangers
     assert count == 20
 
 
