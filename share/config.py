@@ -72,8 +72,9 @@ class InertialConfig:
     features: int = 110  # followed at a time
     spacing_px: float = 18.0  # least distance between new ones
     sigma_px: float = 0.5  # of a feature found again; its errors last, so this is more than their size
-    common_rad: float = 5e-5  # error of an image that all its features share: its blur, its time
-    common_m: float = 1e-4  # the same, as a shift of the camera
+    stereo_px: float = 0.25  # of a new feature's disparity
+    common_rad: float = 3e-3  # error of an image that all its features share: its blur, its time
+    common_m: float = 3e-4  # the same, as a shift of the camera
     gate: float = 12.0  # squared Mahalanobis distance, 2 degrees of freedom, beyond which a sight is refused
     alike: float = 0.85  # correlation with the first patch below which a feature is not seen
     settled_px: float = 0.3  # a last correction larger than this is no find

@@ -123,7 +123,7 @@ class Scene:
         focal = self._rig.cam0.focal
         if frame.image1 is not None and self._rig.cam1 is not None:
             z = self._stereo_depth(frame.image0, frame.image1, px, ray)
-            sigma = self._config.sigma_px / focal / self._rig.baseline
+            sigma = self._config.stereo_px / focal / self._rig.baseline
         elif frame.depth is not None:
             z = from_depth_camera(frame.depth, self._rig, ray)
             sigma = _DEPTH_SIGMA_PX / focal / _DEPTH_BASELINE
