@@ -90,6 +90,11 @@ def _summary(report: dict[str, Any], ate: Any) -> str:
         f"{report['cpu_ms_per_frame']:.1f} ms CPU a frame, "
         f"and {report['decode_ms_per_frame']:.1f} ms to decode it",
     ]
+    if report["contradicted"]:
+        lines.append(
+            f"images and IMU contradict each other in {report['contradicted']} frames: see whether the "
+            "camera sits on the IMU as the calibration says, and whether their clocks agree"
+        )
     if report["stretches"] > 1:
         lines.append(
             f"odometry broke: {report['stretches']} stretches, whose poses do not compare with each other"

@@ -13,7 +13,7 @@ class TrackResult:
 
     keyframe: this frame became one; the tracker's `keyframe` gives what it shows. points: how many
     the pose rests on. new_stretch: odometry broke before this keyframe. cov (6, 6): of T_odom_body, perturbed
-    on the right, where the tracker knows it.
+    on the right, where the tracker knows it. sound: False while images and IMU contradict each other.
     """
 
     state: TrackState
@@ -22,3 +22,4 @@ class TrackResult:
     points: int = 0
     new_stretch: bool = False
     cov: F64 | None = None
+    sound: bool = True

@@ -40,6 +40,7 @@ class RunLog:
     _rows: list[FrameRow] = field(default_factory=list)
     cpu_s: float = 0.0  # process CPU time of the tracking pipeline
     decode_s: float = 0.0  # CPU time of image decoding
+    contradicted: int = 0  # frames in which images and IMU told of different motions
     stretches: int = 0  # of unbroken odometry; poses of different ones do not compare
     _by_stamp: dict[int, FrameRow] = field(default_factory=dict)
 
@@ -82,6 +83,7 @@ class RunLog:
             "sent": sent,
             "lost_s": _lost_s(rows),
             "stretches": self.stretches,
+            "contradicted": self.contradicted,
             "track_ms": parts.track_ms.report(),
             "corrected_ms": parts.corrected_ms.report(),
             "latency_ms": parts.latency_ms.report(),

@@ -185,6 +185,7 @@ class AgentRun:
         )
         self._post(tracked)  # the pose goes out before others are served
         self._log.stretches += result.new_stretch
+        self._log.contradicted += not result.sound
         if result.keyframe:
             self._post(ev.KeyframeMade(tracked, self._tracker.keyframe(frame)))
         self._log.cpu_s += time.thread_time() - cpu

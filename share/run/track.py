@@ -37,6 +37,7 @@ def track(source: Source, settings: config.Config, progress: Callable[[int], Non
         result = tracker.track(frame)
         track_ms = 1e3 * (time.perf_counter() - began)
         log.stretches += result.new_stretch
+        log.contradicted += not result.sound
         if result.keyframe:
             tracker.keyframe(frame)
         log.cpu_s += time.process_time() - cpu

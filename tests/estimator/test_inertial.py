@@ -220,6 +220,20 @@ def test_a_renderer_knows_the_pose_between_frames(walk):
     assert InertialTracker(walk[1], InertialConfig(), TrackerConfig()).predict(to) is None
 
 
+def test_a_camera_that_sits_elsewhere_is_told_and_found(walk):
+    """Turned by 5 degrees and shifted by 5 cm against its calibration."""
+    frames, rig, truth = walk
+    off = se3.exp(np.concatenate([np.radians(5) * np.array([0.6, 0.0, 0.8]), [0.03, -0.04, 0.0]]))
+    wrong = dataclasses.replace(rig, T_body_cam0=rig.T_body_cam0 @ off)
+    fixed, _, _ = run((frames, wrong, truth), frames)
+    _, _, tracker = run((frames, wrong, truth), frames, InertialConfig(extrinsic_rad=0.05, extrinsic_m=0.03))
+    right, _, _ = run(walk, frames)
+    assert all(r.sound for r in right)
+    assert not any(r.sound for r in fixed[-5:])
+    left = se3.log(se3.inverse(rig.T_body_cam0) @ tracker.state.T_body_cam)
+    assert np.degrees(np.linalg.norm(left[:3])) < 1.5
+
+
 def test_what_it_cannot_track_is_refused():
     camera, noise = Camera(640, 480, 385.0, 385.0, 319.5, 239.5), ImuNoise(1e-3, 1e-2, 1e-5, 1e-4, 200.0)
     stereo = Rig(camera, np.eye(4), cam1=camera, T_cam1_cam0=np.eye(4))

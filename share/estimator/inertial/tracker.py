@@ -18,6 +18,7 @@ from share.estimator import relocalise
 from share.estimator.inertial import ekf, find, parsac
 from share.estimator.inertial.beginning import first_state, state_by_camera
 from share.estimator.inertial.features import Looks
+from share.estimator.inertial.health import Agreement
 from share.estimator.inertial.imu import integrate
 from share.estimator.inertial.samples import Samples, coasting, unclipped
 from share.estimator.inertial.scene import Scene
@@ -60,6 +61,7 @@ class InertialTracker:
         self._stamp_ns = 0
         self._rate = np.zeros(3)
         self._astray, self._refused_s = 0, 0.0  # see `_stray`
+        self._agreement, self._surprise = Agreement(), np.zeros(0)  # of the frame
         self._waited = 0  # frames, for the IMU
         self._ready = False
         self._knows_up = False  # the IMU said so
@@ -133,6 +135,8 @@ class InertialTracker:
         measured = self._propagate(frame, scene.state, imu)
         left, seen = self._look(frame, scene)
         heard = imu is not None
+        if measured:
+            self._agreement.add(self._surprise, (frame.stamp_ns - self._stamp_ns) * 1e-9)
         scene.seen(left, seen)
         if not measured:
             self._rate = _mean_rate(before, scene.state.T, frame.stamp_ns - self._stamp_ns)
@@ -154,7 +158,8 @@ class InertialTracker:
     def _told(self, s: State, state: TrackState, wanted: bool, count: int) -> TrackResult:
         first, self._ready = not self._ready, True
         new_stretch = first and self._new_stretch
-        return TrackResult(state, self._pose(s), wanted or first, count, new_stretch, ekf.pose_cov(s))
+        sound = self._agreement.sound
+        return TrackResult(state, self._pose(s), wanted or first, count, new_stretch, ekf.pose_cov(s), sound)
 
     def _look(self, frame: Frame, scene: Scene) -> tuple[find.Sought, NDArray[np.bool_]]:
         """Where cam0 shows the features, and which (N,) were seen and believed."""
@@ -215,7 +220,7 @@ class InertialTracker:
             rows = scene.with_doubt(first.join(*others))
             return rows.take(np.argsort(rows.host, kind="stable"))
 
-        seen = np.zeros(len(s.ids), bool)
+        seen, self._surprise = np.zeros(len(s.ids), bool), np.zeros(0)
         rows = rows_now(anew=False)
         if len(rows.which) == 0:
             return seen
@@ -239,7 +244,9 @@ class InertialTracker:
         if np.median(np.abs(rows.residual)) * self._rig.cam0.focal > _FAR_OFF_PX:
             rows = ekf.relinearised(s, rows_now, self._common)
         PHt, S = ekf.gains(s, rows, self._common)
-        doubted = rows.which[ekf.surprise(rows, S) >= self._config.gate]
+        surprise = ekf.surprise(rows, S)
+        self._surprise = surprise
+        doubted = rows.which[surprise >= self._config.gate]
         return rows, ~np.isin(rows.which, doubted), PHt, S  # one camera's doubt is enough
 
     def _agreed(self, s: State, left: find.Sought) -> bool:
