@@ -36,6 +36,7 @@ _FAR_OFF_PX = 1.0  # median residual, from which derivatives are taken anew
 _MINORITY, _MAJORITY = 0.3, 0.7  # of what is found: believed by the filter; agreeing among itself
 _GAP_NS = 250_000_000  # between frames: more than an IMU of this sort is modelled for,
 _DOUBT = 0.02, 0.1, 0.3  # rad, m, m/s: how wrong the filter may be after it that believes nobody
+_LONGEST_S = 0.2  # that one frame counts for
 _ASTRAY, _REFUSED_S = 3, 1.0  # frames with nothing of what should be there; time with nothing believed
 _REST_RATE, _REST_M_S = 0.03, 0.02  # rad/s of a body at rest; m/s of its velocity
 _SLOW_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to a filter that knows it moves
@@ -142,7 +143,7 @@ class InertialTracker:
             self._rate = _mean_rate(before, scene.state.T, frame.stamp_ns - self._stamp_ns)
         count = int(seen.sum())
         textured = count >= self._config.blind or corners.count(frame.image0) >= self._config.weak
-        self._stray(frame, textured, len(seen), int(left.found.sum()), count)
+        self._stray(frame, textured, left, count)
         state = self._judge(scene.state, count, heard)
         if not self._trusted(scene.state) or self._gone_astray:
             return self._lose(frame)
@@ -266,14 +267,16 @@ class InertialTracker:
             return TrackState.VISION_ONLY
         return TrackState.OK if count >= config.weak else TrackState.WEAK
 
-    def _stray(self, frame: Frame, textured: bool, sought: int, found: int, seen: int) -> None:
+    def _stray(self, frame: Frame, textured: bool, left: find.Sought, seen: int) -> None:
         """Frames that show something and nothing of what they should, or for long nothing that is believed:
-        then the filter is wrong, and not the light."""
+        then the filter is wrong, and not the light. What has left the view tells nothing."""
         config = self._config
-        if textured and sought >= config.weak:
-            self._astray = self._astray + 1 if found < config.blind else 0
-        refused = textured and seen < config.blind
-        self._refused_s = self._refused_s + (frame.stamp_ns - self._stamp_ns) * 1e-9 if refused else 0.0
+        due = int(self._rig.cam0.inside(np.nan_to_num(left.expected, nan=-1e6), 0.0).sum())
+        if textured and due >= config.weak:
+            self._astray = self._astray + 1 if left.found.sum() < config.blind else 0
+        refused = textured and due >= config.blind and seen < config.blind
+        lasted = min((frame.stamp_ns - self._stamp_ns) * 1e-9, _LONGEST_S)
+        self._refused_s = self._refused_s + lasted if refused else 0.0
 
     @property
     def _gone_astray(self) -> bool:
