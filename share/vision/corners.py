@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.types import F32, I64, U8
+from share.vision.grid import evenly
 
 _BLOCK = 5  # px, of a corner
 _LEAST = 4e-4  # of its least eigenvalue: above the noise of an image
@@ -24,7 +25,8 @@ def detect(image: U8, taken: F32, count: int, spacing: float) -> F32:
     if count <= 0:
         return np.zeros((0, 2), np.float32)
     px, strength = _peaks(image)
-    chosen = _apart(px[_evenly(px, strength, taken, image.shape)], taken, count, spacing, image.shape)
+    order = evenly(px, strength, image.shape[::-1], _CELLS, taken)
+    chosen = _apart(px[order], taken, count, spacing, image.shape)
     if len(chosen) == 0:
         return np.zeros((0, 2), np.float32)
     return _refined(image, chosen)
@@ -57,24 +59,6 @@ def _peaks(image: U8) -> tuple[I64, F32]:
     peak[:_BORDER], peak[-_BORDER:], peak[:, :_BORDER], peak[:, -_BORDER:] = False, False, False, False
     y, x = np.nonzero(peak)
     return np.stack([x, y], axis=1), strength[y, x]
-
-
-def _evenly(px: I64, strength: F32, taken: F32, shape: tuple[int, ...]) -> I64:
-    """An order (N,): the best of each cell of the image, then the second best, where the taken ones are the
-    best."""
-    cell = _cell(px, shape)
-    order = np.lexsort((-strength, cell))
-    first = np.searchsorted(cell[order], np.arange(_CELLS[0] * _CELLS[1]))
-    filled = np.bincount(_cell(taken, shape), minlength=len(first))
-    rank = np.arange(len(px)) - first[cell[order]] + filled[cell[order]]
-    out: I64 = order[np.lexsort((-strength[order], rank))]
-    return out
-
-
-def _cell(px: F32 | I64, shape: tuple[int, ...]) -> I64:
-    at = (px * _CELLS / (shape[1], shape[0])).astype(np.int64).clip(0, np.array(_CELLS) - 1)
-    out: I64 = at[:, 1] * _CELLS[0] + at[:, 0]
-    return out
 
 
 def _apart(px: I64, taken: F32, count: int, spacing: float, shape: tuple[int, ...]) -> I64:

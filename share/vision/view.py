@@ -8,6 +8,7 @@ import numpy as np
 from share.geometry.camera import Rig, rays
 from share.types import F32, F64, U8, Frame, View
 from share.vision import depth as depths
+from share.vision.grid import evenly
 
 
 def depth_at(frame: Frame, rig: Rig, px: F32, uv: F64, guess_m: F64 | None = None) -> F64:
@@ -49,18 +50,7 @@ def orb(image: U8, count: int, grid: tuple[int, int] = (8, 6)) -> tuple[F32, U8]
     if not keypoints:
         return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
     px = np.array([k.pt for k in keypoints], np.float32)
-    chosen = _spread(px, np.array([k.response for k in keypoints]), image.shape, count, grid)
+    response = np.array([k.response for k in keypoints])
+    chosen = np.sort(evenly(px, response, image.shape[::-1], grid)[:count])
     kept, descriptors = detector.compute(image, [keypoints[i] for i in chosen])
     return np.array([k.pt for k in kept], np.float32).reshape(-1, 2), np.asarray(descriptors, np.uint8)
-
-
-def _spread(px: F32, response: F64, shape: tuple[int, ...], count: int, grid: tuple[int, int]) -> np.ndarray:
-    """Indices of up to `count` points, taken in turn from the cells of a grid, strongest first."""
-    height, width = shape[:2]
-    column = np.minimum((px[:, 0] * grid[0] / width).astype(int), grid[0] - 1)
-    row = np.minimum((px[:, 1] * grid[1] / height).astype(int), grid[1] - 1)
-    cell = row * grid[0] + column
-    order = np.lexsort((np.arange(len(px)), -response, cell))
-    first = np.searchsorted(cell[order], np.arange(grid[0] * grid[1]))
-    rank = np.arange(len(px)) - first[cell[order]]  # how many of its own cell are stronger
-    return np.sort(order[np.lexsort((-response[order], rank))[:count]])

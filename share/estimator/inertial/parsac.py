@@ -18,6 +18,7 @@ from share.estimator.pose import consensus
 from share.geometry import se3
 from share.geometry.camera import Camera, rays
 from share.types import F32, F64, I64
+from share.vision.grid import cells
 
 _AGREES = 3.0  # sigmas of a feature's own
 _SPLIT = 0.15  # of the features may disagree with the rest before anybody is asked
@@ -48,7 +49,7 @@ def of_the_room(
     agree = fit.agree(fit.robust(proven if proven.sum() >= 2 * _FEWEST else everything))
     if agree.mean() > 1 - _SPLIT and fit.surprise(agree) < _UNLIKELY:
         return everything
-    region, cell = _grid(px, size, _REGIONS), _grid(px, size, _CELLS)
+    region, cell = cells(px, size, _REGIONS), cells(px, size, _CELLS)
     proposals = [agree, *(_grown(fit, region == k) for k in np.unique(region))]
     scores = [len(np.unique(cell[group & proven])) - fit.surprise(group) for group in proposals]
     return proposals[int(np.argmax(scores))]
@@ -61,8 +62,9 @@ def by_votes(state: State, which: I64, px: F32, camera: Camera) -> NDArray[np.bo
     in_host = rays(state.ray[which]) / np.maximum(state.rho[which, None], _FARTHEST)
     points = (T_odom_host[:, :3, :3] @ in_host[:, :, None])[:, :, 0] + T_odom_host[:, :3, 3]
     agree = consensus(points, camera.normalise(px.astype(np.float64)), camera.focal, _VOTE_PX, seed=0)
-    few = agree is None or agree.inliers.mean() < 0.5
-    return np.ones(len(which), bool) if agree is None or few else agree.inliers
+    if agree is None or agree.inliers.mean() < 0.5:
+        return np.ones(len(which), bool)
+    return agree.inliers
 
 
 def _grown(fit: _Fit, group: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -74,13 +76,6 @@ def _grown(fit: _Fit, group: NDArray[np.bool_]) -> NDArray[np.bool_]:
         if group.sum() < _FEWEST:
             break
     return group
-
-
-def _grid(px: F32, size: tuple[int, int], shape: tuple[int, int]) -> I64:
-    """The cell (M,) of each."""
-    at = (px * shape / size).astype(np.int64).clip(0, np.array(shape) - 1)
-    out: I64 = at[:, 1] * shape[0] + at[:, 0]
-    return out
 
 
 class _Fit:

@@ -11,7 +11,7 @@ the right) | time offset 1 | keyframe poses 6 each | inverse depths 1 each.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -64,10 +64,6 @@ class State:
     def means(self) -> tuple[Any, ...]:
         """All but the covariance, for `restore`."""
         return self.T, self.v, self.bg, self.ba, self.T_body_cam, self.offset_s, self.poses, self.rho
-
-    def copy(self) -> State:
-        """To go back to: steps of the filter replace all arrays but the covariance, into which they write."""
-        return replace(self, cov=self.cov.copy())
 
     def restore(self, means: tuple[Any, ...]) -> None:
         """What `means` gave. Steps of the filter replace arrays and never write into them."""

@@ -132,12 +132,13 @@ class InertialTracker:
 
     def _follow(self, frame: Frame, scene: Scene) -> TrackResult:
         before, imu = scene.state.T, self._heard(frame, scene.state)
-        scene.step((frame.stamp_ns - self._stamp_ns) * 1e-9)
+        since_s = (frame.stamp_ns - self._stamp_ns) * 1e-9
+        scene.step(since_s)
         measured = self._propagate(frame, scene.state, imu)
         left, seen = self._look(frame, scene)
         heard = imu is not None
         if measured:
-            self._agreement.add(self._surprise, (frame.stamp_ns - self._stamp_ns) * 1e-9)
+            self._agreement.add(self._surprise, since_s)
         scene.seen(left, seen)
         if not measured:
             self._rate = _mean_rate(before, scene.state.T, frame.stamp_ns - self._stamp_ns)
@@ -245,9 +246,8 @@ class InertialTracker:
         if np.median(np.abs(rows.residual)) * self._rig.cam0.focal > _FAR_OFF_PX:
             rows = ekf.relinearised(s, rows_now, self._common)
         PHt, S = ekf.gains(s, rows, self._common)
-        surprise = ekf.surprise(rows, S)
-        self._surprise = surprise
-        doubted = rows.which[surprise >= self._config.gate]
+        self._surprise = ekf.surprise(rows, S)
+        doubted = rows.which[self._surprise >= self._config.gate]
         return rows, ~np.isin(rows.which, doubted), PHt, S  # one camera's doubt is enough
 
     def _agreed(self, s: State, left: find.Sought) -> bool:
