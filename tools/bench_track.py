@@ -39,7 +39,7 @@ from share.emulate.demo import FALLBACK, SCENE  # noqa: E402
 from share.emulate.recipe import Recipe  # noqa: E402
 from share.emulate.render.context import missing  # noqa: E402
 from share.emulate.session import cached_session, make_session  # noqa: E402
-from share.estimator.inertial import ekf, features, find, tracker  # noqa: E402
+from share.estimator.inertial import ekf, features, find, parsac, tracker  # noqa: E402
 from share.estimator.inertial.scene import Scene  # noqa: E402
 from share.estimator.inertial.tracker import InertialTracker  # noqa: E402
 from share.estimator.visual import VisualTracker  # noqa: E402
@@ -58,7 +58,7 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (find, "_expected", "expect"),
     (patches, "align", "align"),
     (find, "rescue", "rescue"),
-    (InertialTracker, "_movers", "movers"),
+    (parsac, "of_the_room", "movers"),
     (Scene, "sight", "rows"),
     (ekf, "relinearised", "anew where far off"),
     (ekf, "gains", "gains"),

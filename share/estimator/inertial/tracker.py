@@ -27,7 +27,7 @@ from share.estimator.localmap import LocalKeyframe, LocalMap
 from share.estimator.result import TrackResult
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
-from share.types import F64, I64, U8, Candidate, Frame, ImuBatch, TrackState
+from share.types import F64, U8, Candidate, Frame, ImuBatch, TrackState
 from share.vision import corners
 from share.vision.view import make_view
 
@@ -170,14 +170,16 @@ class InertialTracker:
         left = find.seek(frame.image0, camera, s, looks, self._config)
         if self._image is not None:
             find.rescue(self._image, frame.image0, camera, looks, left, self._config)
-        left.astray[self._movers(scene, left)] = True
-        return left, self._update(frame, scene, left)
+        rows = self._of_the_room(scene, left)
+        return left, self._update(frame, scene, left, rows)
 
-    def _movers(self, scene: Scene, left: find.Sought) -> I64:
-        """Numbers of features that were found and are no part of the room."""
-        which = np.flatnonzero(left.found)
-        rows, px, proven = scene.sight(left, self._rate), left.px[which], scene.proven(which)
-        return which[~parsac.of_the_room(scene.state, rows, px, proven, self._rig.cam0)]
+    def _of_the_room(self, scene: Scene, left: find.Sought) -> ekf.Sight:
+        """Rows of what cam0 shows of the room; what moves by itself is marked as astray."""
+        rows = scene.sight(left, self._rate)
+        px, proven = left.px[rows.which], scene.proven(rows.which)
+        fixed = parsac.of_the_room(scene.state, rows, px, proven, self._rig.cam0)
+        left.astray[rows.which[~fixed]] = True
+        return rows.take(fixed)
 
     def _heard(self, frame: Frame, s: State) -> ImuBatch | None:
         """What the IMU said until the image was taken; None if it was silent."""
@@ -208,8 +210,10 @@ class InertialTracker:
         """When the image was taken, IMU time."""
         return frame.stamp_ns + round(s.offset_s * 1e9)
 
-    def _update(self, frame: Frame, scene: Scene, left: find.Sought) -> NDArray[np.bool_]:
-        """Which features (N,) were seen and believed."""
+    def _update(
+        self, frame: Frame, scene: Scene, left: find.Sought, left_rows: ekf.Sight
+    ) -> NDArray[np.bool_]:
+        """Which features (N,) were seen and believed. left_rows: of `left`, before the update."""
         s, config = scene.state, self._config
         sought: list[tuple[find.Sought, F64 | None]] = [(left, None)]
         if frame.image1 is not None and self._rig.cam1 is not None:
@@ -217,13 +221,15 @@ class InertialTracker:
             right = find.seek(frame.image1, self._rig.cam1, s, scene.looks, config, T, left=left)
             sought.append((right, T))
 
-        def rows_now(anew: bool = True) -> ekf.Sight:
-            first, *others = (scene.sight(image, self._rate, T, anew) for image, T in sought)
+        def arranged(first: ekf.Sight, *others: ekf.Sight) -> ekf.Sight:
             rows = scene.with_doubt(first.join(*others))
             return rows.take(np.argsort(rows.host, kind="stable"))
 
+        def rows_now() -> ekf.Sight:
+            return arranged(*(scene.sight(image, self._rate, T, anew=True) for image, T in sought))
+
         seen, self._surprise = np.zeros(len(s.ids), bool), np.zeros(0)
-        rows = rows_now(anew=False)
+        rows = arranged(left_rows, *(scene.sight(image, self._rate, T) for image, T in sought[1:]))
         if len(rows.which) == 0:
             return seen
         rows, good, PHt, S = self._judged(s, rows, rows_now)
