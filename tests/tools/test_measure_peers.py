@@ -1,0 +1,134 @@
+"""What goes to a peer in another interpreter and comes back, and what is said of one that is not there."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from argparse import Namespace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import make_euroc
+
+from share.config import Config
+from share.core.sequencer import SequencerCounters
+from share.errors import DataError, UsageError
+from share.io.source import open_source
+from share.run.pipeline import frames_of
+
+TOOLS = Path(__file__).resolve().parents[2] / "tools"
+PEER = f"""
+import sys
+sys.path.insert(0, {str(TOOLS)!r})
+import numpy as np
+from peer_wire import claim_stdout, read_line, read_moment, write_line
+
+answers = claim_stdout()
+print("chatter that is no answer", flush=True)
+seen = dict(calibration=read_line(sys.stdin.buffer), moments=[])
+while (moment := read_moment(sys.stdin.buffer)) is not None:
+    if len(seen["moments"]) == int(sys.argv[2]):
+        sys.exit("had enough")
+    seen["moments"].append(moment._asdict())
+    T = np.eye(4)
+    T[:3, 3] = 0.1 * len(seen["moments"]), moment.left[0, 0], 1 / 3
+    write_line(answers, dict(T_world_body=T.tolist(), cpu_s=0.001 * len(seen["moments"])))
+np.save(sys.argv[1], seen, allow_pickle=True)
+"""
+
+
+@pytest.fixture
+def tool(monkeypatch):
+    monkeypatch.syspath_prepend(TOOLS)
+    return importlib.import_module("measure_peers")
+
+
+@pytest.fixture
+def source(tmp_path):
+    return open_source(str(make_euroc(tmp_path / "recording", frames=25)))
+
+
+def command(tmp_path, most=1000):
+    script = tmp_path / "peer.py"
+    script.write_text(PEER)
+    return [sys.executable, str(script), str(tmp_path / "seen.npy"), str(most)]
+
+
+def test_peer_sees_what_was_recorded(tool, source, tmp_path):
+    tool.peer_run(source, command(tmp_path))
+    seen = np.load(tmp_path / "seen.npy", allow_pickle=True).item()
+    frames = list(frames_of(source, Config(), SequencerCounters()))
+    assert [m["stamp_ns"] for m in seen["moments"]] == [frame.stamp_ns for frame in frames]
+    for moment, frame in zip(seen["moments"], frames, strict=True):
+        assert np.array_equal(moment["left"], frame.image0) and np.array_equal(moment["right"], frame.image1)
+    imu_ns, imu = (np.concatenate([m[key] for m in seen["moments"]]) for key in ("imu_ns", "imu"))
+    recorded = [m for m in source.measurements() if m.stream == "imu"][: len(imu_ns)]
+    assert imu_ns.tolist() == [m.stamp_ns for m in recorded]
+    assert imu.tolist() == [list(m.payload) for m in recorded]
+
+
+def test_samples_go_just_past_their_frame(tool, source):
+    for moment in tool.moments(source):
+        assert moment.imu_ns[-2] <= moment.stamp_ns < moment.imu_ns[-1]
+
+
+def test_frames_that_no_sample_comes_after_are_not_shown(tool, source):
+    stamps, values = source.imu
+    last = source.stamps()["cam0"][-1]
+    object.__setattr__(source, "imu", (stamps[stamps <= last], values[stamps <= last]))
+    assert [m.stamp_ns for m in tool.moments(source)] == source.stamps()["cam0"][:-1].tolist()
+
+
+def test_peer_is_told_the_calibration(tool, source, tmp_path):
+    tool.peer_run(source, command(tmp_path))
+    told = np.load(tmp_path / "seen.npy", allow_pickle=True).item()["calibration"]
+    left, right = told["cameras"]
+    assert left["K"] == [[50.0, 0.0, 31.5], [0.0, 51.0, 23.5], [0.0, 0.0, 1.0]]
+    assert left["distortion"] == [-0.28, 0.07, 0.0002, 1.76e-05] and (left["width"], left["height"]) == (
+        64,
+        48,
+    )
+    assert np.allclose(np.array(right["T_body_cam"]), [[1, 0, 0, 0.11], *np.eye(4)[1:]], atol=1e-12)
+    assert told["imu"]["gyro_density"] == 1.7e-4 and told["imu"]["rate_hz"] == 200
+
+
+def test_answers_come_back(tool, source, tmp_path):
+    run = tool.peer_run(source, command(tmp_path))
+    first = next(tool.moments(source))
+    assert run.stamps == source.stamps()["cam0"].tolist()
+    assert run.poses[0][:3, 3].tolist() == [0.1, float(first.left[0, 0]), 1 / 3]
+    assert run.cpu_ms == pytest.approx(range(2, 26))  # the first frame sets up
+
+
+def test_peer_that_stops_is_an_error(tool, source, tmp_path):
+    with pytest.raises(DataError, match="frame 3"):
+        tool.peer_run(source, command(tmp_path, most=3))
+
+
+def test_score_is_of_all_frames_under_one_alignment(tool, source):
+    truth = source.truth()
+    T = np.array([[0, -1, 0, 4], [1, 0, 0, 5], [0, 0, 1, 6], [0, 0, 0, 1.0]])
+    run = tool.Run(truth.stamps_ns.tolist(), list(T @ truth.T), [1.0, 2.0, 6.0])
+    good = tool.figures(source, run)
+    assert good["ate_cm"] == pytest.approx(0, abs=1e-9) and good["told"] == 1
+    assert (good["cpu_ms"], good["cpu_mean_ms"]) == (2, 3)
+    run.poses[7] = run.poses[7] + np.array([[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0.05], [0, 0, 0, 0]])
+    assert tool.figures(source, run)["worst_cm"] == pytest.approx(5, rel=0.2)
+
+
+@pytest.mark.parametrize("python", [None, Path(sys.executable), Path("/nowhere/python")])
+def test_peer_that_is_not_there_is_named(tool, python, capsys):
+    if python == Path(sys.executable) and importlib.util.find_spec("depthai"):
+        pytest.skip("depthai is installed here")
+    names = [name for name, _ in tool.trackers_of(Namespace(python=python))]
+    assert len(names) == 1 and names[0].startswith("SHARE ")
+    told = capsys.readouterr().err
+    assert told.startswith("left out: Basalt") and told.count("\n") == 1
+    assert "pip install depthai==" in told and "--python" in told
+
+
+def test_mono_is_refused(tool, tmp_path):
+    folder = make_euroc(tmp_path / "mono", imu=False)
+    with pytest.raises(UsageError, match="stereo"):
+        tool.calibration(open_source(str(folder)))

@@ -1,0 +1,62 @@
+"""The pipe between measure_peers and a peer in another interpreter. Needs numpy alone: both ends use it.
+
+To the peer: a line of JSON, its calibration; then of every moment a line of JSON and the bytes of both
+images. Back: a line of JSON for each moment. Numbers go as text that reads back to the same number.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Moment(NamedTuple):
+    """Both images (H, W) uint8 at stamp_ns; the IMU's stamps (N,) ns and samples (N, 6), gyro rad/s and
+    accelerometer m/s^2, since the moment before, up to the first after stamp_ns."""
+
+    stamp_ns: int
+    imu_ns: NDArray[np.int64]
+    imu: NDArray[np.float64]
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+
+
+def claim_stdout() -> IO[bytes]:
+    """This process's stdout, for answers alone; whatever else is printed goes to stderr from now on."""
+    out = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    return out
+
+
+def write_line(stream: IO[bytes], values: dict[str, Any]) -> None:
+    stream.write(json.dumps(values).encode() + b"\n")
+    stream.flush()
+
+
+def read_line(stream: IO[bytes]) -> dict[str, Any] | None:
+    """None at the end."""
+    line = stream.readline()
+    return json.loads(line) if line else None
+
+
+def write_moment(stream: IO[bytes], moment: Moment) -> None:
+    images = (moment.left, moment.right)
+    head = {"stamp_ns": moment.stamp_ns, "imu_ns": moment.imu_ns.tolist(), "imu": moment.imu.tolist()}
+    write_line(stream, head | {"shapes": [image.shape for image in images]})
+    for image in images:
+        stream.write(image.tobytes())
+    stream.flush()
+
+
+def read_moment(stream: IO[bytes]) -> Moment | None:
+    """None at the end."""
+    head = read_line(stream)
+    if head is None:
+        return None
+    images = [np.frombuffer(stream.read(h * w), np.uint8).reshape(h, w) for h, w in head["shapes"]]
+    imu = np.array(head["imu"], np.float64).reshape(-1, 6)
+    return Moment(head["stamp_ns"], np.array(head["imu_ns"], np.int64), imu, *images)
