@@ -117,10 +117,8 @@ def trackers_of(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[So
     python = options.python
     name = None if python is None else version_of(python)
     if name is None:
-        print(
-            f"left out: Basalt, not installed {'' if python is None else f'for {python}'}; {INSTALL}",
-            file=sys.stderr,
-        )
+        why = "no --python is given" if python is None else f"{python} does not have it"
+        print(f"left out: Basalt, {why}; {INSTALL}", file=sys.stderr)
     else:
         code = hashlib.sha256(b"".join(p.read_bytes() for p in sorted(ADAPTOR.parent.glob("peer_*.py"))))
         yield f"{name} {code.hexdigest()[:8]}", lambda source: peer_run(source, [str(python), str(ADAPTOR)])
