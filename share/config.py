@@ -71,10 +71,12 @@ class InertialConfig:
 
     features: int = 110  # followed at a time
     spacing_px: float = 18.0  # least distance between new ones
-    sigma_px: float = 0.5  # of a feature found again; its errors last, so this is more than their size
+    sigma_px: float = 0.15  # of a feature found again, anew in every image,
+    lasting_px: float = 0.3  # and of what is wrong with it for longer: edges, patches seen from elsewhere;
+    lasting_s: float = 1.0  # for so long
     stereo_px: float = 0.25  # of a new feature's disparity
-    common_rad: float = 3e-3  # error of an image that all its features share: its blur, its time
-    common_m: float = 3e-4  # the same, as a shift of the camera
+    common_rad: float = 1e-3  # error of an image that all its features share: its blur, its time
+    common_m: float = 1e-4  # the same, as a shift of the camera
     gate: float = 12.0  # squared Mahalanobis distance, 2 degrees of freedom, beyond which a sight is refused
     alike: float = 0.85  # correlation with the first patch below which a feature is not seen
     settled_px: float = 0.3  # a last correction larger than this is no find
@@ -104,7 +106,7 @@ class InertialConfig:
 
     def __post_init__(self) -> None:
         _require_positive(self, "features", "spacing_px", "sigma_px", "gate", "imu_noise", "gravity")
-        _require_positive(self, "max_keyframes")
+        _require_positive(self, "max_keyframes", "lasting_s")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The filter alone, fed with what a perfect front end would see, noise and all."""
+"""The filter alone, fed with what a front end would see: noise, and errors that last."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from share.geometry import se3
 from share.types import ImuBatch
 
 FRAME_HZ, IMU_HZ = 20, 200
-SIGMA_PX = 0.5
+SIGMA_PX, LASTING_PX, LASTING_S = 0.5, 0.5, 1.0
 
 
 @dataclass
@@ -72,6 +72,7 @@ def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
         near = slice(*np.searchsorted(imu.stamps_ns, (state.stamp_ns - 10**7, to_ns + 10**7)))
         part = ImuBatch(imu.stamps_ns[near], imu.gyro[near], imu.accel[near])
         rate = ekf.propagate(state, part, to_ns, NOISE, GRAVITY)
+        ekf.fade(state, 1 / FRAME_HZ, LASTING_PX / CAMERA.focal, LASTING_S)
         taken = stamp + offset
         level = world.see(state, taken, rate)
         if len(state.ids) < 0.7 * setup.features or stamp - keyframe_at > 1.0:
@@ -109,7 +110,7 @@ class _World:
 
     def __init__(self, path, sensors, rng):
         self._path, self._rig, self._rng = path, sensors, rng
-        self._points = {}
+        self._points, self._lasting = {}, {}
 
     def _camera(self, taken):
         return self._path.poses(np.array([taken]))[0] @ self._rig.T_body_cam0
@@ -119,12 +120,13 @@ class _World:
         if len(state.ids) == 0:
             return 1.0
         points = np.array([self._points[i] for i in state.ids])
+        lasting = self._what_lasts(state.ids)
         seen = []
         for T_right_left in (None, self._rig.T_cam1_cam0):
             T = se3.inverse(self._camera(taken))
             T = T if T_right_left is None else T_right_left @ T
             px = CAMERA.project(se3.transform(T, points))
-            px += self._rng.normal(0, SIGMA_PX, px.shape)
+            px += self._rng.normal(0, SIGMA_PX, px.shape) + lasting
             seen.append(np.where(CAMERA.inside(np.nan_to_num(px, nan=-1e9))[:, None], px, np.nan))
         inside = ~np.isnan(seen[0][:, 0]) & ~np.isnan(seen[1][:, 0])
         which = np.flatnonzero(inside)
@@ -142,6 +144,14 @@ class _World:
             level = ekf.update(state, rows, *ekf.gains(state, rows)) / (2 * len(rows.which))
         ekf.keep_features(state, inside)
         return level
+
+    def _what_lasts(self, ids):
+        """px (N, 2), a frame later."""
+        kept = np.exp(-1 / FRAME_HZ / LASTING_S)
+        fresh = self._rng.normal(0, LASTING_PX * np.sqrt(1 - kept**2), (len(ids), 2))
+        for i, news in zip(ids.tolist(), fresh, strict=True):
+            self._lasting[i] = kept * self._lasting.get(i, np.zeros(2)) + news
+        return np.array([self._lasting[i] for i in ids.tolist()])
 
     def new(self, state, host, k, taken, count, next_id):
         if count <= 0:

@@ -58,6 +58,11 @@ def basis(state, k):
     return e
 
 
+def looked(state, T):
+    """Where features show in an image."""
+    return observe.predict(state, np.arange(10), T).uv + state.lasting
+
+
 @pytest.mark.parametrize("right", [False, True])
 def test_what_is_seen(state, right):
     T = RIG.T_cam1_cam0 if right else None
@@ -70,15 +75,16 @@ def test_what_is_seen(state, right):
     for i in range(10):
         H[2 * i : 2 * i + 2, state.keyframe(rows.host[i])] = rows.by_host[i]
         H[2 * i : 2 * i + 2, state.features_at + i] = rows.by_rho[i]
+        H[2 * i : 2 * i + 2, state.lasting_at + 2 * i : state.lasting_at + 2 * i + 2] = np.eye(2)
     for k in range(state.size):
         if k == OFFSET:
             continue
-        up, down = (observe.predict(moved(state, s * basis(state, k)), which, T).uv for s in (1, -1))
+        up, down = (looked(moved(state, s * basis(state, k)), T) for s in (1, -1))
         assert np.allclose(H[:, k], ((up - down) / (2 * STEP)).ravel(), atol=1e-6, rtol=1e-6)
     later, sooner = copy.deepcopy(state), copy.deepcopy(state)
     V = ekf.twist(state, rate)
     later.T, sooner.T = se3.exp(V * STEP) @ state.T, se3.exp(-V * STEP) @ state.T
-    up, down = (observe.predict(s, which, T).uv for s in (later, sooner))
+    up, down = (looked(s, T) for s in (later, sooner))
     assert np.allclose(H[:, OFFSET], ((up - down) / (2 * STEP)).ravel(), atol=1e-6, rtol=1e-6)
     PHt, S = ekf.gains(state, rows)
     assert np.allclose(PHt, state.cov @ H.T, atol=1e-14)

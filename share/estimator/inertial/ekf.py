@@ -39,7 +39,8 @@ _SETTLED = 1e-4  # rad, m, 1/m: a correction that changes no derivative
 class Sight(Columns):
     """Rows of an update: residual (M, 2) measured - predicted, and how it depends on the state: core
     (M, 2, 22), the pose (M, 2, 6) of keyframe number host (M,), inverse depth (M, 2) of feature number
-    which (M,). sigma (M,) of one coordinate, as the residual: normalised coordinates."""
+    which (M,), and its lasting error, as it is. sigma (M,) of one coordinate, as the residual: normalised
+    coordinates."""
 
     which: I64
     host: I64
@@ -63,6 +64,17 @@ def propagate(state: State, imu: ImuBatch, to_ns: int, noise: ImuNoise, gravity:
     return motion.rate
 
 
+def fade(state: State, seconds: float, sigma: float, time_s: float) -> None:
+    """What sights have wrong that lasts forgets itself in `time_s`, and is renewed: a Gauss-Markov process of
+    `sigma`, normalised coordinates (Gelb 1974, 3.8)."""
+    kept, at, P = np.exp(-seconds / time_s), state.lasting_at, state.cov
+    state.lasting = kept * state.lasting
+    P[at:] *= kept
+    P[:, at:] *= kept
+    own = np.arange(at, state.size)
+    P[own, own] += (1 - kept**2) * sigma**2
+
+
 def twist(state: State, rate: F64) -> F64:
     """How the body's pose moves with time, (6,): T(t + dt) = Exp(twist dt) T(t). rate (3,): rad/s, body."""
     turning = state.T[:3, :3] @ rate
@@ -74,22 +86,25 @@ def sight(state: State, which: I64, seen: Prediction, uv: F64, sigma: F64, rate:
     core = np.zeros((len(which), 2, CORE))
     core[:, :, POSE], core[:, :, EXTRINSIC] = seen.by_pose, seen.by_extrinsic
     core[:, :, OFFSET] = seen.by_pose @ twist(state, rate)
-    return Sight(which, state.host[which], uv - seen.uv, core, -seen.by_pose, seen.by_rho, sigma)
+    return Sight(
+        which, state.host[which], uv - seen.uv - state.lasting[which], core, -seen.by_pose, seen.by_rho, sigma
+    )
 
 
 def gains(state: State, rows: Sight, common: F64 | None = None) -> tuple[F64, F64]:
-    """cov H' (n, 2 M) and H cov H' + R (2 M, 2 M) of rows sorted by host. H is not formed: a row has 29
+    """cov H' (n, 2 M) and H cov H' + R (2 M, 2 M) of rows sorted by host. H is not formed: a row has 30
     entries. common (6, 6): covariance of an error that all rows share, as one of the pose, on its right."""
     P, M = state.cov, len(rows.which)
     core, by_host = rows.core.reshape(2 * M, CORE), rows.by_host.reshape(2 * M, 6)
     by_rho, at_rho = rows.by_rho.ravel(), np.repeat(state.features_at + rows.which, 2)
+    at_lasting = (state.lasting_at + 2 * rows.which[:, None] + (0, 1)).ravel()
     groups = [
         (state.keyframe(int(h)), slice(2 * a, 2 * b)) for h, a, b in zip(*_runs(rows.host), strict=True)
     ]
-    PHt = P[:, :CORE] @ core.T + P[:, at_rho] * by_rho
+    PHt = P[:, :CORE] @ core.T + P[:, at_rho] * by_rho + P[:, at_lasting]
     for columns, part in groups:
         PHt[:, part] += P[:, columns] @ by_host[part].T
-    S = core @ PHt[:CORE] + by_rho[:, None] * PHt[at_rho]
+    S = core @ PHt[:CORE] + by_rho[:, None] * PHt[at_rho] + PHt[at_lasting]
     for columns, part in groups:
         S[part] += by_host[part] @ PHt[columns]
     S[np.diag_indices(2 * M)] += np.repeat(rows.sigma**2, 2)
@@ -146,7 +161,8 @@ def times(state: State, rows: Sight, error: F64) -> F64:
     """H error (M, 2)."""
     poses = error[CORE : state.features_at].reshape(-1, 6)[rows.host]
     by_rho = rows.by_rho * error[state.features_at + rows.which, None]
-    out: F64 = rows.core @ error[:CORE] + (rows.by_host @ poses[:, :, None])[:, :, 0] + by_rho
+    lasting = error[state.lasting_at :].reshape(-1, 2)[rows.which]
+    out: F64 = rows.core @ error[:CORE] + (rows.by_host @ poses[:, :, None])[:, :, 0] + by_rho + lasting
     return out
 
 
@@ -210,7 +226,8 @@ def move(state: State, error: F64) -> None:
     state.bg, state.ba = state.bg + error[GYRO_BIAS], state.ba + error[ACCEL_BIAS]
     state.T_body_cam = state.T_body_cam @ se3.exp(error[EXTRINSIC])
     state.offset_s += float(error[OFFSET])
-    state.rho = state.rho + error[state.features_at :]
+    state.rho = state.rho + error[state.features_at : state.lasting_at]
+    state.lasting = state.lasting + error[state.lasting_at :].reshape(-1, 2)
 
 
 def add_keyframe(state: State, keyframe: int, rate: F64) -> int:
@@ -233,14 +250,19 @@ def add_keyframe(state: State, keyframe: int, rate: F64) -> int:
     return len(state.keyframes) - 1
 
 
-def add_features(state: State, ids: I64, host: I64, ray: F64, rho: F64, sigma: F64) -> None:
-    """Features (N,) that keyframes number `host` (N,) see on rays (N, 2), inverse depths rho, sigma (N,)."""
-    n, more = state.size, len(ids)
-    grown = np.zeros((n + more, n + more))
-    grown[:n, :n] = state.cov
-    new = np.arange(n, n + more)
-    grown[new, new] = sigma**2
+def add_features(
+    state: State, ids: I64, host: I64, ray: F64, rho: F64, sigma: F64, lasting: float = 0.0
+) -> None:
+    """Features (N,) that keyframes number `host` (N,) see on rays (N, 2), inverse depths rho, sigma (N,).
+    lasting: sigma of what a sight of them now has wrong; nothing in the image that defines them."""
+    n, at, more = state.size, state.lasting_at, len(ids)
+    grown = np.zeros((n + 3 * more, n + 3 * more))
+    old = np.r_[0:at, at + more : n + more]
+    grown[np.ix_(old, old)] = state.cov
+    rhos, errors = np.arange(at, at + more), np.arange(n + more, n + 3 * more)
+    grown[rhos, rhos], grown[errors, errors] = sigma**2, lasting**2
     state.cov = grown
+    state.lasting = np.concatenate([state.lasting, np.zeros((more, 2))])
     state.ids = np.concatenate([state.ids, ids])
     state.host = np.concatenate([state.host, host])
     state.ray = np.concatenate([state.ray, ray])
@@ -249,16 +271,17 @@ def add_features(state: State, ids: I64, host: I64, ray: F64, rho: F64, sigma: F
 
 def keep_features(state: State, keep: NDArray[np.bool_]) -> None:
     """The others are forgotten; what they taught of the rest stays."""
-    _keep_columns(state, np.r_[np.ones(state.features_at, bool), keep])
+    _keep_columns(state, np.r_[np.ones(state.features_at, bool), keep, np.repeat(keep, 2)])
     state.ids, state.host = state.ids[keep], state.host[keep]
-    state.ray, state.rho = state.ray[keep], state.rho[keep]
+    state.ray, state.rho, state.lasting = state.ray[keep], state.rho[keep], state.lasting[keep]
 
 
 def drop_keyframes(state: State, keyframes: I64) -> None:
     """These ids, with the features that they host."""
     leave = np.isin(state.keyframes, keyframes)
     keep_features(state, ~leave[state.host])
-    _keep_columns(state, np.r_[np.ones(CORE, bool), np.repeat(~leave, 6), np.ones(len(state.ids), bool)])
+    features = np.ones(3 * len(state.ids), bool)
+    _keep_columns(state, np.r_[np.ones(CORE, bool), np.repeat(~leave, 6), features])
     state.host = (np.cumsum(~leave) - 1)[state.host]
     state.keyframes, state.poses = state.keyframes[~leave], state.poses[~leave]
 

@@ -13,6 +13,8 @@ from share.types import F32, F64, I64, U8
 from share.vision import patches
 from share.vision.patches import Patches
 
+_NEW, _YOUNG = 4, 10  # frames
+_FEW = 40  # features, of which none waits for its turn
 _LATELY = 0.2  # of a residual that is added to a lag
 _RUN_PX, _UNUSUAL = 0.5, 5.0  # a lag of this size, and so many times the least ones, is a motion of its own
 _FEWEST = 12  # features that say something of each other
@@ -72,6 +74,24 @@ def runaways(looks: Looks, which: I64, residual: F64) -> NDArray[np.bool_]:
     looks.lag[which] += _LATELY * (own - looks.lag[which])
     far = np.linalg.norm(looks.lag[which], axis=1)
     out: NDArray[np.bool_] = far > max(_RUN_PX, _UNUSUAL * float(np.quantile(far, 0.25)))
+    return out
+
+
+def heard(looks: Looks) -> NDArray[np.bool_]:
+    """Which (N,) the filter hears in an image: new ones always, others in every second. What is wrong with a
+    sight is the same in the next one."""
+    out: NDArray[np.bool_] = (looks.age < _NEW) | (_turn(looks) % 2 == 0)
+    return out | (len(out) < _FEW)
+
+
+def seen_twice(looks: Looks) -> NDArray[np.bool_]:
+    """Which of these a second camera is asked for: young ones always, for their depth, others by turns."""
+    out: NDArray[np.bool_] = heard(looks) & ((looks.age < _YOUNG) | (_turn(looks) % 4 == 0))
+    return out
+
+
+def _turn(looks: Looks) -> I64:
+    out: I64 = looks.age + np.arange(len(looks.age))
     return out
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from share.config import InertialConfig
 from share.estimator.inertial import observe
-from share.estimator.inertial.features import Looks
+from share.estimator.inertial.features import Looks, seen_twice
 from share.estimator.inertial.observe import Prediction
 from share.estimator.inertial.state import State
 from share.geometry.camera import Camera
@@ -17,7 +17,6 @@ from share.types import F32, F64, I64, U8
 from share.vision import klt, patches
 
 _BORDER_PX = 6.0
-_YOUNG = 10  # frames
 _AGREE_PX = 1.5  # how far the way by the image before may be from what the first patch says
 _TINY = 1e-12 * np.eye(2)
 
@@ -57,16 +56,9 @@ def seek(
     out = Sought(px, np.zeros(n, bool), np.zeros(n, bool), where, seen, warp, nowhere, along)
     start = where if left is None else where + (left.px - left.expected)
     inside = camera.inside(np.nan_to_num(start, nan=-1e6), _BORDER_PX) & (np.arange(n) >= fresh)
-    todo = np.flatnonzero(inside if left is None else inside & left.found & ~left.astray & _by_turns(looks))
+    todo = np.flatnonzero(inside if left is None else inside & left.found & ~left.astray & seen_twice(looks))
     _settle(image, looks, todo, start[todo], warp[todo], config, config.reach_px, out)
     return out
-
-
-def _by_turns(looks: Looks) -> NDArray[np.bool_]:
-    """Which features (N,) a second camera is asked for: young ones always, for their depth, others in every
-    third frame."""
-    turn: NDArray[np.bool_] = (looks.age + np.arange(len(looks.age))) % 3 == 0
-    return turn | (looks.age < _YOUNG)
 
 
 def rescue(

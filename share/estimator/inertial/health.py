@@ -9,13 +9,13 @@ from share.types import F64
 _OVER_S, _LEAST_S = 5.0, 1.0  # averaged over; of frames, before anything is said
 _BEGIN_S = 1.0  # in which a filter that has just begun finds its bearings
 _FEWEST = 25  # features that say something
-_SURPRISED = 0.1  # of the median squared Mahalanobis distance, which is 0.02 to 0.05 where all is well
+_SURPRISED = 0.8  # of the median squared Mahalanobis distance, which is 0.05 to 0.6 where all is well
 
 
 class Agreement:
     """A camera that is turned or shifted against its calibration, or whose clock is off, is tracked all the
     same, a little beside where the IMU says, all features alike, frame after frame: none is refused for it.
-    With 5 degrees and 5 cm the median rises to 0.15 and more (docs/vio.md)."""
+    With 5 degrees and 5 cm the median rises to 1.2 to 3 (docs/vio.md)."""
 
     def __init__(self) -> None:
         self._mean, self._seconds = 0.0, 0.0

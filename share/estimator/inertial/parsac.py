@@ -87,7 +87,9 @@ class _Fit:
         J = rows.core[:, :, POSE] @ se3.adjoint(state.T) @ np.linalg.cholesky(prior)
         at = state.features_at + rows.which
         rho = rows.by_rho[:, :, None] * rows.by_rho[:, None, :] * state.cov[at, at][:, None, None]
-        white = np.linalg.inv(np.linalg.cholesky(rho + rows.sigma[:, None, None] ** 2 * np.eye(2)))
+        lasts = state.lasting_at + 2 * rows.which[:, None] + (0, 1)
+        own: F64 = rho + state.cov[lasts[:, :, None], lasts[:, None, :]]
+        white = np.linalg.inv(np.linalg.cholesky(own + rows.sigma[:, None, None] ** 2 * np.eye(2)))
         self._J, self._r = white @ J, (white @ rows.residual[:, :, None])[:, :, 0]
 
     @property

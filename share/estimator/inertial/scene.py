@@ -37,6 +37,7 @@ class Scene:
     def __init__(self, state: State, rig: Rig, config: InertialConfig) -> None:
         self.state, self._rig, self._config = state, rig, config
         self.looks: Looks = features.none()
+        self._lasting = config.lasting_px / rig.cam0.focal
         self._memory = Memory()
         self._shunned: list[F32] = []
         self._probation = 0  # frames that _PROBATION_S are
@@ -53,6 +54,7 @@ class Scene:
 
     def step(self, seconds: float) -> None:
         """Since the frame before."""
+        ekf.fade(self.state, seconds, self._lasting, self._config.lasting_s)
         self._probation = int(_PROBATION_S / max(seconds, 1e-3))
 
     def seen(self, left: Sought, seen: NDArray[np.bool_]) -> None:
@@ -145,7 +147,7 @@ class Scene:
         asleep = self._memory.near(s, config.recall_m, config.recall_rad, config.recall)
         if asleep is None:
             return
-        ekf.add_features(s, asleep.ids, asleep.host, asleep.ray, asleep.rho, asleep.sigma)
+        ekf.add_features(s, asleep.ids, asleep.host, asleep.ray, asleep.rho, asleep.sigma, self._lasting)
         self.looks = self.looks.join(asleep.looks)
         good = self._recognised(frame, rate, fresh)
         self._memory.wake(s.ids[good][fresh:])

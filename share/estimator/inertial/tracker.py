@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from share.config import InertialConfig, TrackerConfig
 from share.estimator import relocalise
-from share.estimator.inertial import ekf, find, parsac
+from share.estimator.inertial import ekf, features, find, parsac
 from share.estimator.inertial.beginning import first_state, state_by_camera
 from share.estimator.inertial.features import Looks
 from share.estimator.inertial.health import Agreement
@@ -221,8 +221,11 @@ class InertialTracker:
             right = find.seek(frame.image1, self._rig.cam1, s, scene.looks, config, T, left=left)
             sought.append((right, T))
 
+        heard = features.heard(scene.looks)
+
         def arranged(first: ekf.Sight, *others: ekf.Sight) -> ekf.Sight:
             rows = scene.with_doubt(first.join(*others))
+            rows = rows.take(heard[rows.which])
             return rows.take(np.argsort(rows.host, kind="stable"))
 
         def rows_now() -> ekf.Sight:
@@ -230,6 +233,7 @@ class InertialTracker:
 
         seen, self._surprise = np.zeros(len(s.ids), bool), np.zeros(0)
         rows = arranged(left_rows, *(scene.sight(image, self._rate, T) for image, T in sought[1:]))
+        seen[left_rows.which] = True
         if len(rows.which) == 0:
             return seen
         rows, good, PHt, S = self._judged(s, rows, rows_now)
@@ -242,7 +246,7 @@ class InertialTracker:
         elif good.any():
             twice = np.repeat(good, 2)
             ekf.update(s, rows.take(good), PHt[:, twice], S[np.ix_(twice, twice)])
-        seen[rows.which[good]] = True
+        seen[rows.which[~good]] = False
         return seen
 
     def _judged(
