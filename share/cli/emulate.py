@@ -60,8 +60,8 @@ class _Size(click.ParamType[tuple[float, ...]]):
 @click.option(
     "--sensors",
     multiple=True,
-    metavar="[NAME=]stereo|rgbd",
-    help="Infrared pair, or left image and depth.  [default: stereo; rgbd for robot:]",
+    metavar="[NAME=]stereo|rgbd|mono",
+    help="Infrared pair, left image and depth, or left image alone.  [default: stereo; rgbd for robot:]",
 )
 @click.option(
     "--effect",

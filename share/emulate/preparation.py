@@ -27,7 +27,7 @@ from share.types import I64, AgentKind
 _GLTF = (".glb", ".gltf")
 _TAKEN = ("truth",)  # the name of a folder of the session
 _PROFILE, _EUROC_PROFILE = "d435i", "euroc"
-_DEPTH = "rgbd"
+_DEPTH, _MONO = "rgbd", "mono"
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +92,8 @@ def _actor(agent: Agent, number: int, recipe: Recipe) -> Actor:
     sensors = _chosen(recipe.sensors, agent.name) or _usual_sensors(agent)
     made = _profile(agent, recipe)
     rig = _mounted(made.rig(depth=sensors == _DEPTH), agent)
+    if sensors == _MONO:
+        rig = replace(rig, cam1=None, T_cam1_cam0=None)
     seed = (recipe.seed, 7, number)
     path = _of_imu(agent, rig)
     device = Device(made, recipe.effects, seed, agent.path.start_ns, (recipe.seed, 8))

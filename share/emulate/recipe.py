@@ -14,7 +14,7 @@ from share.emulate.sensor.effects import Effects
 from share.errors import UsageError
 
 GENERATOR_VERSION = 2  # raise it when any picture, motion or file changes: cached sessions are made anew
-SENSORS = ("stereo", "rgbd")
+SENSORS = ("stereo", "rgbd", "mono")
 IMAGES = ("jpeg", "png")
 _DEPTHS, _TEXTS = ("*", "*/*", "*/*/*"), (".csv", ".txt", ".yaml")  # FOLDER/mav0/imu0/data.csv
 

@@ -47,8 +47,8 @@ def frames_of(
 
 def tracker_for(source: Source, config: Config) -> VisualTracker | InertialTracker:
     """The estimator that fits the rig."""
-    if source.rig.cam1 is None and source.rig.depth is None:
-        raise UsageError(f"{source.name}: one camera without depth gives no scale; stereo or depth is needed")
     if source.rig.imu is not None:
         return InertialTracker(source.rig, config.inertial, config.tracker)
+    if source.rig.cam1 is None and source.rig.depth is None:
+        raise UsageError(f"{source.name}: one camera alone gives no scale; stereo, depth or an IMU is needed")
     return VisualTracker(source.rig, config.tracker)

@@ -10,6 +10,15 @@ from share.types import F32, F64, U8, Frame, View
 from share.vision import depth as depths
 from share.vision.grid import evenly
 
+_BESIDE_PX = 4.0  # of a known point, where nothing measures depth: as deep
+
+
+def measures_depth(frame: Frame, rig: Rig) -> bool:
+    """Whether stereo or a depth camera says how far things are."""
+    return (frame.depth is not None and rig.depth is not None) or (
+        frame.image1 is not None and rig.cam1 is not None
+    )
+
 
 def depth_at(frame: Frame, rig: Rig, px: F32, uv: F64, guess_m: F64 | None = None) -> F64:
     """Depth (N,) m in cam0 of image points, from whatever the frame carries; NaN where unknown. guess_m (N,):
@@ -23,20 +32,24 @@ def depth_at(frame: Frame, rig: Rig, px: F32, uv: F64, guess_m: F64 | None = Non
 
 def make_view(frame: Frame, rig: Rig, count: int = 500, known: tuple[F32, F64] | None = None) -> View:
     """ORB features (Rublee et al. 2011) of cam0 with 3D points where the frame gives depth. known: px (M, 2)
-    and depth (M,) m of points whose neighbours will not be much nearer or further."""
+    and depth (M,) m of points whose neighbours will not be much nearer or further; where the frame measures
+    nothing, only what is right beside them has a depth."""
     px, descriptors = orb(frame.image0, count)
     uv = rig.cam0.normalise(px.astype(np.float64))
-    z = depth_at(frame, rig, px, uv, None if known is None else _nearest(px, *known))
+    if known is not None and not measures_depth(frame, rig):
+        z = _nearest(px, *known, _BESIDE_PX)
+    else:
+        z = depth_at(frame, rig, px, uv, None if known is None else _nearest(px, *known))
     points = rays(uv) * z[:, None]
     return View(uv.astype(np.float32), points.astype(np.float32), descriptors)
 
 
-def _nearest(px: F32, known_px: F32, known_m: F64) -> F64:
-    """Depth (N,) m of the known point next to each; NaN where there is none."""
+def _nearest(px: F32, known_px: F32, known_m: F64, within_px: float = np.inf) -> F64:
+    """Depth (N,) m of the known point next to each; NaN where there is none within so many px."""
     if len(known_px) == 0:
         return np.full(len(px), np.nan)
     apart = (px**2).sum(axis=1)[:, None] - 2 * px @ known_px.T + (known_px**2).sum(axis=1)
-    out: F64 = known_m[apart.argmin(axis=1)]
+    out: F64 = np.where(apart.min(axis=1) <= within_px**2, known_m[apart.argmin(axis=1)], np.nan)
     return out
 
 

@@ -136,6 +136,11 @@ def cut(path: Path, left: int = 3) -> None:
     path.write_text("".join(lines[:left]) + lines[left][: len(lines[left]) // 3])
 
 
+def leave_only_cam0(folder: Path) -> None:
+    for name in ("cam1", "imu0"):
+        shutil.rmtree(folder / name, ignore_errors=True)
+
+
 CAM0, IMU0 = Path("mav0/cam0"), Path("mav0/imu0")
 EUROC_DAMAGE = {
     "gone": (2, "no such file or folder", shutil.rmtree),
@@ -169,7 +174,7 @@ EUROC_DAMAGE = {
         "distortion_model 'equidistant' is not supported; supported: radtan",
         lambda r: edit(r / CAM0 / "sensor.yaml", "radial-tangential", "equidistant"),
     ),
-    "mono": (2, "stereo or depth is needed", lambda r: shutil.rmtree(r / "mav0/cam1")),
+    "mono": (2, "stereo, depth or an IMU is needed", lambda r: leave_only_cam0(r / "mav0")),
 }
 
 
@@ -263,7 +268,7 @@ CALIBRATIONS = {
     "NaN": (CAMCHAIN.replace("320.4", ".nan"), "intrinsics: has values that are not finite"),
     "negative focal length": (CAMCHAIN.replace("[385", "[-385"), "cam0"),
     "three intrinsics": (CAMCHAIN.replace(", 239.6", ""), "intrinsics: expected 4 numbers, found 3"),
-    "one camera": (CAMCHAIN[: CAMCHAIN.index("cam1")], "stereo or depth is needed"),
+    "one camera": (CAMCHAIN[: CAMCHAIN.index("cam1")], "stereo, depth or an IMU is needed"),
     "another sensor": (CAMCHAIN.replace("cam1", "depth").replace("T_cn_cnm1", "T_depth_cam0"), "has depth"),
 }
 

@@ -92,7 +92,7 @@ TYPED = {
         ["--profile", "d435i", "--profile", "euroc"],
         "--profile is given twice for everybody; give one of them",
     ),
-    "sensors": (["--sensors", "mono"], "sensors 'mono' are not known; known: stereo, rgbd"),
+    "sensors": (["--sensors", "lidar"], "sensors 'lidar' are not known; known: stereo, rgbd, mono"),
     "whose sensors": (["--sensors", "bob=rgbd"], "'bob' is not one of the agents: walk1"),
     "effect": (["--effect", "drop=0.1"], "effect 'drop' is not known; did you mean 'drops'?"),
     "much of it": (["--effect", "drops=2"], "effect drops: 2 must lie in 0 .. 0.9"),

@@ -8,6 +8,7 @@ import numpy as np
 from imu_world import CAMERA, GRAVITY, NOISE, Path, imu_of, rig
 
 from share.estimator.inertial import ekf, observe
+from share.estimator.inertial.guess import guess
 from share.estimator.inertial.state import CORE, State, begin
 from share.geometry import se3
 from share.types import ImuBatch
@@ -22,6 +23,7 @@ class Setup:
 
     seconds: float = 20.0
     features: int = 60
+    mono: bool = False
     pose: tuple[float, float] = (
         0.01,
         1e-4,
@@ -53,7 +55,7 @@ def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
     t_imu = np.arange(0, setup.seconds + 0.5, 1 / IMU_HZ)
     imu, bg, ba = imu_of(path, t_imu, rng.normal(0, setup.bg, 3), rng.normal(0, setup.ba, 3), rng)
     sigma = _sigmas(setup)
-    world = _World(path, sensors, rng)
+    world = _World(path, sensors, rng, setup.mono)
     extrinsic = (
         setup.extrinsic_error if setup.extrinsic_error is not None else rng.normal(0, 1, 6) * sigma[15:21]
     )
@@ -108,7 +110,9 @@ def _forget_idle(state: State) -> None:
 class _World:
     """Points that come and go with the features."""
 
-    def __init__(self, path, sensors, rng):
+    def __init__(self, path, sensors, rng, mono):
+        self._eyes = (None,) if mono else (None, sensors.T_cam1_cam0)
+        self._mono, self._px = mono, np.zeros((0, 2), np.float32)
         self._path, self._rig, self._rng = path, sensors, rng
         self._points, self._lasting = {}, {}
 
@@ -122,27 +126,28 @@ class _World:
         points = np.array([self._points[i] for i in state.ids])
         lasting = self._what_lasts(state.ids)
         seen = []
-        for T_right_left in (None, self._rig.T_cam1_cam0):
+        for T_right_left in self._eyes:
             T = se3.inverse(self._camera(taken))
             T = T if T_right_left is None else T_right_left @ T
             px = CAMERA.project(se3.transform(T, points))
             px += self._rng.normal(0, SIGMA_PX, px.shape) + lasting
             seen.append(np.where(CAMERA.inside(np.nan_to_num(px, nan=-1e9))[:, None], px, np.nan))
-        inside = ~np.isnan(seen[0][:, 0]) & ~np.isnan(seen[1][:, 0])
+        inside = ~np.isnan([px[:, 0] for px in seen]).any(axis=0)
         which = np.flatnonzero(inside)
         sigma = np.full(len(which), SIGMA_PX / CAMERA.focal)
-        left, right = (
+        first, *others = (
             ekf.sight(
                 state, which, observe.predict(state, which, T), CAMERA.normalise(px[which]), sigma, rate
             )
-            for px, T in zip(seen, (None, self._rig.T_cam1_cam0), strict=True)
+            for px, T in zip(seen, self._eyes, strict=True)
         )
-        rows = left.join(right)
+        rows = first.join(*others)
         rows = rows.take(np.argsort(rows.host, kind="stable"))
         level = 1.0
         if len(which):
             level = ekf.update(state, rows, *ekf.gains(state, rows)) / (2 * len(rows.which))
         ekf.keep_features(state, inside)
+        self._px = seen[0][inside].astype(np.float32)
         return level
 
     def _what_lasts(self, ids):
@@ -161,6 +166,11 @@ class _World:
         in_cam = np.column_stack([uv, np.ones(count)]) * z[:, None]
         for i, p in enumerate(se3.transform(self._camera(taken), in_cam)):
             self._points[next_id + i] = p
+        ids = np.arange(next_id, next_id + count)
+        if self._mono:
+            g = guess(state, px.astype(np.float32), self._px)
+            ekf.add_features(state, ids, np.full(count, host), uv, g.rho, g.sigma, g.like, g.common)
+            return next_id + count
         sigma = SIGMA_PX / CAMERA.fx / self._rig.baseline
         rho = np.maximum(1 / z + self._rng.normal(0, sigma, count), 0.02)
         hosts = np.full(count, host)

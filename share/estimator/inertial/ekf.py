@@ -108,7 +108,7 @@ def gains(state: State, rows: Sight, common: F64 | None = None) -> tuple[F64, F6
     for columns, part in groups:
         S[part] += by_host[part] @ PHt[columns]
     S[np.diag_indices(2 * M)] += np.repeat(rows.sigma**2, 2)
-    if common is not None:
+    if common is not None and common.any():
         B = core[:, POSE] @ se3.adjoint(state.T)
         S += B @ common @ B.T
     return PHt, S
@@ -251,16 +251,32 @@ def add_keyframe(state: State, keyframe: int, rate: F64) -> int:
 
 
 def add_features(
-    state: State, ids: I64, host: I64, ray: F64, rho: F64, sigma: F64, lasting: float = 0.0
+    state: State,
+    ids: I64,
+    host: I64,
+    ray: F64,
+    rho: F64,
+    sigma: F64,
+    lasting: float = 0.0,
+    like: F64 | None = None,
+    common: F64 | None = None,
 ) -> None:
-    """Features (N,) that keyframes number `host` (N,) see on rays (N, 2), inverse depths rho, sigma (N,).
-    lasting: sigma of what a sight of them now has wrong; nothing in the image that defines them."""
+    """Features (N,) that keyframes number `host` (N,) see on rays (N, 2), inverse depths rho, sigma (N,) of
+    what each is off by itself. lasting: sigma of what a sight of them now has wrong; nothing in the image that
+    defines them. like (N, M): how the errors of the M inverse depths that are there come in; common (N,):
+    sigma of an error that the new ones share."""
     n, at, more = state.size, state.lasting_at, len(ids)
     grown = np.zeros((n + 3 * more, n + 3 * more))
     old = np.r_[0:at, at + more : n + more]
     grown[np.ix_(old, old)] = state.cov
     rhos, errors = np.arange(at, at + more), np.arange(n + more, n + 3 * more)
     grown[rhos, rhos], grown[errors, errors] = sigma**2, lasting**2
+    if like is not None and like.shape[1]:
+        rows = like @ state.cov[state.features_at : at]
+        grown[np.ix_(rhos, old)], grown[np.ix_(old, rhos)] = rows, rows.T
+        grown[np.ix_(rhos, rhos)] += rows[:, state.features_at : at] @ like.T
+    if common is not None and common.any():
+        grown[np.ix_(rhos, rhos)] += np.outer(common, common)
     state.cov = grown
     state.lasting = np.concatenate([state.lasting, np.zeros((more, 2))])
     state.ids = np.concatenate([state.ids, ids])
@@ -315,6 +331,15 @@ def _between(state: State, a: slice, b: slice) -> F64:
     P = state.cov
     out: F64 = P[a, a] + P[b, b] - P[a, b] - P[b, a]
     return out
+
+
+def scale_sigma(state: State) -> float:
+    """Of the scale of what is seen, relative: of the best estimate of an error that all inverse depths share;
+    inf without any."""
+    at = slice(state.features_at, state.lasting_at)
+    P = state.cov[at, at]
+    known = float(state.rho @ np.linalg.solve(P, state.rho)) if len(P) else 0.0
+    return float(np.inf) if known <= 0 else known**-0.5
 
 
 def pose_cov(state: State) -> F64:

@@ -11,6 +11,7 @@ from share.config import InertialConfig
 from share.estimator.inertial import ekf, features, find, observe
 from share.estimator.inertial.features import Looks
 from share.estimator.inertial.find import Sought
+from share.estimator.inertial.guess import Guess, guess
 from share.estimator.inertial.memory import Memory
 from share.estimator.inertial.state import State
 from share.geometry import se3
@@ -18,6 +19,7 @@ from share.geometry.camera import Rig, rays
 from share.types import F32, F64, I64, U8, Frame
 from share.vision import corners, epipolar
 from share.vision.depth import from_depth_camera, from_stereo
+from share.vision.view import measures_depth
 
 _DEPTH_SIGMA_PX, _DEPTH_BASELINE = 0.3, 0.05  # of the stereo pair inside a depth camera, m
 _NOISE = 3.0  # gray levels of an image
@@ -28,6 +30,8 @@ _CROWD, _WARY_FRAMES = 5, 60  # features at a time that went astray: somebody mo
 _PROBATION_S, _UNPROVEN = 0.34, 5.0  # in which a feature proves itself, and times its sigma until then
 _SLANT_EVERY = 2  # frames in which a feature's slant is learnt
 _FARTHEST, _NEAREST_M = 0.03, 0.2  # 1/m; m
+_VAGUE = 0.05  # 1/m, sigma; half a pixel a frame of somebody who walks
+_SURE = 0.1  # relative sigma of an inverse depth that others are told
 _FAR = 100.0  # redundancy that features in view are worth
 
 
@@ -61,7 +65,7 @@ class Scene:
         """Which features (N,) a frame showed. The others are gone, or asleep where they were not found."""
         self.looks.px[left.found] = left.px[left.found]
         self.looks.age[seen] += 1
-        which = np.flatnonzero(seen)
+        which = np.flatnonzero(seen & ~self._vague())
         away = which[features.runaways(self.looks, which, left.px[which] - left.expected[which])]
         seen[away] = False
         left.astray[away] = True
@@ -70,15 +74,18 @@ class Scene:
         turn = np.flatnonzero(seen & ((self.looks.age + np.arange(len(seen))) % _SLANT_EVERY == 0))
         features.learn_slant(self.looks, turn, left.error[turn], left.along[turn])
         self._memory.sleep(self.state, self.looks, np.flatnonzero(~left.found))
-        self._keep(seen)
+        self.keep(seen)
 
-    def depths(self) -> tuple[F32, F64]:
-        """px (N, 2) and depth (N,) m of the features in the image that was seen last."""
+    def depths(self, frame: Frame) -> tuple[F32, F64]:
+        """px (N, 2) and depth (N,) m of the features in `frame`, the last one; only of those whose depth is
+        known well, where nothing else in the frame tells."""
         s = self.state
         T_cam_odom = se3.inverse(s.T @ s.T_body_cam)
         R = T_cam_odom @ s.poses[s.host] @ s.T_body_cam
         z = (R[:, 2, :3] * rays(s.ray)).sum(axis=1) / np.maximum(s.rho, _FARTHEST) + R[:, 2, 3]
-        return self.looks.px, np.maximum(z, _NEAREST_M)
+        variance = np.diag(s.cov)[s.features_at :]
+        sure = (variance < (_SURE * s.rho) ** 2) | measures_depth(frame, self._rig)
+        return self.looks.px[sure], np.maximum(z, _NEAREST_M)[sure]
 
     def _shun(self, px: F32) -> None:
         """No new feature near px (N, 2) for a while: there goes somebody."""
@@ -107,31 +114,39 @@ class Scene:
         out: NDArray[np.bool_] = self.looks.age[which] >= self._probation
         return out
 
+    def _vague(self) -> NDArray[np.bool_]:
+        """Which features' depth (N,) is hardly known, nor therefore where they should be."""
+        out: NDArray[np.bool_] = np.diag(self.state.cov)[self.state.features_at :] > _VAGUE**2
+        return out
+
     def _add_features(self, frame: Frame, host: int) -> None:
         config, camera, s = self._config, self._rig.cam0, self.state
         taken = np.concatenate([self.looks.px, *self._shunned])
         px = corners.detect(frame.image0, taken, config.features - len(s.ids), config.spacing_px)
         ray = camera.normalise(px.astype(np.float64))
-        rho, sigma = self._inverse_depth(frame, px, ray)
-        looks = features.looks(frame.image0, camera, px, ray, np.nan_to_num(rho))
-        good = ~np.isnan(rho) & (_NOISE * looks.patch.sigma_px < _SHARPEST_PX)
+        far = self._inverse_depths(frame, px, ray)
+        looks = features.looks(frame.image0, camera, px, ray, np.nan_to_num(far.rho))
+        good = ~np.isnan(far.rho) & (_NOISE * looks.patch.sigma_px < _SHARPEST_PX)
         ids = np.arange(self._next_feature, self._next_feature + int(good.sum()))
         self._next_feature += len(ids)
-        ekf.add_features(s, ids, np.full(len(ids), host), ray[good], rho[good], sigma[good])
+        far = far.take(good)
+        hosts = np.full(len(ids), host)
+        ekf.add_features(s, ids, hosts, ray[good], far.rho, far.sigma, far.like, far.common)
         self.looks = self.looks.join(looks.take(good))
 
-    def _inverse_depth(self, frame: Frame, px: F32, ray: F64) -> tuple[F64, F64]:
-        """1/m (N,), NaN unknown, and sigma (N,)."""
-        focal = self._rig.cam0.focal
+    def _inverse_depths(self, frame: Frame, px: F32, ray: F64) -> Guess:
+        """Of new features, NaN unknown: measured, or else guessed."""
+        if not measures_depth(frame, self._rig):
+            return guess(self.state, px, self.looks.px)
+        focal, n = self._rig.cam0.focal, len(px)
         if frame.image1 is not None and self._rig.cam1 is not None:
             z = self._stereo_depth(frame.image0, frame.image1, px, ray)
             sigma = self._config.stereo_px / focal / self._rig.baseline
-        elif frame.depth is not None:
+        else:
+            assert frame.depth is not None
             z = from_depth_camera(frame.depth, self._rig, ray)
             sigma = _DEPTH_SIGMA_PX / focal / _DEPTH_BASELINE
-        else:
-            z, sigma = np.full(len(px), np.nan), 1.0
-        return 1 / z, np.full(len(z), sigma)
+        return Guess(1 / z, np.full(n, sigma), np.zeros((n, 0)), np.zeros(n))
 
     def _stereo_depth(self, image0: U8, image1: U8, px: F32, ray: F64) -> F64:
         """m (N,), NaN where the pair does not agree on one: the clearest place on each line, then to a
@@ -151,7 +166,7 @@ class Scene:
         self.looks = self.looks.join(asleep.looks)
         good = self._recognised(frame, rate, fresh)
         self._memory.wake(s.ids[good][fresh:])
-        self._keep(good)
+        self.keep(good)
 
     def _recognised(self, frame: Frame, rate: F64, fresh: int) -> NDArray[np.bool_]:
         """Of features from number `fresh` on, those that are found where they should be; all others."""
@@ -164,9 +179,14 @@ class Scene:
             good[rows.which[ekf.surprise(rows, S) < self._config.gate]] = True
         return good
 
-    def _keep(self, keep: NDArray[np.bool_]) -> None:
+    def keep(self, keep: NDArray[np.bool_]) -> None:
+        """The other features (N,) are forgotten."""
         ekf.keep_features(self.state, keep)
         self.looks = self.looks.take(keep)
+
+    def forget_asleep(self) -> None:
+        """What is out of sight was remembered for nothing."""
+        self._memory = Memory()
 
     def _forget(self) -> None:
         """Keyframes whose features are all gone, and, where there are too many, the most redundant ones.

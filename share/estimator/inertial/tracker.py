@@ -8,7 +8,6 @@ Without the IMU the body is taken to go on as it does, without sight the IMU car
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,18 +19,21 @@ from share.estimator.inertial.beginning import first_state, state_by_camera
 from share.estimator.inertial.features import Looks
 from share.estimator.inertial.health import Agreement
 from share.estimator.inertial.imu import integrate
+from share.estimator.inertial.noise import louder, without
 from share.estimator.inertial.samples import Samples, coasting, unclipped
 from share.estimator.inertial.scene import Scene
 from share.estimator.inertial.state import VELOCITY, State
+from share.estimator.inertial.window import Window, by_camera, without_force
 from share.estimator.localmap import LocalKeyframe, LocalMap
 from share.estimator.result import TrackResult
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
 from share.types import F64, U8, Candidate, Frame, ImuBatch, TrackState
 from share.vision import corners
-from share.vision.view import make_view
+from share.vision.view import make_view, measures_depth
 
 _READY_RAD, _READY_M_S = np.radians(3.0), 0.3  # sigmas of tilt and velocity: a pose is worth telling
+_UNKNOWN_SCALE = 0.1  # relative sigma: no depth was measured
 _FAR_OFF_PX = 1.0  # median residual, from which derivatives are taken anew
 _MINORITY, _MAJORITY = 0.3, 0.7  # of what is found: believed by the filter; agreeing among itself
 _GAP_NS = 250_000_000  # between frames: more than an IMU of this sort is modelled for,
@@ -50,14 +52,13 @@ class InertialTracker:
     def __init__(self, rig: Rig, config: InertialConfig, places: TrackerConfig, seed: int = 0) -> None:
         if rig.imu is None:
             raise ValueError("without an IMU there is VisualTracker")
-        if rig.cam1 is None and rig.depth is None:
-            raise ValueError("a camera alone gives no scale: stereo or depth is needed")
         self._rig, self._config = rig, config
-        self._noise = _louder(rig.imu, config.imu_noise)
+        self._noise = louder(rig.imu, config.imu_noise)
         self._coasting = ImuNoise(config.turning_noise, config.moving_noise, 0.0, 0.0, rig.imu.rate_hz)
         self._common = np.diag(np.repeat([config.common_rad**2, config.common_m**2], 3))
         self._samples = Samples()
         self._scene: Scene | None = None
+        self._window: Window | None = None  # of a single camera, until its scale is known
         self._image: U8 | None = None
         self._stamp_ns = 0
         self._rate = np.zeros(3)
@@ -100,7 +101,7 @@ class InertialTracker:
             self._anchor(frame, scene)
         new_stretch, self._new_stretch = self._new_stretch, False
         s = scene.state
-        view = make_view(frame, self._rig, self._places_config.view_features, scene.depths())
+        view = make_view(frame, self._rig, self._places_config.view_features, scene.depths(frame))
         if not self._astray and not self._refused_s:
             self._places.add_keyframe(frame.image0, s.T @ s.T_body_cam)
             self._places.set_view(view)
@@ -154,11 +155,25 @@ class InertialTracker:
         if state is TrackState.INITIALISING:
             if wanted:
                 self._anchor(frame, scene)
-            return TrackResult(state, None)
+            if not self._solved(frame, scene, wanted):
+                return TrackResult(state, None)
+            state, wanted = TrackState.OK, True
         return self._told(scene.state, state, wanted, count)
 
+    def _solved(self, frame: Frame, scene: Scene, anchored: bool) -> bool:
+        """Whether what a single camera saw since the beginning has told it the scale, and all that poses
+        need."""
+        window, s = self._window, scene.state
+        if window is None or not (anchored or window.wants(s.stamp_ns)):
+            return False
+        imu = self._samples.between(window.last_ns, s.stamp_ns, round(self._config.silent_s * 1e9))
+        if imu is None or window.full or measures_depth(frame, self._rig):
+            self._scene = self._window = None  # begin anew
+            return False
+        return window.solved(scene, imu, anchored) and self._converged(s)
+
     def _told(self, s: State, state: TrackState, wanted: bool, count: int) -> TrackResult:
-        first, self._ready = not self._ready, True
+        first, self._ready, self._window = not self._ready, True, None
         new_stretch = first and self._new_stretch
         sound = self._agreement.sound
         return TrackResult(state, self._pose(s), wanted or first, count, new_stretch, ekf.pose_cov(s), sound)
@@ -197,8 +212,12 @@ class InertialTracker:
         if imu is None:
             ekf.propagate(s, coasting(s, self._rate, to_ns, gravity), to_ns, self._coasting, gravity)
             return False
+        if self._window is not None:
+            noise = without(self._noise, self._coasting, np.arange(6) >= 3)
+            self._rate = ekf.propagate(s, without_force(s, imu, to_ns, gravity), to_ns, noise, gravity)
+            return True
         clipped = self._samples.clipped(imu)
-        noise = _without(self._noise, self._coasting, clipped)
+        noise = without(self._noise, self._coasting, clipped)
         imu = unclipped(imu, clipped[:3], self._rate + s.bg)
         self._rate = ekf.propagate(s, imu, to_ns, noise, gravity)
         slow = np.linalg.norm(self._rate) < _REST_RATE and np.linalg.norm(s.v) < _SLOW_M_S
@@ -269,7 +288,7 @@ class InertialTracker:
 
     def _judge(self, s: State, count: int, heard: bool) -> TrackState:
         config = self._config
-        if heard and not self._ready and not self._converged(s):
+        if self._window is not None or (heard and not self._ready and not self._converged(s)):
             return TrackState.INITIALISING
         if count < config.blind:
             return TrackState.INERTIAL_ONLY if heard else TrackState.LOST
@@ -355,18 +374,24 @@ class InertialTracker:
         if len(state.ids) < self._config.weak:
             return TrackResult(waiting, None)
         self._scene, self._ready = scene, False
+        self._window = None
+        if ekf.scale_sigma(state) > _UNKNOWN_SCALE:
+            self._window = Window(state, self._rig.cam0, self._noise, self._config, self._common)
+            by_camera(state)
         self._new_stretch = found is None
         if found is None:
             self._places = LocalMap(self._places_config.max_keyframes)
         self._lost_ns = None
-        if not self._converged(state):
+        if self._window is not None or not self._converged(state):
             return TrackResult(TrackState.INITIALISING, None)
         return self._told(state, TrackState.OK, True, len(state.ids))
 
     def _lose(self, frame: Frame) -> TrackResult:
         """What is left of the filter is worth nothing."""
-        self._scene, self._ready, self._lost_ns = None, False, frame.stamp_ns
-        self._astray, self._refused_s = 0, 0.0
+        self._scene, self._astray, self._refused_s = None, 0, 0.0
+        if self._window is not None:  # there was nothing to lose
+            return TrackResult(TrackState.INITIALISING, None)
+        self._ready, self._lost_ns = False, frame.stamp_ns
         return TrackResult(TrackState.LOST, None)
 
     def _find_place(self, frame: Frame) -> F64 | None:
@@ -385,22 +410,3 @@ def _mean_rate(before: F64, after: F64, dt_ns: int) -> F64:
     """rad/s (3,), in the body."""
     out: F64 = se3.so3_log(before[:3, :3].T @ after[:3, :3]) / max(dt_ns * 1e-9, 1e-3)
     return out
-
-
-def _without(imu: ImuNoise, coasting: ImuNoise, clipped: NDArray[np.bool_]) -> ImuNoise:
-    """Noise of an IMU of whose axes (6,) some are at the end of their scale."""
-    return replace(
-        imu,
-        gyro_density=coasting.gyro_density if clipped[:3].any() else imu.gyro_density,
-        accel_density=coasting.accel_density if clipped[3:].any() else imu.accel_density,
-    )
-
-
-def _louder(imu: ImuNoise, times: float) -> ImuNoise:
-    return ImuNoise(
-        imu.gyro_density * times,
-        imu.accel_density * times,
-        imu.gyro_walk * times,
-        imu.accel_walk * times,
-        imu.rate_hz,
-    )
