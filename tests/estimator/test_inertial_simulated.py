@@ -12,17 +12,19 @@ def nees(seeds, setup):
     return np.mean([run(seed, setup).nees[20:].mean(axis=0) for seed in range(seeds)], axis=0)
 
 
-def test_it_is_as_sure_as_it_should_be():
+@pytest.mark.parametrize("mono", [False, True])
+def test_it_is_as_sure_as_it_should_be(mono):
     low, high = BANDS[6]
-    orientation, position = nees(6, Setup(seconds=6.0))
+    orientation, position = nees(6, Setup(seconds=6.0, mono=mono))
     assert low < orientation < high
     assert low < position < high
 
 
+@pytest.mark.parametrize("mono", [False, True])
 @pytest.mark.slow
-def test_it_is_as_sure_as_it_should_be_in_fifty_runs():
+def test_it_is_as_sure_as_it_should_be_in_fifty_runs(mono):
     """At 2, 5, 10 and 20 s, not over time, for errors of one run last."""
-    runs = [run(seed) for seed in range(50)]
+    runs = [run(seed, Setup(mono=mono)) for seed in range(50)]
     low, high = BANDS[50]
     for k in (40, 100, 200, 398):
         orientation, position = np.mean([r.nees[k] for r in runs], axis=0)

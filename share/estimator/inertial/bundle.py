@@ -16,7 +16,7 @@ import numpy as np
 
 from share.estimator.inertial import observe
 from share.estimator.inertial.imu import Motion, integrate
-from share.estimator.inertial.normal import SHOT, Normal
+from share.estimator.inertial.normal import SHOT, Normal, inverse
 from share.estimator.inertial.shooting import SIDE, Shooting, Sights, gap, off
 from share.estimator.inertial.state import State
 from share.geometry import se3
@@ -115,8 +115,8 @@ class _Means:
 class _Problem:
     def __init__(self, shots: list[Shot], first: State, model: Model) -> None:
         self._shots, self._first, self._model = shots, first, model
-        self._prior: F64 = np.linalg.inv(first.cov[:SIDE, :SIDE])
-        self._common: F64 = np.linalg.inv(model.common)
+        self._prior = inverse(first.cov[:SIDE, :SIDE])
+        self._common = inverse(model.common)
         number = {s.keyframe: k for k, s in enumerate(shots) if s.keyframe >= 0}
         ids, hosts, ray = (
             np.concatenate([getattr(s, name) for s in shots]) for name in ("ids", "host", "ray")
@@ -181,7 +181,7 @@ class _Problem:
             motion = self._motion(k, m.T[k], m.v[k], m.bg, m.ba)
             F = motion.transition[:SHOT]
             J = np.concatenate([-F[:, :SHOT], np.eye(SHOT), -F[:, SHOT:]], axis=1)
-            W: F64 = np.linalg.inv(motion.noise[:SHOT, :SHOT] + _LEAST * np.eye(SHOT))
+            W = inverse(motion.noise[:SHOT, :SHOT] + _LEAST * np.eye(SHOT))
             at = np.r_[SHOT * k : SHOT * (k + 2), out.biases]
             out.add(at, J, gap(motion.T, motion.v, m.T[k + 1], m.v[k + 1]), W)
         for k in range(K):

@@ -9,6 +9,10 @@ from share.types import F64, I64
 SHOT = 9  # columns of a shot: pose and velocity
 
 
+def inverse(A: F64) -> F64:
+    return np.asarray(np.linalg.inv(A), np.float64)
+
+
 class Normal:
     """A (D, D), b (D,) of what is shared: shots, 6 of biases, the room, 6 of each image; cross (D, N),
     depth (N,), b_rho (N,) of features' inverse depths. cost: the sum of squares."""
@@ -42,13 +46,13 @@ class Normal:
         depth = self.depth * (1 + damping)
         by_depth = self.cross / depth
         A = self.A + damping * np.diag(np.diag(self.A)) - by_depth @ self.cross.T
-        x: F64 = np.linalg.solve(A, self.b - by_depth @ self.b_rho)
+        x = np.asarray(np.linalg.solve(A, self.b - by_depth @ self.b_rho), np.float64)
         return x, (self.b_rho - self.cross.T @ x) / depth
 
     def covariance(self) -> F64:
         """Of shots, biases and features."""
         by_depth = self.cross / self.depth
-        P = np.linalg.inv(self.A - by_depth @ self.cross.T)[: self.room, : self.room]
+        P = inverse(self.A - by_depth @ self.cross.T)[: self.room, : self.room]
         to_depth = -P @ by_depth[: self.room]
         own = np.diag(1 / self.depth) - by_depth[: self.room].T @ to_depth
         out: F64 = np.block([[P, to_depth], [to_depth.T, own]])

@@ -41,9 +41,16 @@ class Shooting:
     """first: the state at the first shot and how well it is known. carry: motions by IMU from shot to shot,
     K - 1 of them, of a state there. depth: about how far features are, m, for N of them."""
 
-    def __init__(self, first: State, carry: Callable[[State], list[Motion]], sights: Sights, features: int, depth: float) -> None:
-        self._first, self._carry, self._sights, self._usual_depth = first, carry: Callable[[State], list[Motion]], sights, depth
-        self._prior = np.linalg.inv(first.cov[:SIDE, :SIDE])
+    def __init__(
+        self,
+        first: State,
+        carry: Callable[[State], list[Motion]],
+        sights: Sights,
+        features: int,
+        depth: float,
+    ) -> None:
+        self._first, self._carry, self._sights, self._usual_depth = first, carry, sights, depth
+        self._prior = np.asarray(np.linalg.inv(first.cov[:SIDE, :SIDE]), np.float64)
         self.state, self.depth = first, np.full(features, depth)
         self.T, self.v, self._by_first = self._carried()
 
@@ -93,7 +100,7 @@ class Shooting:
         flat = J.reshape(-1, SIDE)
         A = self._prior + flat.T @ flat - (cross / known) @ cross.T
         b = self._prior @ off(self._first, self.state) + flat.T @ r.ravel() - cross @ (wanted / known)
-        x: F64 = np.linalg.solve(A, b)
+        x = np.asarray(np.linalg.solve(A, b), np.float64)
         self.depth = np.maximum(self.depth + (wanted - cross.T @ x) / known, _NEAREST)
         by, s = se3.exp(x[:6]), self.state
         v = by[:3, :3] @ s.v + x[6:9]

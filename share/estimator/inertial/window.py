@@ -24,7 +24,7 @@ _LONGEST_NS = 2_500_000_000
 _LASTING = (
     2.0  # times the sigma of a coordinate: what a patch is off by stays, and sights are no news each time
 )
-_SURE, _FAR_PX, _COST = 0.03, 25.0, 1.0  # a fit's scale, how far it came as an image shows it, and its cost
+_SURE, _FAR_PX, _COST = 0.03, 15.0, 1.0  # a fit's scale, how far it came as an image shows it, and its cost
 _TASTE = 1e-3  # rad, 1/m
 
 
