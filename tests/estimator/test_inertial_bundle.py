@@ -35,14 +35,18 @@ def scene(seed, outliers=0.0):
     hosts = np.repeat(KEYFRAMES, EACH)
     ray = CAMERA.normalise(rng.uniform((5, 5), (634, 474), (len(hosts), 2)))
     z = rng.uniform(1.5, 6.0, len(hosts))
-    points = np.array([se3.transform(cams[h], np.r_[r, 1] * d) for h, r, d in zip(hosts, ray, z, strict=True)])
+    points = np.array(
+        [se3.transform(cams[h], np.r_[r, 1] * d) for h, r, d in zip(hosts, ray, z, strict=True)]
+    )
     shots = []
     for k in range(SHOTS):
         q = se3.transform(se3.inverse(cams[k]), points)
         uv = q[:, :2] / q[:, 2:] + rng.normal(0, SIGMA, (len(q), 2))
         uv[rng.random(len(q)) < outliers] += rng.uniform(-0.05, 0.05, 2)
         seen = np.flatnonzero((hosts <= k) & (q[:, 2] > 0.3))
-        near = slice(*np.searchsorted(imu.stamps_ns, np.rint([(t[k] - STEP_S) * 1e9 - 1e7, t[k] * 1e9 + 1e7])))
+        near = slice(
+            *np.searchsorted(imu.stamps_ns, np.rint([(t[k] - STEP_S) * 1e9 - 1e7, t[k] * 1e9 + 1e7]))
+        )
         part = ImuBatch(imu.stamps_ns[near], imu.gyro[near], imu.accel[near])
         stamp, keyframe = round(t[k] * 1e9), k if k in KEYFRAMES else -1
         shots.append(Shot(stamp, part, keyframe, seen, hosts[seen], ray[seen], uv[seen]))

@@ -23,7 +23,7 @@ from share.geometry import se3
 from share.geometry.camera import ImuNoise
 from share.types import F64, I64, ImuBatch
 
-_ROUNDS, _GAIN = 15, 2e-3  # at most; relative, of the cost, below which it is settled
+_ROUNDS, _GAIN = 20, 0.1  # at most; of the cost, squared sigmas, below which it is settled
 _DAMPING = 1e-4
 _USUAL = 2.0  # sigmas; what is further off counts ever less (Cauchy)
 _BEHIND = 1e3  # sigmas, of what is behind the camera
@@ -93,7 +93,7 @@ def fit(shots: list[Shot], first: State, model: Model) -> Fit:
             problem.means, damping = before, damping * 10
             continue
         gained, best, damping = best.cost - new.cost, new, damping / 10
-        if gained < _GAIN * best.cost:
+        if gained < _GAIN:
             break
     return problem.result(best)
 

@@ -88,3 +88,9 @@ def coasting(state: State, rate: F64, to_ns: int, gravity: float) -> ImuBatch:
     force = (state.T[:3, :3] @ half).T @ np.array([0.0, 0.0, gravity])
     stamps = np.array([state.stamp_ns, to_ns])
     return ImuBatch(stamps, np.tile(rate + state.bg, (2, 1)), np.tile(force + state.ba, (2, 1)))
+
+
+def mean_rate(before: F64, after: F64, dt_ns: int) -> F64:
+    """rad/s (3,), in the body, by which one pose (4, 4) becomes the other."""
+    out: F64 = se3.so3_log(before[:3, :3].T @ after[:3, :3]) / max(dt_ns * 1e-9, 1e-3)
+    return out

@@ -20,10 +20,10 @@ from share.estimator.inertial.features import Looks
 from share.estimator.inertial.health import Agreement
 from share.estimator.inertial.imu import integrate
 from share.estimator.inertial.noise import louder, without
-from share.estimator.inertial.samples import Samples, coasting, unclipped
+from share.estimator.inertial.samples import Samples, coasting, mean_rate, unclipped
 from share.estimator.inertial.scene import Scene
 from share.estimator.inertial.state import VELOCITY, State
-from share.estimator.inertial.window import Window, by_camera, without_force
+from share.estimator.inertial.window import Window, window_for, without_force
 from share.estimator.localmap import LocalKeyframe, LocalMap
 from share.estimator.result import TrackResult
 from share.geometry import se3
@@ -33,7 +33,6 @@ from share.vision import corners
 from share.vision.view import make_view, measures_depth
 
 _READY_RAD, _READY_M_S = np.radians(3.0), 0.3  # sigmas of tilt and velocity: a pose is worth telling
-_UNKNOWN_SCALE = 0.1  # relative sigma: no depth was measured
 _FAR_OFF_PX = 1.0  # median residual, from which derivatives are taken anew
 _MINORITY, _MAJORITY = 0.3, 0.7  # of what is found: believed by the filter; agreeing among itself
 _GAP_NS = 250_000_000  # between frames: more than an IMU of this sort is modelled for,
@@ -142,7 +141,7 @@ class InertialTracker:
             self._agreement.add(self._surprise, since_s)
         scene.seen(left, seen)
         if not measured:
-            self._rate = _mean_rate(before, scene.state.T, frame.stamp_ns - self._stamp_ns)
+            self._rate = mean_rate(before, scene.state.T, frame.stamp_ns - self._stamp_ns)
         count = int(seen.sum())
         textured = count >= self._config.blind or corners.count(frame.image0) >= self._config.weak
         self._stray(frame, textured, left, count)
@@ -374,10 +373,7 @@ class InertialTracker:
         if len(state.ids) < self._config.weak:
             return TrackResult(waiting, None)
         self._scene, self._ready = scene, False
-        self._window = None
-        if ekf.scale_sigma(state) > _UNKNOWN_SCALE:
-            self._window = Window(state, self._rig.cam0, self._noise, self._config, self._common)
-            by_camera(state)
+        self._window = window_for(state, self._rig.cam0, self._noise, self._config, self._common)
         self._new_stretch = found is None
         if found is None:
             self._places = LocalMap(self._places_config.max_keyframes)
@@ -404,9 +400,3 @@ class InertialTracker:
         self._places_tried += 1
         chosen: list[LocalKeyframe] = [self._places.keyframes[n] for n in numbers[first : first + count]]
         return relocalise.find(chosen, frame, self._rig, self._places_config, self._seed)
-
-
-def _mean_rate(before: F64, after: F64, dt_ns: int) -> F64:
-    """rad/s (3,), in the body."""
-    out: F64 = se3.so3_log(before[:3, :3].T @ after[:3, :3]) / max(dt_ns * 1e-9, 1e-3)
-    return out

@@ -25,6 +25,7 @@ _LASTING = (
     2.0  # times the sigma of a coordinate: what a patch is off by stays, and sights are no news each time
 )
 _SURE, _FAR_PX, _COST = 0.03, 15.0, 1.0  # a fit's scale, how far it came as an image shows it, and its cost
+_UNKNOWN = 0.1  # relative sigma of scale
 _TASTE = 1e-3  # rad, 1/m
 
 
@@ -100,9 +101,19 @@ class Window:
         s.poses, s.rho = fit.T[shot], fit.rho[which]
 
 
-def by_camera(state: State) -> None:
-    """Until the scale is known the filter goes by camera and gyro: up and how far the room is are as they
-    are."""
+def window_for(
+    first: State, camera: Camera, noise: ImuNoise, config: InertialConfig, common: F64
+) -> Window | None:
+    """None where depth was measured. Else the filter goes by camera and gyro until the window is solved:
+    up, and how far the room is, are as they are."""
+    if ekf.scale_sigma(first) < _UNKNOWN:
+        return None
+    window = Window(first, camera, noise, config, common)
+    _by_camera(first)
+    return window
+
+
+def _by_camera(state: State) -> None:
     H = np.zeros((3, state.size))
     H[0, 0] = H[1, 1] = 1
     H[2, state.features_at :] = 1 / len(state.ids)
