@@ -137,7 +137,7 @@ class InertialTracker:
         measured = self._propagate(frame, scene.state, imu)
         left, seen = self._look(frame, scene)
         heard = imu is not None
-        if measured:
+        if measured and self._window is None:
             self._agreement.add(self._surprise, since_s)
         scene.seen(left, seen)
         if not measured:
