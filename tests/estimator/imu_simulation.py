@@ -169,7 +169,7 @@ class _World:
         ids = np.arange(next_id, next_id + count)
         if self._mono:
             g = guess(state, px.astype(np.float32), self._px)
-            ekf.add_features(state, ids, np.full(count, host), uv, g.rho, g.sigma, g.like, g.common)
+            ekf.add_features(state, ids, np.full(count, host), uv, g.rho, g.sigma, 0.0, g.like, g.common)
             return next_id + count
         sigma = SIGMA_PX / CAMERA.fx / self._rig.baseline
         rho = np.maximum(1 / z + self._rng.normal(0, sigma, count), 0.02)

@@ -83,7 +83,7 @@ class Scene:
         T_cam_odom = se3.inverse(s.T @ s.T_body_cam)
         R = T_cam_odom @ s.poses[s.host] @ s.T_body_cam
         z = (R[:, 2, :3] * rays(s.ray)).sum(axis=1) / np.maximum(s.rho, _FARTHEST) + R[:, 2, 3]
-        variance = np.diag(s.cov)[s.features_at :]
+        variance = np.diag(s.cov)[s.features_at : s.lasting_at]
         sure = (variance < (_SURE * s.rho) ** 2) | measures_depth(frame, self._rig)
         return self.looks.px[sure], np.maximum(z, _NEAREST_M)[sure]
 
@@ -116,7 +116,9 @@ class Scene:
 
     def _vague(self) -> NDArray[np.bool_]:
         """Which features' depth (N,) is hardly known, nor therefore where they should be."""
-        out: NDArray[np.bool_] = np.diag(self.state.cov)[self.state.features_at :] > _VAGUE**2
+        out: NDArray[np.bool_] = (
+            np.diag(self.state.cov)[self.state.features_at : self.state.lasting_at] > _VAGUE**2
+        )
         return out
 
     def _add_features(self, frame: Frame, host: int) -> None:
@@ -131,7 +133,7 @@ class Scene:
         self._next_feature += len(ids)
         far = far.take(good)
         hosts = np.full(len(ids), host)
-        ekf.add_features(s, ids, hosts, ray[good], far.rho, far.sigma, far.like, far.common)
+        ekf.add_features(s, ids, hosts, ray[good], far.rho, far.sigma, 0.0, far.like, far.common)
         self.looks = self.looks.join(looks.take(good))
 
     def _inverse_depths(self, frame: Frame, px: F32, ray: F64) -> Guess:
