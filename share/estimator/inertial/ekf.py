@@ -263,7 +263,7 @@ def add_features(
 ) -> None:
     """Features (N,) that keyframes number `host` (N,) see on rays (N, 2), inverse depths rho, sigma (N,) of
     what each is off by itself. lasting: sigma of what a sight of them now has wrong; nothing in the image
-    that defines them. like (N, M): how the errors of the M inverse depths that are there come in; common (N,):
+    that defines them. like (N, M): how the errors of the M inverse depths there are come in; common (N,):
     sigma of an error that the new ones share."""
     n, at, more = state.size, state.lasting_at, len(ids)
     grown = np.zeros((n + 3 * more, n + 3 * more))

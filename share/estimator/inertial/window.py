@@ -21,9 +21,7 @@ _APART_NS = 90_000_000  # between shots that are no keyframes
 _FITTED, _FEWEST = 4, 12  # shots from one fit to the next, and before the first
 _MOVED_PX = 2.0  # of a quarter of the features at least, beside what turning does: less is not worth a fit
 _LONGEST_NS = 2_500_000_000
-_LASTING = (
-    2.0  # times the sigma of a coordinate: what a patch is off by stays, and sights are no news each time
-)
+_LASTING = 2.0  # times the sigma of a coordinate: what a patch is off by stays, sights are no news each time
 _SURE, _FAR_PX, _COST = 0.03, 15.0, 1.0  # a fit's scale, how far it came as an image shows it, and its cost
 _UNKNOWN = 0.1  # relative sigma of scale
 _TASTE = 1e-3  # rad, 1/m
