@@ -63,19 +63,20 @@ class Camera:
             uv = self._radtan(uv)
         return uv * (self.fx, self.fy) + (self.cx, self.cy)
 
-    def normalise(self, px: F64) -> F64:
-        """Pixels (..., 2) -> undistorted normalised coordinates (x/z, y/z), to 1e-9 inside the image."""
+    def normalise(self, px: F64, about: F64 | None = None) -> F64:
+        """Pixels (..., 2) -> undistorted normalised coordinates (x/z, y/z), to 1e-9 inside the image. about:
+        where they nearly are, from which it is found sooner."""
         observed = (px - (self.cx, self.cy)) / (self.fx, self.fy)
         if not self.distortion:
             return observed
-        uv = observed.copy()
+        uv = (observed if about is None else about).copy()
         for _ in range(8):  # Newton on the 2x2 system; converges quadratically inside the image
             J = self._radtan_jacobian(uv)
             r = observed - self._radtan(uv)
             det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
             uv[..., 0] += (J[..., 1, 1] * r[..., 0] - J[..., 0, 1] * r[..., 1]) / det
             uv[..., 1] += (J[..., 0, 0] * r[..., 1] - J[..., 1, 0] * r[..., 0]) / det
-            if np.nanmax(np.abs(r), initial=0.0) < 1e-12:
+            if np.nanmax(np.abs(r), initial=0.0) < 1e-6:  # so the step leaves about its square
                 break
         return uv
 

@@ -86,8 +86,8 @@ def test_what_is_seen(state, right):
     later.T, sooner.T = se3.exp(V * STEP) @ state.T, se3.exp(-V * STEP) @ state.T
     up, down = (looked(s, T) for s in (later, sooner))
     assert np.allclose(H[:, OFFSET], ((up - down) / (2 * STEP)).ravel(), atol=1e-6, rtol=1e-6)
-    PHt, S = ekf.gains(state, rows)
-    assert np.allclose(PHt, state.cov @ H.T, atol=1e-14)
+    HP, S = ekf.gains(state, rows)
+    assert np.allclose(HP, H @ state.cov, atol=1e-14)
     assert np.allclose(S, H @ state.cov @ H.T + np.eye(20), atol=1e-14)
 
 

@@ -92,7 +92,7 @@ def sight(state: State, which: I64, seen: Prediction, uv: F64, sigma: F64, rate:
 
 
 def gains(state: State, rows: Sight, common: F64 | None = None) -> tuple[F64, F64]:
-    """cov H' (n, 2 M) and H cov H' + R (2 M, 2 M) of rows sorted by host. H is not formed: a row has 30
+    """H cov (2 M, n) and H cov H' + R (2 M, 2 M) of rows sorted by host. H is not formed: a row has 30
     entries. common (6, 6): covariance of an error that all rows share, as one of the pose, on its right."""
     P, M = state.cov, len(rows.which)
     core, by_host = rows.core.reshape(2 * M, CORE), rows.by_host.reshape(2 * M, 6)
@@ -101,17 +101,19 @@ def gains(state: State, rows: Sight, common: F64 | None = None) -> tuple[F64, F6
     groups = [
         (state.keyframe(int(h)), slice(2 * a, 2 * b)) for h, a, b in zip(*_runs(rows.host), strict=True)
     ]
-    PHt = P[:, :CORE] @ core.T + P[:, at_rho] * by_rho + P[:, at_lasting]
+    HP = core @ P[:CORE]
+    HP += by_rho[:, None] * P[at_rho]
+    HP += P[at_lasting]
     for columns, part in groups:
-        PHt[:, part] += P[:, columns] @ by_host[part].T
-    S = core @ PHt[:CORE] + by_rho[:, None] * PHt[at_rho] + PHt[at_lasting]
+        HP[part] += by_host[part] @ P[columns]
+    S = HP[:, :CORE] @ core.T + HP[:, at_rho] * by_rho + HP[:, at_lasting]
     for columns, part in groups:
-        S[part] += by_host[part] @ PHt[columns]
+        S[:, part] += HP[:, columns] @ by_host[part].T
     S[np.diag_indices(2 * M)] += np.repeat(rows.sigma**2, 2)
     if common is not None and common.any():
         B = core[:, POSE] @ se3.adjoint(state.T)
         S += B @ common @ B.T
-    return PHt, S
+    return HP, S
 
 
 def _runs(host: I64) -> tuple[I64, I64, I64]:
@@ -144,8 +146,8 @@ def relinearised(
     for _ in range(rounds):
         rows = rows_at()
         rows.residual[:] += times(state, rows, error)
-        PHt, S = gains(state, rows, common)
-        step = _gain(PHt, S, rows.residual.ravel())[0] - error
+        HP, S = gains(state, rows, common)
+        step = _gain(HP, S, rows.residual.ravel())[0] - error
         error += step
         state.restore(before)
         move(state, error)
@@ -166,16 +168,16 @@ def times(state: State, rows: Sight, error: F64) -> F64:
     return out
 
 
-def update(state: State, rows: Sight, PHt: F64, S: F64) -> float:
+def update(state: State, rows: Sight, HP: F64, S: F64) -> float:
     """Apply rows with their `gains`. The squared Mahalanobis distance of all of them together.
 
     Raises numpy.linalg.LinAlgError where S is not positive definite."""
-    return apply(state, rows.residual.ravel(), PHt, S)
+    return apply(state, rows.residual.ravel(), HP, S)
 
 
-def apply(state: State, residual: F64, PHt: F64, S: F64) -> float:
-    """residual (m,), cov H' (n, m), its covariance S (m, m)."""
-    error, W, white = _gain(PHt, S, residual)
+def apply(state: State, residual: F64, HP: F64, S: F64) -> float:
+    """residual (m,), H cov (m, n), its covariance S (m, m)."""
+    error, W, white = _gain(HP, S, residual)
     state.cov -= W.T @ W  # numpy makes this one symmetric to the last bit
     move(state, error)
     return float(white @ white)
@@ -184,11 +186,11 @@ def apply(state: State, residual: F64, PHt: F64, S: F64) -> float:
 def learn(state: State, residual: F64, H: F64, sigma: float, gate: float = np.inf) -> bool:
     """Apply a few rows H (m, n) of any kind, sigma of each. Whether they were believed: where they contradict
     the state by more than `gate`, a squared Mahalanobis distance, nothing is done."""
-    PHt = state.cov @ H.T
-    S = H @ PHt + sigma**2 * np.eye(len(H))
+    HP = H @ state.cov
+    S = HP @ H.T + sigma**2 * np.eye(len(H))
     if residual @ np.linalg.solve(S, residual) > gate:
         return False
-    apply(state, residual, PHt, S)
+    apply(state, residual, HP, S)
     return True
 
 
@@ -206,13 +208,15 @@ def doubt(state: State, turn: float, shift: float, speed: float) -> None:
     state.cov[VELOCITY, VELOCITY] += speed**2 * np.eye(3)
 
 
-def _gain(PHt: F64, S: F64, residual: F64) -> tuple[F64, F64, F64]:
+def _gain(HP: F64, S: F64, residual: F64) -> tuple[F64, F64, F64]:
     """The error (n,) that the residual tells of, L^-1 H cov (m, n), L^-1 residual (m,) with L L' = S."""
     L, failed = lapack.dpotrf(S, lower=1, clean=1)
     if failed:
         raise np.linalg.LinAlgError("innovation covariance is not positive definite")
-    W = blas.dtrsm(1.0, L, PHt.T, lower=1)
-    white = blas.dtrsm(1.0, L, residual[:, None], lower=1)[:, 0]
+    W: F64 = blas.dtrsm(
+        1.0, L, HP.T, side=1, lower=1, trans_a=1
+    ).T  # from the right: no copy for Fortran's order
+    white: F64 = blas.dtrsm(1.0, L, residual[:, None], lower=1)[:, 0]
     return W.T @ white, W, white
 
 

@@ -44,6 +44,7 @@ class Scene:
         self._lasting = config.lasting_px / rig.cam0.focal
         self._memory = Memory()
         self._shunned: list[F32] = []
+        self._measured = True
         self._probation = 0  # frames that _PROBATION_S are
         self._wary = 0  # frames for which new features have to prove themselves
         self._next_feature = self._next_keyframe = 0
@@ -56,8 +57,9 @@ class Scene:
         self._add_features(frame, host)
         self._forget()
 
-    def step(self, seconds: float) -> None:
-        """Since the frame before."""
+    def step(self, seconds: float, measured: bool) -> None:
+        """Since the frame before. measured: an IMU told how the body turned meanwhile."""
+        self._measured = measured
         ekf.fade(self.state, seconds, self._lasting, self._config.lasting_s)
         self._probation = int(_PROBATION_S / max(seconds, 1e-3))
 
@@ -99,12 +101,19 @@ class Scene:
         camera = self._rig.cam0 if T_right_left is None else self._rig.cam1
         assert camera is not None
         which = np.flatnonzero(sought.found & ~sought.astray)
-        uv = camera.normalise(sought.px[which].astype(np.float64))
+        uv = camera.normalise(sought.px[which].astype(np.float64), sought.prediction.uv[which])
         sigma = np.full(len(which), self._config.sigma_px / camera.focal)
         seen = observe.predict(self.state, which, T_right_left) if anew else sought.prediction.take(which)
         return ekf.sight(self.state, which, seen, uv, sigma, rate)
 
-    def with_doubt(self, rows: ekf.Sight) -> ekf.Sight:
+    def heard(self, first: ekf.Sight, *others: ekf.Sight) -> ekf.Sight:
+        """What the filter hears of all that was seen in a frame's images, sorted by host."""
+        rows = self._with_doubt(first.join(*others))
+        if self._measured:  # else nothing but images leads from one to the next
+            rows = rows.take(features.heard(self.looks)[rows.which])
+        return rows.take(np.argsort(rows.host, kind="stable"))
+
+    def _with_doubt(self, rows: ekf.Sight) -> ekf.Sight:
         """While somebody moves in the view, what is new in it counts little."""
         unproven = (self._wary > 0) & ~self.proven(rows.which)
         return replace(rows, sigma=np.where(unproven, _UNPROVEN, 1.0) * rows.sigma)

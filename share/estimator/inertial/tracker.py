@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from share.config import InertialConfig, TrackerConfig
 from share.estimator import relocalise
-from share.estimator.inertial import ekf, features, find, parsac
+from share.estimator.inertial import ekf, find, parsac
 from share.estimator.inertial.beginning import first_state, state_by_camera
 from share.estimator.inertial.features import Looks
 from share.estimator.inertial.health import Agreement
@@ -133,8 +133,8 @@ class InertialTracker:
     def _follow(self, frame: Frame, scene: Scene) -> TrackResult:
         before, imu = scene.state.T, self._heard(frame, scene.state)
         since_s = (frame.stamp_ns - self._stamp_ns) * 1e-9
-        scene.step(since_s)
         measured = self._propagate(frame, scene.state, imu)
+        scene.step(since_s, measured)
         left, seen = self._look(frame, scene)
         heard = imu is not None
         if measured and self._window is None:
@@ -239,31 +239,24 @@ class InertialTracker:
             right = find.seek(frame.image1, self._rig.cam1, s, scene.looks, config, T, left=left)
             sought.append((right, T))
 
-        heard = features.heard(scene.looks)
-
-        def arranged(first: ekf.Sight, *others: ekf.Sight) -> ekf.Sight:
-            rows = scene.with_doubt(first.join(*others))
-            rows = rows.take(heard[rows.which])
-            return rows.take(np.argsort(rows.host, kind="stable"))
-
         def rows_now() -> ekf.Sight:
-            return arranged(*(scene.sight(image, self._rate, T, anew=True) for image, T in sought))
+            return scene.heard(*(scene.sight(image, self._rate, T, anew=True) for image, T in sought))
 
         seen, self._surprise = np.zeros(len(s.ids), bool), np.zeros(0)
-        rows = arranged(left_rows, *(scene.sight(image, self._rate, T) for image, T in sought[1:]))
+        rows = scene.heard(left_rows, *(scene.sight(image, self._rate, T) for image, T in sought[1:]))
         seen[left_rows.which] = True
         if len(rows.which) == 0:
             return seen
-        rows, good, PHt, S = self._judged(s, rows, rows_now)
+        rows, good, HP, S = self._judged(s, rows, rows_now)
         gap = frame.stamp_ns - self._stamp_ns > _GAP_NS
         if gap and good.mean() < _MINORITY and self._agreed(s, left):
             ekf.doubt(s, *_DOUBT)
-            rows, good, PHt, S = self._judged(s, rows, rows_now)
+            rows, good, HP, S = self._judged(s, rows, rows_now)
         if good.all():
-            ekf.update(s, rows, PHt, S)
+            ekf.update(s, rows, HP, S)
         elif good.any():
             twice = np.repeat(good, 2)
-            ekf.update(s, rows.take(good), PHt[:, twice], S[np.ix_(twice, twice)])
+            ekf.update(s, rows.take(good), HP[twice], S[np.ix_(twice, twice)])
         seen[rows.which[~good]] = False
         return seen
 
@@ -273,10 +266,10 @@ class InertialTracker:
         """Rows at the best linearisation, which of them the filter believes, and its `ekf.gains`."""
         if np.median(np.abs(rows.residual)) * self._rig.cam0.focal > _FAR_OFF_PX:
             rows = ekf.relinearised(s, rows_now, self._common)
-        PHt, S = ekf.gains(s, rows, self._common)
+        HP, S = ekf.gains(s, rows, self._common)
         self._surprise = ekf.surprise(rows, S)
         doubted = rows.which[self._surprise >= self._config.gate]
-        return rows, ~np.isin(rows.which, doubted), PHt, S  # one camera's doubt is enough
+        return rows, ~np.isin(rows.which, doubted), HP, S  # one camera's doubt is enough
 
     def _agreed(self, s: State, left: find.Sought) -> bool:
         """Whether nearly all that cam0 shows agrees among itself."""
