@@ -213,9 +213,7 @@ def _gain(HP: F64, S: F64, residual: F64) -> tuple[F64, F64, F64]:
     L, failed = lapack.dpotrf(S, lower=1, clean=1)
     if failed:
         raise np.linalg.LinAlgError("innovation covariance is not positive definite")
-    W: F64 = blas.dtrsm(
-        1.0, L, HP.T, side=1, lower=1, trans_a=1
-    ).T  # from the right: no copy for Fortran's order
+    W: F64 = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1).T  # as Fortran has it: no copy
     white: F64 = blas.dtrsm(1.0, L, residual[:, None], lower=1)[:, 0]
     return W.T @ white, W, white
 
