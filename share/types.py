@@ -46,6 +46,30 @@ class TrackState(StrEnum):
         return self not in (TrackState.INITIALISING, TrackState.LOST)
 
 
+class Wait(StrEnum):
+    """What a tracker still has to know before it tells a pose."""
+
+    IMU = "imu"
+    VIEW = "view"
+    TILT = "tilt"
+    SPEED = "speed"
+    SCALE = "scale"
+
+    @property
+    def words(self) -> str:
+        """For a person, after "waits for"."""
+        return _WAITS_FOR[self]
+
+
+_WAITS_FOR = {
+    Wait.IMU: "the IMU's first samples",
+    Wait.VIEW: "something to see",
+    Wait.TILT: "what is up",
+    Wait.SPEED: "its velocity",
+    Wait.SCALE: "the scale: move the camera",
+}
+
+
 def checked(
     name: str, value: ArrayLike, shape: tuple[int | None, ...], dtype: DTypeLike, finite: bool = True
 ) -> NDArray[Any]:

@@ -11,6 +11,9 @@ import click
 from share.cli import options
 from share.cli.progress import progress
 from share.errors import DataError, UsageError
+from share.types import Wait
+
+_SOON_S = 1.0  # a first pose that needs no word
 
 
 @click.command()
@@ -57,7 +60,7 @@ def track(
     if not len(run.trajectory.stamps_ns):
         raise DataError(
             f"{opened.name}: none of its {run.report['frames']} frames could be tracked; are they dark, "
-            "blurred or bare, or is the calibration another camera's?"
+            "blurred or bare, or is the calibration another camera's?" + _waited(run.report)
         )
     ate = accuracy(run, truth) if run.report["stretches"] == 1 else None
     report = {**run.report, "ate_m": ate.rmse if ate else None}
@@ -83,6 +86,12 @@ def _targets(named: dict[str, str | None], source: str) -> dict[str, Path]:
     return wanted
 
 
+def _waited(report: dict[str, Any]) -> str:
+    """For what, for most of the time without a pose."""
+    frames = report["waited"]
+    return f" The tracker waited for {Wait(max(frames, key=frames.get)).words}" if frames else ""
+
+
 def _summary(report: dict[str, Any], ate: Any) -> str:
     lines = [
         f"{report['tracked']} of {report['frames']} frames tracked, {report['keyframes']} keyframes, "
@@ -90,6 +99,8 @@ def _summary(report: dict[str, Any], ate: Any) -> str:
         f"{report['cpu_ms_per_frame']:.1f} ms CPU a frame, "
         f"and {report['decode_ms_per_frame']:.1f} ms to decode it",
     ]
+    if report["init_s"] > _SOON_S:
+        lines.append(f"the first pose came after {report['init_s']:.1f} s." + _waited(report))
     if report["contradicted"]:
         lines.append(
             f"images and IMU contradict each other in {report['contradicted']} frames: see whether the "

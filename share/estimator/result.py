@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from share.types import F64, TrackState
+from share.types import F64, TrackState, Wait
 
 
 @dataclass(frozen=True, eq=False)
@@ -13,7 +13,8 @@ class TrackResult:
 
     keyframe: this frame became one; the tracker's `keyframe` gives what it shows. points: how many
     the pose rests on. new_stretch: odometry broke before this keyframe. cov (6, 6): of T_odom_body, perturbed
-    on the right, where the tracker knows it. sound: False while images and IMU contradict each other.
+    on the right, where the tracker knows it. sound: False while images and IMU contradict each other. waits:
+    for what, where there is no pose yet.
     """
 
     state: TrackState
@@ -23,3 +24,4 @@ class TrackResult:
     new_stretch: bool = False
     cov: F64 | None = None
     sound: bool = True
+    waits: Wait | None = None

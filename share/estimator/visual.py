@@ -21,7 +21,7 @@ from share.estimator.pose import PoseEstimate, consensus, refine
 from share.estimator.result import TrackResult
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
-from share.types import F32, F64, I64, U8, Candidate, Frame, TrackState
+from share.types import F32, F64, I64, U8, Candidate, Frame, TrackState, Wait
 from share.vision import corners, klt
 from share.vision.view import depth_at, make_view
 
@@ -218,7 +218,7 @@ class VisualTracker:
         """The first keyframe defines odom: body at the origin, z up as far as that is known."""
         up = self._gravity.add(frame.imu) if self._gravity else None
         if self._gravity and up is None and not self._gravity.gave_up:
-            return TrackResult(TrackState.INITIALISING, None)
+            return TrackResult(TrackState.INITIALISING, None, waits=Wait.TILT)
         if up is None:
             up = self._gravity.guess() if self._gravity else None
             self._gravity = None
@@ -230,7 +230,7 @@ class VisualTracker:
         if len(self._tracks.ids) < self._config.min_inliers:
             self._T_odom_cam, self._tracks = None, _NO_TRACKS
             self._map = LocalMap(self._config.max_keyframes)
-            return TrackResult(TrackState.INITIALISING, None)
+            return TrackResult(TrackState.INITIALISING, None, waits=Wait.VIEW)
         return TrackResult(TrackState.OK, self._T_odom_body(), True, len(self._tracks.ids), True)
 
     def _recover(self, frame: Frame) -> TrackResult:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from share.metrics.latency import latency
-from share.types import TrackState
+from share.types import TrackState, Wait
 
 CSV_HEADER = "stamp_ns,track_ms,corrected_ms,state,keyframe,sent"
 
@@ -41,6 +42,7 @@ class RunLog:
     cpu_s: float = 0.0  # process CPU time of the tracking pipeline
     decode_s: float = 0.0  # CPU time of image decoding
     contradicted: int = 0  # frames in which images and IMU told of different motions
+    waited: Counter[Wait] = field(default_factory=Counter)  # frames, by what was still waited for
     stretches: int = 0  # of unbroken odometry; poses of different ones do not compare
     _by_stamp: dict[int, FrameRow] = field(default_factory=dict)
 
@@ -58,6 +60,11 @@ class RunLog:
         row = FrameRow(stamp_ns, track_ms, state, keyframe, sent)
         self._rows.append(row)
         self._by_stamp[stamp_ns] = row
+
+    def add_wait(self, wait: Wait | None) -> None:
+        """Of a frame; None where nothing was waited for."""
+        if wait is not None:
+            self.waited[wait] += 1
 
     def add_decode(self, cpu_s: float) -> None:
         self.decode_s += cpu_s
@@ -92,6 +99,7 @@ class RunLog:
             "decode_ms_per_frame": 1e3 * self.decode_s / frames if frames else None,
             "rate_hz": sent / span_s if span_s else None,
             "init_s": _init_s(rows),
+            "waited": {str(wait): frames for wait, frames in self.waited.items()},
         }
 
 

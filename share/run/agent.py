@@ -30,7 +30,7 @@ from share.io.transport import AgentLink
 from share.metrics.runlog import RunLog
 from share.run.agent_files import AgentFiles
 from share.run.pipeline import frames_of, tracker_for
-from share.types import Frame
+from share.types import Frame, TrackState, Wait
 from share.wire.messages import Hello
 
 READ_AHEAD = 30  # frames decoded before they are due
@@ -83,6 +83,7 @@ class AgentRun:
         self._link = connect()  # last: whatever is wrong with the above has been said by now
         self._shared = _Shared()
         self._damaged = 0
+        self._waits: Wait | None = None  # the tracker, for what
         self._ended = False
         self.report: dict[str, Any] = {}
         self.trouble: str | None = None  # why the edge does not let this agent in
@@ -186,6 +187,8 @@ class AgentRun:
         self._post(tracked)  # the pose goes out before others are served
         self._log.stretches += result.new_stretch
         self._log.contradicted += not result.sound
+        self._log.add_wait(result.waits)
+        self._waits = result.waits
         if result.keyframe:
             self._post(ev.KeyframeMade(tracked, self._tracker.keyframe(frame)))
         self._log.cpu_s += time.thread_time() - cpu
@@ -226,7 +229,7 @@ class AgentRun:
                     self._files.map(effect.stamp_ns, effect.T_map_odom @ effect.T_odom_body, effect.map_id)
             case ev.FrameDone():
                 self._log.add(effect.stamp_ns, effect.track_ms, effect.state, effect.keyframe, effect.sent)
-                self._show(Status(len(self._log), str(effect.state), self._machine.report))
+                self._show(Status(len(self._log), self._state(effect.state), self._machine.report))
             case ev.CorrectionApplied():
                 if effect.stamp_ns is not None and effect.corrected_ms is not None:
                     self._log.mark_corrected(effect.stamp_ns, effect.corrected_ms)
@@ -239,6 +242,10 @@ class AgentRun:
                 raise effect.error
             case ev.Stop():
                 self._ended = True
+
+    def _state(self, state: TrackState) -> str:
+        waits = self._waits if state is TrackState.INITIALISING else None
+        return str(state) if waits is None else f"{state}, waits for {waits.words},"
 
     def _report(self) -> dict[str, Any]:
         protocol = self._machine.report()

@@ -38,6 +38,7 @@ def track(source: Source, settings: config.Config, progress: Callable[[int], Non
         track_ms = 1e3 * (time.perf_counter() - began)
         log.stretches += result.new_stretch
         log.contradicted += not result.sound
+        log.add_wait(result.waits)
         if result.keyframe:
             tracker.keyframe(frame)
         log.cpu_s += time.process_time() - cpu

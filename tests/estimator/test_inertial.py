@@ -15,7 +15,7 @@ from share.io.source import open_source
 from share.io.trajectory import Trajectory
 from share.metrics.ate import ate
 from share.run.pipeline import frames_of
-from share.types import ImuBatch, TrackState
+from share.types import ImuBatch, TrackState, Wait
 
 OK, BLIND, DEAF, LOST = TrackState.OK, TrackState.INERTIAL_ONLY, TrackState.VISION_ONLY, TrackState.LOST
 STARTING = TrackState.INITIALISING
@@ -157,6 +157,7 @@ def test_an_imu_that_was_never_there(walk):
     frames = some(walk[0], mute, 0, 99)
     results, candidates, _ = run(walk, frames)
     assert states(results)[:9] == [STARTING] * 9
+    assert {r.waits for r in results[:9]} == {Wait.IMU}
     assert states(results)[10:] == [DEAF] * 35
     assert error_m(walk, frames, results) < 0.04
     assert all((c.up == 0).all() for c in candidates)
@@ -188,7 +189,9 @@ def test_waits_for_something_to_see(walk):
     frames = some(walk[0][:15], dark, 0, 6)
     results, _, _ = run(walk, frames)
     assert states(results)[:6] == [STARTING] * 6
+    assert {r.waits for r in results[1:6]} == {Wait.VIEW}
     assert results[-1].state is OK
+    assert results[-1].waits is None
 
 
 def test_memory_is_bounded(walk):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_inertial import error_m, run, some, states, walk  # noqa: F401
 
-from share.types import ImuBatch, TrackState
+from share.types import ImuBatch, TrackState, Wait
 
 OK, STARTING = TrackState.OK, TrackState.INITIALISING
 
@@ -52,6 +52,7 @@ def test_scale_from_the_imu(walk):  # noqa: F811
     print(ready, scale_of(mono[0], results, mono[2]), error_m(mono, mono[0], results))
     assert set(states(results)[:ready]) == {STARTING}
     assert all(r.T_odom_body is None for r in results[:ready])
+    assert {r.waits for r in results[1:ready]} == {Wait.SCALE}
     assert 10 <= ready < 40
     assert set(states(results)[ready:]) == {OK}
     assert scale_of(mono[0], results, mono[2]) == pytest.approx(1, abs=0.08)

@@ -9,7 +9,7 @@ from share.estimator import gravity
 from share.estimator.visual import VisualTracker
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
-from share.types import Frame, ImuBatch, TrackState
+from share.types import Frame, ImuBatch, TrackState, Wait
 
 HZ = 20
 DEFAULT = TrackerConfig()
@@ -111,6 +111,7 @@ def test_waits_for_something_to_see(walk):
     dark = (np.zeros((480, 640), np.uint8),) * 2
     results, _ = run([dark, dark, *walk[0][:3]])
     assert [r.state for r in results] == [TrackState.INITIALISING] * 2 + [TrackState.OK] * 3
+    assert [r.waits for r in results] == [Wait.VIEW] * 2 + [None] * 3
 
 
 def test_memory_is_bounded(walk):
@@ -149,6 +150,7 @@ def test_without_gravity_in_the_accelerometer_up_stays_unknown(walk):
     rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0, imu=noise)
     results, candidates = run(walk[0][:15], rig=rig)  # the IMU says nothing at all
     assert [r.state for r in results[:9]] == [TrackState.INITIALISING] * 9
+    assert {r.waits for r in results[:9]} == {Wait.TILT}
     assert results[9].state is TrackState.VISION_ONLY
     assert (candidates[0].up == 0).all()
 

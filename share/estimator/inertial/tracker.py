@@ -28,7 +28,7 @@ from share.estimator.localmap import LocalKeyframe, LocalMap
 from share.estimator.result import TrackResult
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
-from share.types import F64, U8, Candidate, Frame, ImuBatch, TrackState
+from share.types import F64, U8, Candidate, Frame, ImuBatch, TrackState, Wait
 from share.vision import corners
 from share.vision.view import make_view, measures_depth
 
@@ -155,7 +155,7 @@ class InertialTracker:
             if wanted:
                 self._anchor(frame, scene)
             if not self._solved(frame, scene, wanted):
-                return TrackResult(state, None)
+                return self._initialising(scene.state)
             state, wanted = TrackState.OK, True
         return self._told(scene.state, state, wanted, count)
 
@@ -316,6 +316,11 @@ class InertialTracker:
         fast = np.sqrt(np.trace(s.cov[VELOCITY, VELOCITY]))
         return bool(self._tilt(s) < _READY_RAD and fast < _READY_M_S)
 
+    def _initialising(self, s: State) -> TrackResult:
+        waits = Wait.TILT if self._tilt(s) >= _READY_RAD else Wait.SPEED
+        waits = waits if self._window is None else Wait.SCALE
+        return TrackResult(TrackState.INITIALISING, None, waits=waits)
+
     def _tilt(self, s: State) -> float:
         """Sigma, rad."""
         return float(np.sqrt(s.cov[0, 0] + s.cov[1, 1]))
@@ -357,14 +362,14 @@ class InertialTracker:
         if state is None and self._waited >= _PATIENCE:
             state = state_by_camera(frame.stamp_ns, self._rig, self._config)
         if state is None:
-            return TrackResult(waiting, None)
+            return TrackResult(waiting, None, waits=Wait.IMU)
         if found is not None:
             state.T = found @ se3.inverse(self._rig.T_body_cam0)
         scene = Scene(state, self._rig, self._config)
         self._rate = self._samples.all.gyro[-1] - state.bg if len(self._samples.all) else np.zeros(3)
         self._anchor(frame, scene)
         if len(state.ids) < self._config.weak:
-            return TrackResult(waiting, None)
+            return TrackResult(waiting, None, waits=Wait.VIEW)
         self._scene, self._ready = scene, False
         self._window = window_for(state, self._rig.cam0, self._noise, self._config, self._common)
         self._new_stretch = found is None
@@ -372,14 +377,14 @@ class InertialTracker:
             self._places = LocalMap(self._places_config.max_keyframes)
         self._lost_ns = None
         if self._window is not None or not self._converged(state):
-            return TrackResult(TrackState.INITIALISING, None)
+            return self._initialising(state)
         return self._told(state, TrackState.OK, True, len(state.ids))
 
     def _lose(self, frame: Frame) -> TrackResult:
         """What is left of the filter is worth nothing."""
         self._scene, self._astray, self._refused_s = None, 0, 0.0
         if self._window is not None:  # there was nothing to lose
-            return TrackResult(TrackState.INITIALISING, None)
+            return TrackResult(TrackState.INITIALISING, None, waits=Wait.SCALE)
         self._ready, self._lost_ns = False, frame.stamp_ns
         return TrackResult(TrackState.LOST, None)
 
