@@ -11,7 +11,6 @@ import click
 from share.cli import options
 from share.cli.progress import progress
 from share.errors import DataError, UsageError
-from share.types import Wait
 
 _SOON_S = 1.0  # a first pose that needs no word
 
@@ -88,6 +87,8 @@ def _targets(named: dict[str, str | None], source: str) -> dict[str, Path]:
 
 def _waited(report: dict[str, Any]) -> str:
     """For what, for most of the time without a pose."""
+    from share.types import Wait
+
     frames = report["waited"]
     return f" The tracker waited for {Wait(max(frames, key=frames.get)).words}" if frames else ""
 

@@ -14,7 +14,7 @@ from share.geometry import se3
 from share.types import ImuBatch
 
 FRAME_HZ, IMU_HZ = 20, 200
-SIGMA_PX, LASTING_PX, LASTING_S = 0.5, 0.5, 1.0
+SIGMA_PX, LASTING_PX, LASTING_S = 0.5, 0.3, 1.0
 
 
 @dataclass
