@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from imu_world import CAMERA, GRAVITY, NOISE, Path, imu_of, rig
 
+from share.config import InertialConfig
 from share.estimator.inertial import ekf, observe
 from share.estimator.inertial.guess import guess
 from share.estimator.inertial.state import CORE, State, begin
@@ -14,7 +15,8 @@ from share.geometry import se3
 from share.types import ImuBatch
 
 FRAME_HZ, IMU_HZ = 20, 200
-SIGMA_PX, LASTING_PX, LASTING_S = 0.5, 0.3, 1.0
+SHIPPED = InertialConfig()
+LASTING_PX, LASTING_S = SHIPPED.lasting_px, SHIPPED.lasting_s
 
 
 @dataclass
@@ -37,6 +39,7 @@ class Setup:
     extrinsic_error: np.ndarray | None = None  # (6,); None: drawn
     offset_error: float | None = None
     path: dict[str, float] = field(default_factory=dict)
+    sigma_px: float = 0.5  # white; more than is shipped
 
 
 @dataclass
@@ -55,7 +58,7 @@ def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
     t_imu = np.arange(0, setup.seconds + 0.5, 1 / IMU_HZ)
     imu, bg, ba = imu_of(path, t_imu, rng.normal(0, setup.bg, 3), rng.normal(0, setup.ba, 3), rng)
     sigma = _sigmas(setup)
-    world = _World(path, sensors, rng, setup.mono)
+    world = _World(path, sensors, rng, setup)
     extrinsic = (
         setup.extrinsic_error if setup.extrinsic_error is not None else rng.normal(0, 1, 6) * sigma[15:21]
     )
@@ -110,9 +113,10 @@ def _forget_idle(state: State) -> None:
 class _World:
     """Points that come and go with the features."""
 
-    def __init__(self, path, sensors, rng, mono):
-        self._eyes = (None,) if mono else (None, sensors.T_cam1_cam0)
-        self._mono, self._px = mono, np.zeros((0, 2), np.float32)
+    def __init__(self, path, sensors, rng, setup):
+        self._eyes = (None,) if setup.mono else (None, sensors.T_cam1_cam0)
+        self._mono, self._sigma_px = setup.mono, setup.sigma_px
+        self._px = np.zeros((0, 2), np.float32)
         self._path, self._rig, self._rng = path, sensors, rng
         self._points, self._lasting = {}, {}
 
@@ -130,11 +134,11 @@ class _World:
             T = se3.inverse(self._camera(taken))
             T = T if T_right_left is None else T_right_left @ T
             px = CAMERA.project(se3.transform(T, points))
-            px += self._rng.normal(0, SIGMA_PX, px.shape) + lasting
+            px += self._rng.normal(0, self._sigma_px, px.shape) + lasting
             seen.append(np.where(CAMERA.inside(np.nan_to_num(px, nan=-1e9))[:, None], px, np.nan))
         inside = ~np.isnan([px[:, 0] for px in seen]).any(axis=0)
         which = np.flatnonzero(inside)
-        sigma = np.full(len(which), SIGMA_PX / CAMERA.focal)
+        sigma = np.full(len(which), self._sigma_px / CAMERA.focal)
         first, *others = (
             ekf.sight(
                 state, which, observe.predict(state, which, T), CAMERA.normalise(px[which]), sigma, rate
@@ -171,7 +175,7 @@ class _World:
             g = guess(state, px.astype(np.float32), self._px)
             ekf.add_features(state, ids, np.full(count, host), uv, g.rho, g.sigma, 0.0, g.like, g.common)
             return next_id + count
-        sigma = SIGMA_PX / CAMERA.fx / self._rig.baseline
+        sigma = self._sigma_px / CAMERA.fx / self._rig.baseline
         rho = np.maximum(1 / z + self._rng.normal(0, sigma, count), 0.02)
         hosts = np.full(count, host)
         ekf.add_features(state, np.arange(next_id, next_id + count), hosts, uv, rho, np.full(count, sigma))
