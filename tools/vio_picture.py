@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from PIL import Image  # comes with matplotlib
 
 from share.types import F64, I64
 
 _COLOURS = ("#00798c", "#d1495b", "#b8860b")
+_PALETTE = 64  # colours of the file
 _GAP_S = 0.2  # where nothing was told for longer, no line is drawn
 _BEGINNING_S, _ROOM = 10.0, 1.08  # the scale is that of what comes later, and a little more
 
@@ -58,6 +60,7 @@ def draw(path: Path, title: str, runs: list[Curves]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=90)
         pyplot.close(figure)
+    Image.open(path).convert("RGB").quantize(_PALETTE).save(path, optimize=True)  # a quarter of the bytes
 
 
 def _column(panels: Any, runs: list[Curves], part: Part) -> None:
