@@ -150,6 +150,7 @@ class AgentConfig:
     """What an agent keeps, sends and makes of corrections."""
 
     keep_keyframes: int = 600  # that an agent remembers, sent ones too: a restarted edge is given them again
+    late_ms: float = 0.0  # a frame that is later when its turn comes is left out; 0: none is
     rate_burst: float = 2.0  # keyframes that may be saved up under a rate limit
     blend_jump_m: float = 0.05  # a correction that moves the body further, or turns it more,
     blend_jump_rad: float = 0.02  # is blended in
@@ -158,6 +159,8 @@ class AgentConfig:
 
     def __post_init__(self) -> None:
         _require_positive(self, "keep_keyframes", "blend_s")
+        if not self.late_ms >= 0:
+            raise ValueError(f"late_ms: {self.late_ms} must not be negative")
         if self.rate_burst < 1:
             raise ValueError(f"rate_burst: {self.rate_burst} must be at least 1")
 

@@ -143,6 +143,15 @@ class ImuBatch:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    def join(self, *others: ImuBatch) -> ImuBatch:
+        """All samples, one batch after the other."""
+        parts = (self, *others)
+        return ImuBatch(
+            np.concatenate([part.stamps_ns for part in parts]),
+            np.concatenate([part.gyro for part in parts]),
+            np.concatenate([part.accel for part in parts]),
+        )
+
     @staticmethod
     def empty() -> ImuBatch:
         return ImuBatch(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))

@@ -133,6 +133,8 @@ def _summary(run: AgentRun) -> str:
         f"{r['sent']} of {r['keyframes']} keyframes sent, {r['corrections']} corrections, "
         f"{r['bytes_up'] / 1e6:.2f} MB up, {r['bytes_down'] / 1e6:.3f} MB down",
     ]
+    if r["drop_late"]:
+        lines.append(f"{r['drop_late']} more frames came too late and were left out")
     if p95 is not None:
         lines.append(f"pose after {r['track_ms']['p50']:.1f} ms (95 %: {p95:.1f} ms)")
     return "\n".join(lines)

@@ -6,7 +6,7 @@
 A recording is played at its own pace and no frame of it is dropped: the reader waits when the tracker
 is behind (policy `block`), while a frame still counts as arrived when it was due. So the poses of a
 recording are the same to the last digit on any machine, with an edge or without, and lateness shows
-in the latency, where it belongs.
+in the latency, where it belongs. With `agent.late_ms` the loop holds its rate instead (policy `drop_late`).
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from share.io.source import Source
 from share.io.transport import AgentLink
 from share.metrics.runlog import RunLog
 from share.run.agent_files import AgentFiles
+from share.run.late import Late
 from share.run.pipeline import frames_of, tracker_for
 from share.types import Frame, TrackState, Wait
 from share.wire.messages import Hello
@@ -79,6 +80,7 @@ class AgentRun:
         self._machine = Agent(hello, settings)
         self._tracker = tracker_for(source, settings)
         self._files, self._log = AgentFiles(out, say), RunLog()
+        self._late = Late(settings.agent.late_ms)
         self._counters = SequencerCounters()
         self._link = connect()  # last: whatever is wrong with the above has been said by now
         self._shared = _Shared()
@@ -169,7 +171,9 @@ class AgentRun:
             due = began[0] + frame.stamp_ns - began[1]
             if due > now and self._shared.stop.wait((due - now) * 1e-9):
                 return
-            yield frame, due
+            behind_ns, another = time.monotonic_ns() - due, not self._shared.frames.empty()
+            if (taken := self._late.take(frame, behind_ns, another)) is not None:
+                yield taken, due
 
     def _track_one(self, frame: Frame, arrived_ns: int) -> None:
         cpu = time.thread_time()
@@ -256,6 +260,7 @@ class AgentRun:
             "bytes_up": protocol["bytes_up"],
             "bytes_down": protocol["bytes_down"],
             "damaged_images": self._damaged,
+            "drop_late": self._late.dropped,
             "sequencer": dataclasses.asdict(self._counters),
             "protocol": protocol,
             "version": __version__,

@@ -1,0 +1,42 @@
+"""Frames that come too late."""
+
+import numpy as np
+import pytest
+
+from share.run.late import Late
+from share.types import Frame, ImuBatch
+
+MS = 1_000_000
+IMAGE = np.zeros((4, 4), np.uint8)
+
+
+def frame(k):
+    stamps = np.array([10 * k, 10 * k + 5], np.int64) * MS
+    return Frame(10 * k * MS, k, IMAGE, imu=ImuBatch(stamps, np.full((2, 3), k), np.full((2, 3), -k)))
+
+
+def test_a_late_frame_is_left_out_if_another_waits():
+    late = Late(20.0)
+    assert late.take(frame(0), 19 * MS, another=True) is not None
+    assert late.take(frame(1), 21 * MS, another=True) is None
+    assert late.take(frame(2), 21 * MS, another=True) is None
+    assert late.dropped == 2
+
+
+def test_the_next_frame_has_all_that_the_imu_said():
+    late = Late(20.0)
+    late.take(frame(1), 30 * MS, another=True)
+    late.take(frame(2), 30 * MS, another=True)
+    taken = late.take(frame(3), 5 * MS, another=True)
+    assert taken.index == 3
+    assert taken.imu.stamps_ns.tolist() == [10 * MS, 15 * MS, 20 * MS, 25 * MS, 30 * MS, 35 * MS]
+    assert taken.imu.gyro[:, 0].tolist() == [1, 1, 2, 2, 3, 3]
+    assert taken.imu.accel[:, 0].tolist() == [-1, -1, -2, -2, -3, -3]
+    assert late.take(frame(4), 0, another=True).imu.stamps_ns.tolist() == [40 * MS, 45 * MS]
+
+
+@pytest.mark.parametrize(("late_ms", "another"), [(0.0, True), (20.0, False)])
+def test_none_is_left_out_where_none_may_be_or_none_waits(late_ms, another):
+    late = Late(late_ms)
+    assert late.take(frame(1), 10**12, another) is not None
+    assert late.dropped == 0
