@@ -25,16 +25,19 @@ from share import process
 process.prepare()
 
 import numpy as np  # noqa: E402
-from measure_vio import DATA, ROOT, code_version, there  # noqa: E402
+import vio_options  # noqa: E402
 from peer_wire import Moment, read_line, write_line, write_moment  # noqa: E402
+from tool_main import exit_code  # noqa: E402
+from vio_kept import code_version, keep, kept  # noqa: E402
 from vio_run import follow  # noqa: E402
-from vio_sequences import SEQUENCES, Sequence  # noqa: E402
+from vio_sequences import Sequence  # noqa: E402
+from vio_table import line  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.core.measurement import IMU  # noqa: E402
 from share.core.sequencer import SequencerCounters  # noqa: E402
 from share.emulate.session import cached_session  # noqa: E402
-from share.errors import DataError, ShareError, UsageError  # noqa: E402
+from share.errors import DataError, UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.camera import Camera  # noqa: E402
 from share.io.files import atomic_write  # noqa: E402
@@ -64,52 +67,27 @@ class Run:
 
 def main() -> int:
     options = arguments()
-    try:
-        measure(options)
-    except ShareError as error:
-        print(f"measure_peers: {error}", file=sys.stderr)
-        return error.exit_code
-    return 0
+    return exit_code("measure_peers", lambda: measure(options))
 
 
 def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    names = [sequence.name for sequence in SEQUENCES]
+    parser = vio_options.parser(__doc__, "peers", (101,))
     parser.add_argument("--python", type=Path, metavar="PATH", help="interpreter that has the peer")
-    parser.add_argument("--only", action="append", choices=names, help="may be repeated")
-    parser.add_argument("--seeds", default="101", metavar="N,N,…")
-    parser.add_argument("--data", type=Path, default=DATA, help="recordings: euroc/NAME, tumvi/NAME")
-    parser.add_argument("--cache", type=Path, help="of sessions (default: the user's)")
-    parser.add_argument("--out", type=Path, default=ROOT / "build" / "peers")
-    parser.add_argument("--workers", type=int, default=2, help="processes that make sessions")
-    parser.add_argument("--again", action="store_true", help="also what has been run already")
     return parser.parse_args()
 
 
 def measure(options: argparse.Namespace) -> None:
     """All runs, seed by seed; then the table."""
-    options.data = options.data.resolve()
-    trackers = dict(trackers_of(options))
-    chosen = list(there(options))
-    if not chosen:
-        raise UsageError("none of the recordings asked for is there; say where they are with --data")
+    trackers, chosen = dict(trackers_of(options)), vio_options.chosen(options)
     rows = [
         row
-        for seed in seeds(options.seeds)
+        for seed in options.seeds
         for sequence in chosen
         for row in both(sequence, seed, trackers, options)
     ]
     text = table(rows)
     print(text)
     atomic_write(options.out / "table.md", text + "\n")
-
-
-def seeds(text: str) -> list[int]:
-    """Raises UsageError."""
-    try:
-        return [int(word) for word in text.split(",")]
-    except ValueError:
-        raise UsageError(f"--seeds {text}: not a list of numbers such as 101,102") from None
 
 
 def trackers_of(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[Source], Run]]]:
@@ -143,13 +121,13 @@ def both(
     for name, tracker in trackers.items():
         made_by = {"sequence": sequence.name, "seed": seed, "tracker": name, "session": recipe.digest}
         file = options.out / f"{sequence.name}-{seed}-{name.split()[0]}.json"
-        row: Row = json.loads(file.read_text()) if file.exists() and not options.again else {}
-        if {key: row.get(key) for key in made_by} != made_by:
+        row = None if options.again else kept(file, made_by)
+        if row is None:
             if source is None:
                 source = open_source(str(cached_session(recipe, options.cache, options.workers) / "agent"))
             row = made_by | figures(source, tracker(source))
             options.out.mkdir(parents=True, exist_ok=True)
-            atomic_write(file, json.dumps(row, indent=2) + "\n")
+            keep(file, row)
             print(cells(row), file=sys.stderr, flush=True)
         yield row
 
@@ -234,8 +212,8 @@ def figures(source: Source, run: Run) -> Row:
 
 
 def table(rows: list[Row]) -> str:
-    head = (*COLUMNS, *CPU_COLUMNS)
-    return "\n".join(["| " + " | ".join(head) + " |", "|---" * len(head) + "|", *map(cells, rows)])
+    head = [*COLUMNS, *CPU_COLUMNS]
+    return "\n".join([line(head), line(["---"] * len(head)), *map(cells, rows)])
 
 
 def cells(row: Row) -> str:
@@ -243,8 +221,7 @@ def cells(row: Row) -> str:
     numbers = [f"{row[key]:.2f}" for key in ("ate_cm", "worst_cm", "rpe_1s_cm")]
     cpu = [f"{row[key]:.1f}" for key in ("cpu_ms", "cpu_mean_ms", "cpu_p99_ms")]
     name = " ".join(row["tracker"].split()[:-1])
-    words = [row["sequence"], str(row["seed"]), name, *numbers, f"{100 * row['told']:.1f}", *cpu]
-    return f"| {' | '.join(words)} |"
+    return line([row["sequence"], str(row["seed"]), name, *numbers, f"{100 * row['told']:.1f}", *cpu])
 
 
 if __name__ == "__main__":

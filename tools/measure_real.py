@@ -29,13 +29,14 @@ from share import process
 process.prepare()
 
 import numpy as np  # noqa: E402
+from tool_main import exit_code  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.core.sequencer import SequencerCounters  # noqa: E402
 from share.emulate.motion.sources import EUROC, open_recording  # noqa: E402
 from share.emulate.recipe import Recipe  # noqa: E402
 from share.emulate.session import cached_session  # noqa: E402
-from share.errors import DataError, ShareError, UsageError  # noqa: E402
+from share.errors import DataError, UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.align import umeyama  # noqa: E402
 from share.io import tables  # noqa: E402
@@ -88,16 +89,16 @@ class Pair:
 
 def main() -> int:
     options = arguments()
+    return exit_code("measure_real", lambda: measure(options))
+
+
+def measure(options: argparse.Namespace) -> None:
+    """The parts asked for."""
     parts = {"pairs": real_pairs, "kitchen": kitchen, "rooms": rooms}
-    try:
-        for name in options.part or parts:
-            print(f"\n## {name}\n")
-            for line in parts[name](options):
-                print(line, flush=True)
-    except ShareError as error:
-        print(f"measure_real: {error}", file=sys.stderr)
-        return error.exit_code
-    return 0
+    for name in options.part or parts:
+        print(f"\n## {name}\n")
+        for line in parts[name](options):
+            print(line, flush=True)
 
 
 def arguments() -> argparse.Namespace:

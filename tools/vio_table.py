@@ -45,11 +45,11 @@ def table(rows: Iterable[Row]) -> str:
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(row["sequence"], []).append(row)
-    lines = [_line(["sequence", "seeds", *(column.title for column in COLUMNS)])]
-    lines.append(_line(["---"] * (2 + len(COLUMNS))))
+    lines = [line(["sequence", "seeds", *(column.title for column in COLUMNS)])]
+    lines.append(line(["---"] * (2 + len(COLUMNS))))
     for name, runs in groups.items():
         seeds = " ".join(str(run["seed"]) for run in runs)
-        lines.append(_line([name, seeds, *(_cell(column, runs) for column in COLUMNS)]))
+        lines.append(line([name, seeds, *(_cell(column, runs) for column in COLUMNS)]))
     return "\n".join(lines)
 
 
@@ -64,5 +64,5 @@ def _cell(column: _Column, runs: list[Row]) -> str:
     return middle if middle == worst else f"{middle} ({worst})"
 
 
-def _line(cells: list[str]) -> str:
+def line(cells: list[str]) -> str:
     return f"| {' | '.join(cells)} |"
