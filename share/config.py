@@ -239,12 +239,11 @@ class EdgeConfig:
     name_hold_s: float = 3.0  # a name stays taken so long after its agent was last heard
     max_agents: int = 64  # present at a time; more are refused
     max_waiting: int = 12  # keyframes that queue to be looked up; beyond, the oldest is only stored
-    solve_every: int = 4  # where keyframes queue, the map is solved once for so many of them
 
     def __post_init__(self) -> None:
         if self.policy not in POLICIES:
             raise ValueError(f"policy: '{self.policy}' is not known; known: {', '.join(POLICIES)}")
-        _require_positive(self, "max_agents", "max_waiting", "solve_every")
+        _require_positive(self, "max_agents", "max_waiting")
 
 
 @dataclass(frozen=True)

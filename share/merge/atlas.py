@@ -26,19 +26,24 @@ from share.types import F64, Correction, Keyframe
 
 @dataclass(frozen=True)
 class Decision:
-    """What became of a loop, and why, for a person. joined: maps that became one, the survivor first."""
+    """What became of a loop, and why, for a person. joined: maps that became one, the survivor first.
+    tied: all loops that are believed since, this one and those that waited."""
 
     accepted: bool
     reason: str
     joined: tuple[str, str] | None = None
+    tied: tuple[Loop, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Applied:
-    """What a solution changed. corrections: by agent. reason: for events.jsonl."""
+    """What a solution changed. corrections: by agent. reason: for events.jsonl. tied, dropped: loops that
+    are believed since, and those that are no longer."""
 
     corrections: dict[str, Correction]
     reason: str
+    tied: tuple[Loop, ...] = ()
+    dropped: tuple[Loop, ...] = ()
 
 
 class Atlas:
@@ -69,6 +74,11 @@ class Atlas:
     def map_of(self, key: Key) -> str:
         """Raises ValueError if no such keyframe was added."""
         return self._map_name(self._trails.number(key))
+
+    def current_map(self, agent: str) -> str | None:
+        """The map that the agent's present stretch is in; None before its first keyframe."""
+        stretch = self._trails.current(agent)
+        return None if stretch is None else self._trails.name(self._founder[stretch])
 
     def maps(self) -> dict[str, list[Key]]:
         """All keyframes by map, in the order of arrival."""
@@ -169,14 +179,14 @@ class Atlas:
         for number, T in zip(job.nodes, solved.poses, strict=True):
             self._poses[number] = T
         self._extend(job.stretches, after=job.nodes[-1])
-        news = self._drop_contradicted(job, solved.loop_chi2) + self._settle_pending()
+        dropped = self._drop_contradicted(job, solved.loop_chi2)
+        tied = self._settle_pending()
         corrections = self._corrections(result)
         moved = ", ".join(corrections) or "nobody"
-        return Applied(
-            corrections,
-            f"map {job.map_id}: {len(job.nodes)} poses, {len(job.loops)} loops solved, "
-            f"corrects {moved}{news}",
-        )
+        reason = f"map {job.map_id}: {len(job.nodes)} poses, {len(job.loops)} loops solved, corrects {moved}"
+        if dropped:
+            reason += f"; dropped loops at odds with it: {', '.join(map(str, dropped))}"
+        return Applied(corrections, reason + _that_waited(tied), tied, dropped)
 
     # ------------------------------------------------------------ judging loops
 
@@ -232,11 +242,12 @@ class Atlas:
         for loop in loops:
             self._tie(loop)
         self._pending = [loop for loop in self._pending if loop not in loops]
-        reason += self._settle_pending()
+        waited = self._settle_pending()
+        reason, tied = reason + _that_waited(waited), (*loops, *waited)
         if len(before) == 1:
-            return Decision(True, reason)
+            return Decision(True, reason, tied=tied)
         survivor, gone = (self._trails.name(s) for s in before)
-        return Decision(True, f"{reason}: map {gone} joins {survivor}", (survivor, gone))
+        return Decision(True, f"{reason}: map {gone} joins {survivor}", (survivor, gone), tied)
 
     def _lay_beside(self, loop: Loop) -> None:
         """Move the younger of two maps rigidly to where the loop says."""
@@ -259,14 +270,14 @@ class Atlas:
         self._unsolved = {self._founder[f] for f in self._unsolved} | {self._founder_of(edge.a)}
         self._answers[loop.b.agent] = loop.b.id
 
-    def _settle_pending(self) -> str:
+    def _settle_pending(self) -> tuple[Loop, ...]:
         """Loops that waited between maps which are one by now are judged by it."""
         inside = [loop for loop in self._pending if self._same_map(*self._ends(loop))]
         fitting = [x for x in inside if self._fits(x)]
         self._pending = [loop for loop in self._pending if loop not in fitting]
         for loop in fitting:
             self._tie(loop)
-        return f", {len(fitting)} that waited fit too" if fitting else ""
+        return tuple(fitting)
 
     def _fits(self, loop: Loop) -> bool:
         known = self._between(*self._ends(loop))
@@ -278,13 +289,13 @@ class Atlas:
             node = self._trails.nodes[number]
             self._poses[number] = se3.orthonormal(self._poses[node.reference] @ node.T_ref_body)
 
-    def _drop_contradicted(self, job: SolveJob, chi2: F64) -> str:
+    def _drop_contradicted(self, job: SolveJob, chi2: F64) -> tuple[Loop, ...]:
         """Loops that the whole map speaks against are taken back, and the joins that hung on them."""
         gone = [i for i, x in zip(job.loop_ids, chi2, strict=True) if x > self._config.drop_chi2]
         gone = [i for i in gone if i in self._loops]
         if not gone:
-            return ""
-        names = [str(self._loops[i][0]) for i in gone]
+            return ()
+        dropped = tuple(self._loops[i][0] for i in gone)
         for i in gone:
             self._roads.remove(self._loops.pop(i)[1])
         self._find_maps()
@@ -292,7 +303,7 @@ class Atlas:
             first = self._trails.stretches[founder][0]
             self._move(founder, self._trails.nodes[first].T_odom_body @ se3.inverse(self._poses[first]))
             self._unsolved.add(founder)
-        return f"; dropped loops at odds with it: {', '.join(names)}"
+        return dropped
 
     def _corrections(self, result: SolveResult) -> dict[str, Correction]:
         out = {}
@@ -366,3 +377,7 @@ class Atlas:
             low, high = sorted(find(self._trails.nodes[n].stretch) for n in (edge.a, edge.b))
             root[high] = low
         self._founder = [find(i) for i in range(len(root))]
+
+
+def _that_waited(loops: tuple[Loop, ...]) -> str:
+    return f", {len(loops)} that waited fit too" if loops else ""
