@@ -46,7 +46,9 @@ class Equations:
         self._columns = columns[self._order]
         self._starts = np.searchsorted(rows[self._order], np.arange(n + 1))
         self._onward, self._backward = np.flatnonzero(b == a + 1), np.flatnonzero(a == b + 1)
-        self._below = np.concatenate([a[self._onward], b[self._backward]])
+        upper = np.concatenate([a[self._onward], b[self._backward]])
+        shape = n, len(upper)
+        self._next = csr_array((np.ones(len(upper)), (upper, np.arange(len(upper)))), shape=shape)
 
     def __len__(self) -> int:
         return self._n
@@ -93,10 +95,9 @@ class Equations:
 
     def _band(self, diagonal: F64, coupling: F64) -> F64:
         """LAPACK's lower band (12, 6 n) of the blocks on the diagonal and next to it."""
-        below = np.zeros((self._n, 6, 6))
         onward = np.swapaxes(coupling[self._onward], 1, 2)
-        np.add.at(below, self._below, np.concatenate([onward, coupling[self._backward]]))
-        columns = np.concatenate([diagonal, below], 1)
+        below = self._next @ np.concatenate([onward, coupling[self._backward]]).reshape(-1, 36)
+        columns = np.concatenate([diagonal, below.reshape(-1, 6, 6)], 1)
         band = np.zeros((12, 6 * self._n))
         for j in range(6):
             band[: 12 - j, j::6] = columns[:, j:, j].T
