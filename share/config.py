@@ -11,7 +11,7 @@ import dataclasses
 import difflib
 import types as _types
 import typing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
 from share.errors import ConfigError
@@ -207,9 +207,12 @@ class GraphConfig:
     max_iterations: int = 100  # of Levenberg-Marquardt
     relative_tolerance: float = 1e-6  # of the cost, between two iterations
     anchor_sigma: float = 1e-4  # rad and m; holds the gauge, removed again after solving
+    step_tolerance: float = 1e-3  # rad and m; solved once no pose is moved by more
+    inner_tolerance: float = 1e-2  # of the residual of a step's equations, relative
+    covariance_edges: int = 250  # the surest, by which covariances are told; more: tighter and slower
 
     def __post_init__(self) -> None:
-        _require_positive(self, "cauchy", "max_iterations", "relative_tolerance", "anchor_sigma")
+        _require_positive(self, *(setting.name for setting in fields(self)))
 
 
 @dataclass(frozen=True)
