@@ -18,9 +18,9 @@ from share.core.finding import Finding
 from share.core.keeping import Change, DropLoop, KeepLoop
 from share.core.lookups import Lookups
 from share.core.steps import Look, Query, Solve, Step, Verify
+from share.graph.change import Solution
 from share.merge.atlas import Atlas
 from share.merge.join import Key, Loop
-from share.merge.solving import SolveResult
 from share.metrics.latency import summary
 from share.place.index import PlaceIndex
 from share.place.verify import Refusal, Sight, Verified
@@ -95,7 +95,7 @@ class Mapper:
         if not due:
             return None
         self._solving = True
-        return Solve(self._atlas.snapshot(due[0]), self._config.graph)
+        return Solve(self._atlas.snapshot(due[0]))
 
     def done(self, step: Step, result: Any, ms: float) -> list[Finding]:
         """What follows from a step's result; an exception as the result costs that step only."""
@@ -114,11 +114,17 @@ class Mapper:
                 return []
             case Verify() if isinstance(result, dict):
                 return [f for n, outcome in result.items() for f in self._judge(step.number, n, outcome)]
-            case Solve() if isinstance(result, SolveResult):
-                return self._solved(result)
+            case Solve() if isinstance(result, Solution):
+                return self._solved(step, result)
+            case Solve():
+                self._atlas.solver_lost()
         self._counts["failed_jobs"] += 1
         agent = self._keys[0 if isinstance(step, Solve) else step.number].agent
         return [Finding(agent, "job failed", f"{step.kind}: {type(result).__name__}: {result}")]
+
+    def solver_lost(self) -> None:
+        """The solver knows nothing any more."""
+        self._atlas.solver_lost()
 
     def take_changes(self) -> tuple[Change, ...]:
         """What has to be kept since the last call."""
@@ -142,6 +148,7 @@ class Mapper:
             return [Finding(b.agent, "loop refused", f"{a} - {b}: {outcome.reason}")]
         decision = self._atlas.propose(Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers))
         reason = f"{decision.reason} ({outcome.reason})"
+        self._changes += [DropLoop(loop.a, loop.b) for loop in decision.dropped]
         self._changes += [KeepLoop(loop) for loop in decision.tied]
         if not decision.accepted:
             return [Finding(b.agent, "loop not taken", reason)]
@@ -150,10 +157,10 @@ class Mapper:
         what = "maps joined" if decision.joined else "loop accepted"
         return [Finding(b.agent, what, reason)]
 
-    def _solved(self, result: SolveResult) -> list[Finding]:
-        applied = self._atlas.apply(result)
-        self._changes += [KeepLoop(loop) for loop in applied.tied]
+    def _solved(self, step: Solve, solution: Solution) -> list[Finding]:
+        applied = self._atlas.apply(step.job, solution)
         self._changes += [DropLoop(loop.a, loop.b) for loop in applied.dropped]
+        self._changes += [KeepLoop(loop) for loop in applied.tied]
         return [
             Finding(agent, "correction", applied.reason, correction)
             for agent, correction in applied.corrections.items()
@@ -174,7 +181,7 @@ class Mapper:
                 "in_map": len(self._atlas.loops),
             },
             "merges": {"requested": merges, "skipped": 0, "done": merges},
-            "maps": {map_id: len(keys) for map_id, keys in self._atlas.maps().items()},
+            "maps": self._atlas.sizes(),
             "waiting": len(self._lookups),
             "failed_jobs": self._counts["failed_jobs"],
             **{f"{kind}_ms": summary(ms).report() for kind, ms in self._ms.items()},

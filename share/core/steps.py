@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from share.config import GraphConfig, PlaceConfig
-from share.merge.solving import SolveJob, SolveResult, run_job
+from share.config import PlaceConfig
+from share.graph.change import Solution
+from share.graph.solver import Solver
+from share.merge.solving import SolveJob
 from share.place.index import Candidate, PlaceIndex
 from share.place.verify import Refusal, Sight, Verified, verify
 
@@ -51,11 +53,13 @@ class Solve:
     """Where was everybody?"""
 
     job: SolveJob
-    config: GraphConfig
     kind: str = "solve"
 
-    def run(self) -> SolveResult:
-        return run_job(self.job, self.config)
+    def run(self, solver: Solver) -> Solution:
+        if self.job.anew:
+            solver.clear()
+        solver.update(self.job.change)
+        return solver.solve(self.job.anchor, self.job.last)
 
 
 Look = Query | Verify

@@ -26,6 +26,10 @@ class Solver:
 
     def __init__(self, config: GraphConfig) -> None:
         self._config = config
+        self.clear()
+
+    def clear(self) -> None:
+        """Know nothing any more."""
         nothing = Change.of({})
         self._numbers, self._poses = nothing.numbers, nothing.poses  # numbers rise
         self._ids, self._edges = nothing.edge_ids, _edges_of(nothing)  # their ends are numbers

@@ -6,13 +6,15 @@ import queue
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-from share.config import Config
+from share.config import Config, GraphConfig
 from share.core.edge import Add, Found, Join
 from share.core.finding import Finding
 from share.core.mapper import Mapper
-from share.core.steps import Solve, Step
+from share.core.steps import Solve
+from share.graph.solver import Solver
 from share.run.companion import END, Companion, Inbox
 
 _REPORT_S = 1.0
@@ -34,7 +36,6 @@ class _Lost:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    step: Solve
     result: object
     ms: float
 
@@ -46,7 +47,7 @@ def map_all(inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> No
 
 class _Mapping:
     def __init__(self, inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
-        self._inbox, self._answer = inbox, answer
+        self._inbox, self._answer, self._settings = inbox, answer, settings
         self._mapper = Mapper(settings)
         self._solver = self._new_solver()
         self._solving: Solve | None = None
@@ -62,7 +63,7 @@ class _Mapping:
             self._give_solver()
             look = self._mapper.next_look()
             if look is not None:
-                self._findings += self._mapper.done(look, *_timed(look))
+                self._findings += self._mapper.done(look, *_timed(look.run))
             self._tell()
         self._solver.close()
         self._answer(Mapped(self._mapper.report()))
@@ -83,8 +84,7 @@ class _Mapping:
             case Add():
                 self._findings += self._mapper.add(message.key, message.keyframe)
             case _Solved():
-                self._solving = None
-                self._findings += self._mapper.done(message.step, message.result, message.ms)
+                self._solved(message.result, message.ms)
             case _Lost():
                 self._replace_solver(message.how)
             case _ if message is END:
@@ -96,16 +96,24 @@ class _Mapping:
             self._solving = step
             self._solver.send(step)
 
+    def _solved(self, result: object, ms: float) -> None:
+        step, self._solving = self._solving, None
+        if step is not None:
+            self._findings += self._mapper.done(step, result, ms)
+
     def _new_solver(self) -> Companion:
-        return Companion("solver", solve_all, (), self._inbox.put, lambda how: self._inbox.put(_Lost(how)))
+        return Companion("solver", solve_all, (self._settings.graph,), self._inbox.put, self._solver_lost)
+
+    def _solver_lost(self, how: str) -> None:
+        """From another thread."""
+        self._inbox.put(_Lost(how))
 
     def _replace_solver(self, how: str) -> None:
-        """It costs the solution that it was at, and no more."""
+        """It costs the solution that it was at, and telling it all again."""
         self._solver.close()
         self._solver = self._new_solver()
-        if self._solving is not None:
-            step, self._solving = self._solving, None
-            self._findings += self._mapper.done(step, RuntimeError(f"the solver {how}"), 0.0)
+        self._mapper.solver_lost()
+        self._solved(RuntimeError(f"the solver {how}"), 0.0)
 
     def _tell(self) -> None:
         changes = self._mapper.take_changes()
@@ -117,17 +125,18 @@ class _Mapping:
             self._answer(Mapped(self._mapper.report()))
 
 
-def solve_all(inbox: Inbox, answer: Callable[[Any], None]) -> None:
+def solve_all(inbox: Inbox, answer: Callable[[Any], None], settings: GraphConfig) -> None:
     """For a `Companion`: takes Solve, answers with what came of it, until END."""
+    solver = Solver(settings)
     while (step := inbox.get()) is not END:
-        answer(_Solved(step, *_timed(step)))
+        answer(_Solved(*_timed(partial(step.run, solver))))
 
 
-def _timed(step: Step) -> tuple[object, float]:
+def _timed(work: Callable[[], object]) -> tuple[object, float]:
     began = time.perf_counter()
     result: object
     try:
-        result = step.run()
+        result = work()
     except Exception as error:  # a step that fails costs its keyframe, never the edge
         result = error
     return result, 1e3 * (time.perf_counter() - began)

@@ -15,8 +15,9 @@ from share.core import events as ev
 from share.core.agent import Agent
 from share.core.finding import Finding
 from share.core.mapper import Mapper
-from share.core.steps import Step
+from share.core.steps import Solve, Step
 from share.geometry import se3
+from share.graph.solver import Solver
 from share.types import F64, U8, AgentKind, Candidate, Keyframe, TrackState, View
 from share.wire.codec import decode
 from share.wire.messages import Hello, peer_id
@@ -95,6 +96,7 @@ class ModelRun:
     def __init__(self, config: Config, session: int) -> None:
         self.machine = ed.Edge(config, session)
         self.mapper = Mapper(config)
+        self.solver = Solver(config.graph)
 
     def report(self) -> dict[str, Any]:
         return self.machine.report(self.mapper.report())
@@ -182,7 +184,7 @@ class Town:
             self._in(0, lambda: self.to_edge(found) if self.edge is edge else None)
         for step in (edge.mapper.next_look(), edge.mapper.next_solve()):
             if step is not None:
-                result = step.run()
+                result = step.run(edge.solver) if isinstance(step, Solve) else step.run()
                 self._in(self._job_ns, lambda step=step, result=result: self._done(edge, step, result))
 
     def _done(self, edge: ModelRun, step: Step, result: object) -> None:
