@@ -8,13 +8,14 @@ False. What must arrive is sent again by the one who cares (`share.core.ledger`)
 
 from __future__ import annotations
 
+import errno
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import Protocol
 
-from share.errors import UsageError
+from share.errors import TransportError, UsageError
 from share.io.keys import AgentKeys, EdgeKeys
 from share.wire.codec import Bytes
 
@@ -106,6 +107,17 @@ def parse_address(text: str, bind: bool = False) -> Address:
         )
     host = match[1] or match[2]
     return Address("127.0.0.1" if host == "localhost" else host, int(match[3]))
+
+
+def bind_error(target: Address, number: int | None, text: str) -> TransportError:
+    """Why nothing can listen at `target`: errno `number`, which the system calls `text`."""
+    mend = {
+        errno.EADDRINUSE: "the port is in use; stop the other edge or choose another port",
+        errno.EACCES: "this port needs root; choose one above 1023",
+        errno.EADDRNOTAVAIL: "this machine has no such address",
+        errno.ENODEV: "this machine has no such address",
+    }
+    return TransportError(f"{target}: {mend.get(number or 0, f'cannot be bound: {text}')}")
 
 
 def check_keys(target: Address, keys: AgentKeys | EdgeKeys | None) -> Address:

@@ -6,7 +6,6 @@ With keys, CURVE (RFC 26) encrypts and proves who is who; the edge's doorkeeper 
 from __future__ import annotations
 
 import contextlib
-import errno
 import socket
 import time
 from collections.abc import Iterator, Sequence
@@ -15,7 +14,7 @@ import zmq
 
 from share.errors import TransportError, UsageError
 from share.io.keys import AgentKeys, EdgeKeys
-from share.io.transport import LINGER_MS, QUEUE_MESSAGES, Address, check_keys, parse_address
+from share.io.transport import LINGER_MS, QUEUE_MESSAGES, Address, bind_error, check_keys, parse_address
 from share.io.transport.handshake import Handshakes, Outcome
 from share.io.transport.zap import Doorkeeper
 from share.wire.codec import MAX_ARRAYS, MAX_FRAME_BYTES, Bytes
@@ -226,7 +225,7 @@ class ZmqEdgeLink:
             socket.bind(str(self._target))
         except zmq.ZMQError as error:
             self.close()
-            raise _bind_error(self._target, error) from None
+            raise bind_error(self._target, error.errno, error.strerror) from None
         bound = parse_address(socket.get_string(zmq.LAST_ENDPOINT).rstrip("\0"))
         self._target = Address(self._target.host, bound.port)
 
@@ -239,13 +238,3 @@ class ZmqEdgeLink:
         self._link.close(linger_ms)
         if self._door is not None:
             self._door.join()
-
-
-def _bind_error(target: Address, error: zmq.ZMQError) -> TransportError:
-    mend = {
-        errno.EADDRINUSE: "the port is in use; stop the other edge or choose another port",
-        errno.EACCES: "this port needs root; choose one above 1023",
-        errno.EADDRNOTAVAIL: "this machine has no such address",
-        errno.ENODEV: "this machine has no such address",
-    }
-    return TransportError(f"{target}: {mend.get(error.errno or 0, f'cannot be bound: {error.strerror}')}")

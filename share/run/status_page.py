@@ -1,0 +1,132 @@
+"""The page for people: asks for /snapshot.json each second and shows it. Needs nothing from elsewhere."""
+
+from __future__ import annotations
+
+# Whatever comes from outside, names above all, is set as text and never as HTML.
+PAGE = """<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>SHARE edge</title>
+<style>
+:root { color-scheme: light dark; --line: #8884; --dim: #888; --bad: #d22; --good: #293 }
+body { font: 15px/1.45 system-ui, sans-serif; margin: 0 auto; max-width: 62rem; padding: 1rem }
+header { display: flex; flex-wrap: wrap; align-items: baseline; gap: .2rem 1rem }
+h1 { font-size: 1.25rem; margin: 0 }
+h2 { font-size: 1rem; margin: 1.4rem 0 .3rem }
+header span, td.none { color: var(--dim) }
+#mark { font-weight: 600; color: var(--good) }
+.bad, #mark.bad { color: var(--bad) }
+#trouble { margin: .5rem 0 0; padding-left: 1.2rem; color: var(--bad); overflow-wrap: anywhere }
+.wide { overflow-x: auto }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums }
+th, td { padding: .25rem .75rem .25rem 0; text-align: right; white-space: nowrap }
+th { color: var(--dim); font-weight: 500; border-bottom: 1px solid var(--line) }
+td { border-bottom: 1px solid var(--line) }
+.words th:nth-child(-n+3), .words td:nth-child(-n+3), th:first-child, td:first-child { text-align: left }
+td:first-child { max-width: 14rem; overflow: hidden; text-overflow: ellipsis }
+#maps th:last-child, #maps td:last-child { text-align: left; white-space: normal }
+tr.gone { color: var(--dim) }
+.stale { opacity: .45 }
+@media (max-width: 40rem) {
+  body { font-size: 13px; padding: .7rem }
+  th, td { padding-right: .5rem }
+  td:first-child { max-width: 6.5rem }
+}
+</style>
+<header><h1>SHARE edge</h1><b id="mark">…</b><span id="about"></span></header>
+<ul id="trouble"></ul>
+<main>
+<h2>Agents</h2><div class="wide"><table id="agents" class="words"></table></div>
+<h2>Maps</h2><div class="wide"><table id="maps"></table></div>
+<h2>Loops</h2><div class="wide"><table id="loops"></table></div>
+<h2>Times, ms</h2><div class="wide"><table id="times"></table></div>
+</main>
+<script>
+"use strict";
+const at = id => document.getElementById(id);
+const entries = x => Object.entries(x ?? {});
+const shown = x => x === null || x === undefined || x === "" ? "–" : String(x);
+const fixed = (x, n) => Number.isFinite(x) ? x.toFixed(n) : "–";
+
+function node(tag, text, kind) {
+  const made = document.createElement(tag);
+  made.textContent = text;
+  if (kind) made.className = kind;
+  return made;
+}
+
+function table(id, head, rows) {
+  const body = rows.map(({cells, kind}) => {
+    const row = node("tr", "", kind);
+    row.append(...cells.map(c => c instanceof Node ? c : node("td", shown(c))));
+    return row;
+  });
+  if (!body.length) body.push(node("td", "none yet", "none"));
+  const top = node("tr", "");
+  top.append(...head.map(h => node("th", h)));
+  at(id).replaceChildren(...(rows.length ? [top] : []), ...body);
+}
+
+function lasted(s) {
+  if (typeof s !== "number") return "–";
+  const [h, m] = [Math.floor(s / 3600), Math.floor(s / 60) % 60];
+  return h ? `${h} h ${m} min` : m ? `${m} min ${Math.floor(s) % 60} s` : `${Math.floor(s)} s`;
+}
+
+let before = null;
+function rate(name, agent, now) {
+  const old = before?.agents[name];
+  if (!old || old.run_id !== agent.run_id || before.session !== now.session) return "–";
+  const bytes = agent.bytes_up + agent.bytes_down - old.bytes_up - old.bytes_down;
+  return fixed(bytes / (now.uptime_s - before.uptime_s) / 1000, 1);
+}
+
+function mark(text, bad) {
+  at("mark").textContent = text;
+  at("mark").className = bad ? "bad" : "";
+}
+
+function show(now) {
+  const trouble = now.trouble ?? [];
+  mark(trouble.length ? "trouble" : "ok", trouble.length);
+  at("trouble").replaceChildren(...trouble.map(t => node("li", t)));
+  const about = [`up ${lasted(now.uptime_s)}`];
+  if (now.queue !== undefined) about.push(`queue ${shown(now.queue)}`);
+  if (typeof now.last_solve_s === "number") about.push(`solved ${lasted(now.last_solve_s)} ago`);
+  if (now.failed_jobs) about.push(`failed jobs ${now.failed_jobs}`);
+  at("about").textContent = [...about, now.policy, now.version].filter(Boolean).join(" · ");
+  const agents = entries(now.agents).sort(([a, x], [b, y]) => x.gone - y.gone || (a < b ? -1 : 1));
+  table("agents", ["name", "kind", "state", "keyframes", "corrections", "map", "kB/s", "loops"],
+    agents.map(([name, a]) => ({kind: a.gone ? "gone" : "", cells: [
+      name, a.kind, node("td", a.gone ? "gone" : shown(a.state), !a.gone && a.state === "LOST" ? "bad" : ""),
+      a.keyframes, a.corrections, a.map_id, a.gone ? "–" : rate(name, a, now),
+      `${shown(a.loops?.accepted)} of ${shown(a.loops?.tried)}`]})));
+  table("maps", ["map", "keyframes", "agents"], entries(now.maps).map(([id, count]) => ({cells: [
+    id, typeof count === "object" ? count?.keyframes : count,
+    agents.filter(([, a]) => String(a.map_id) === id).map(([name]) => name).join(", ")]})));
+  const loops = now.loops ?? {};
+  table("loops", ["tried", "accepted", "waiting for a witness", "in the maps", "merges"],
+    now.loops ? [{cells: [loops.tried, loops.accepted, loops.waiting, loops.in_map, now.merges?.done]}] : []);
+  table("times", ["step", "p50", "p95", "max", "times"],
+    entries(now).filter(([k, t]) => k.endsWith("_ms") && t && "p50" in t).map(([k, t]) => ({cells: [
+      k.slice(0, -3), fixed(t.p50, 1), fixed(t.p95, 1), fixed(t.max, 1), t.n]})));
+  before = now;
+}
+
+async function refresh() {
+  try {
+    const answer = await fetch("snapshot.json", {signal: AbortSignal.timeout(4000)});
+    if (!answer.ok) throw new Error((await answer.text()).trim());
+    show(await answer.json());
+    document.querySelector("main").className = "";
+  } catch (error) {
+    mark(error instanceof TypeError || error.name === "TimeoutError" ? "no answer" : error.message, true);
+    document.querySelector("main").className = "stale";
+  }
+  setTimeout(refresh, 1000);
+}
+refresh();
+</script>
+</html>
+"""

@@ -1,0 +1,373 @@
+"""What `share edge --http` serves, asked over real sockets."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import socket
+import threading
+import time
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from share.config import Config
+from share.core.edge import Edge, Received
+from share.errors import TransportError, UsageError
+from share.run import status_metrics, web
+from share.run.status import KEPT_S, StatusServer
+from share.types import AgentKind
+from share.wire.codec import encode
+from share.wire.messages import Hello, peer_id
+
+AGENT = {
+    "kind": "ar",
+    "run_id": 7,
+    "state": "OK",
+    "gone": False,
+    "keyframes": 12,
+    "bytes_up": 34567,
+    "loops": {"tried": 9, "accepted": 4},
+    "map_id": 0,
+}
+TIMES = {"n": 4, "mean": 20.0, "p50": 10.0, "p95": 30.0, "p99": 40.0, "max": 50.0}
+REPORT = {
+    "agents": {"ann": AGENT, "bob": {**AGENT, "kind": "robot", "gone": True, "map_id": None}},
+    "maps": {0: 12, 3: 1},
+    "failed_jobs": 2,
+    "solve_ms": TIMES,
+}
+
+
+@contextmanager
+def serving(report=lambda: REPORT, address="127.0.0.1:0", tell=lambda text: None):
+    server = StatusServer(address, report, tell)
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def get(server, path, method="GET", headers=None):
+    """Status, headers and body."""
+    connection = http.client.HTTPConnection(server.endpoint, timeout=10)
+    try:
+        connection.request(method, path, headers=headers or {})
+        answer = connection.getresponse()
+        return answer.status, answer.headers, answer.read()
+    finally:
+        connection.close()
+
+
+def said(server, request: bytes) -> bytes:
+    """All that is answered to these bytes."""
+    host, _, port = server.endpoint.rpartition(":")
+    with socket.create_connection((host, int(port)), timeout=10) as client:
+        client.sendall(request)
+        return b"".join(iter(lambda: client.recv(65536), b""))
+
+
+def metrics(body):
+    """Every sample by its name and labels."""
+    return {
+        (sample.name, frozenset(sample.labels.items())): sample.value
+        for family in text_string_to_metric_families(body.decode())
+        for sample in family.samples
+    }
+
+
+def real_report():
+    """Of an edge that knows one agent and nothing more."""
+    edge = Edge(Config(), session=5)
+    hello = Hello("ann", AgentKind.AR, 1, 400.0, np.eye(4))
+    edge.handle(Received(peer_id(1), encode(hello)), 10**9)
+    return edge.report()
+
+
+# ---------------------------------------------------------------- what is served
+
+
+def test_health_says_who_is_there():
+    with serving(lambda: {**REPORT, "queue": 3, "last_solve_s": 0.5}) as server:
+        status, headers, body = get(server, "/health")
+    assert (status, headers["Content-Type"]) == (200, "application/json")
+    health = json.loads(body)
+    assert 0 <= health.pop("uptime_s") < 60
+    expected = {"status": "ok", "trouble": [], "agents": ["ann"], "queue": 3, "last_solve_s": 0.5}
+    assert health == expected
+
+
+def test_health_is_503_where_something_is_wrong():
+    trouble = ["the map file cannot be written"]
+    with serving(lambda: {**REPORT, "trouble": trouble}) as server:
+        status, _, body = get(server, "/health")
+    assert status == 503
+    assert json.loads(body)["status"] == "trouble" and json.loads(body)["trouble"] == trouble
+
+
+def test_snapshot_is_the_report_and_its_age():
+    with serving() as server:
+        status, headers, body = get(server, "/snapshot.json?now")
+    snapshot = json.loads(body)
+    assert status == 200 and snapshot.pop("uptime_s") >= 0
+    assert snapshot == json.loads(json.dumps(REPORT))
+    assert headers["Access-Control-Allow-Origin"] is None and headers["Set-Cookie"] is None
+
+
+def test_metrics_are_read_back():
+    with serving() as server:
+        status, headers, body = get(server, "/metrics")
+    assert status == 200
+    assert headers["Content-Type"] == "text/plain; version=0.0.4; charset=utf-8"
+    read = metrics(body)
+    ann, bob = {("agent", "ann"), ("kind", "ar")}, {("agent", "bob"), ("kind", "robot")}
+    for name, labels, value in [
+        ("share_edge_keyframes_total", ann, 12),
+        ("share_edge_received_bytes_total", bob, 34567),
+        ("share_edge_loops_accepted_total", ann, 4),
+        ("share_edge_agent_gone", ann, 0),
+        ("share_edge_agent_gone", bob, 1),
+        ("share_edge_agent_info", ann | {("state", "OK"), ("map", "0")}, 1),
+        ("share_edge_agent_info", bob | {("state", "OK"), ("map", "")}, 1),
+        ("share_edge_maps", set(), 2),
+        ("share_edge_map_keyframes", {("map", "3")}, 1),
+        ("share_edge_failed_jobs_total", set(), 2),
+        ("share_edge_job_seconds", {("job", "solve"), ("quantile", "0.95")}, 0.03),
+        ("share_edge_job_seconds_count", {("job", "solve")}, 4),
+        ("share_edge_job_seconds_sum", {("job", "solve")}, 0.08),
+    ]:
+        assert read[name, frozenset(labels)] == pytest.approx(value), name
+
+
+def test_what_the_report_lacks_is_left_out():
+    odd = {"agents": {"ann": {"keyframes": "many"}, "bob": None}, "maps": 3, "loops": None, "x_ms": {"n": 0}}
+    for report in ({}, odd):
+        body, _ = status_metrics.text(report)
+        assert all(value == value for value in metrics(body).values())
+
+
+def test_all_that_an_edge_reports_is_in_a_metric():
+    body, _ = status_metrics.text({**real_report(), "uptime_s": 1.0, "queue": 0, "trouble": []})
+    names = {name for name, _ in metrics(body)}
+    absent = {row.name for row in status_metrics.ROWS} - names
+    by_others = {"share_edge_last_solve_age_seconds", "share_edge_refused_handshakes_total"}
+    not_yet = {"share_edge_map_keyframes", "share_edge_stranger_bad_messages_total"}
+    assert absent <= by_others | not_yet
+
+
+def test_names_and_units_are_as_prometheus_wants_them():
+    for row in status_metrics.ROWS:
+        assert re.fullmatch(r"share_edge(_[a-z]+)+", row.name)
+        assert row.help.endswith(".") and len({r.name for r in status_metrics.ROWS}) == len(
+            status_metrics.ROWS
+        )
+
+
+def test_every_metric_is_in_the_documentation():
+    page = (Path(__file__).parents[2] / "docs" / "status.md").read_text()
+    assert [
+        r.name for r in status_metrics.ROWS if f"`{r.name.removeprefix('share_edge_')}`" not in page
+    ] == []
+
+
+@pytest.mark.parametrize("name", ['a"b', "a\nb", "a\\b", "änn 漢字", "<img src=x>", "{}"])
+def test_any_name_comes_through(name):
+    with serving(lambda: {"agents": {name: AGENT}}) as server:
+        samples = metrics(get(server, "/metrics")[2])
+        assert samples["share_edge_keyframes_total", frozenset({("agent", name), ("kind", "ar")})] == 12
+        assert json.loads(get(server, "/health")[2])["agents"] == [name]
+
+
+def test_the_page_needs_nothing_from_elsewhere():
+    with serving() as server:
+        status, headers, body = get(server, "/")
+    page = body.decode()
+    assert status == 200 and headers["Content-Type"].startswith("text/html") and len(body) < 8192
+    assert not re.search(r"https?://|(src|href)=|innerHTML|@import|url\(", page)
+    assert "default-src 'none'" in headers["Content-Security-Policy"]
+    assert 'fetch("snapshot.json"' in page
+
+
+# ---------------------------------------------------------------- what goes wrong
+
+
+def test_a_report_that_raises_is_500_and_said_once():
+    told = []
+
+    def report():
+        raise RuntimeError("the map\nis gone")
+
+    with serving(report, tell=told.append) as server:
+        answers = [get(server, path) for path in ("/health", "/metrics", "/snapshot.json", "/health")]
+        assert get(server, "/")[0] == 200
+    assert {(status, body) for status, _, body in answers} == {
+        (500, b"no report: RuntimeError: the map is gone\n")
+    }
+    assert told == ["status: no report: RuntimeError: the map is gone"]
+
+
+def test_a_report_that_is_no_json_is_500():
+    with serving(lambda: {"x": float("nan")}) as server:
+        assert get(server, "/snapshot.json")[0] == 500
+
+
+def test_it_recovers():
+    fail = [True]
+
+    def report():
+        if fail:
+            raise RuntimeError("not yet")
+        return REPORT
+
+    with serving(report) as server:
+        assert get(server, "/health")[0] == 500
+        fail.clear()
+        time.sleep(1.5 * KEPT_S)
+        assert get(server, "/health")[0] == 200
+
+
+def test_the_edge_is_not_asked_for_each_of_many():
+    asked = []
+    with serving(lambda: asked.append(1) or REPORT) as server:
+        began = time.monotonic()
+        for _ in range(50):
+            assert get(server, "/metrics")[0] == 200
+        most = 2 + (time.monotonic() - began) / KEPT_S
+    assert 1 <= len(asked) <= most
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "TRACE"])
+def test_nothing_but_get_and_head(method):
+    with serving() as server:
+        status, headers, _ = get(server, "/health", method)
+    assert status == 405 and headers["Allow"] == "GET, HEAD"
+
+
+def test_head_has_no_body():
+    with serving() as server:
+        status, headers, body = get(server, "/snapshot.json", "HEAD")
+        assert (status, body) == (200, b"") and int(headers["Content-Length"]) > 100
+
+
+@pytest.mark.parametrize("path", ["/nothing", "/../etc/passwd", "/health/", "//", "*", "/%2e%2e/"])
+def test_there_is_nothing_else(path):
+    with serving() as server:
+        assert get(server, path)[0] == 404
+
+
+def test_a_large_request_is_refused():
+    with serving() as server:
+        status, _, body = get(server, "/health", headers={"X": "y" * 9000})
+        assert status == 431 and b"8192" in body
+        assert said(server, b"A" * 60000).startswith(b"HTTP/1.1 431 ")
+        assert get(server, "/health")[0] == 200
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [b"hello\r\n\r\n", b"GET /\r\n\r\n", b"\r\n\r\n", b"GET / HTTP/3\n\n", b"\x16\x03\x01\n\n\xff"],
+)
+def test_what_is_no_http_is_refused(request_):
+    with serving() as server:
+        assert said(server, request_).startswith(b"HTTP/1.1 400 ")
+
+
+def test_a_request_may_come_in_pieces():
+    with serving() as server:
+        host, _, port = server.endpoint.rpartition(":")
+        with socket.create_connection((host, int(port)), timeout=10) as client:
+            for piece in (b"GET /hea", b"lth HTTP/1.0\r\n", b"\r", b"\n"):
+                client.sendall(piece)
+                time.sleep(0.02)
+            assert client.recv(15) == b"HTTP/1.1 200 OK"
+
+
+def test_slow_clients_hold_nobody_up(monkeypatch):
+    monkeypatch.setattr(web, "PATIENCE_S", 0.5)
+    with serving() as server:
+        host, _, port = server.endpoint.rpartition(":")
+        threads = threading.active_count()
+        slow = [socket.create_connection((host, int(port)), timeout=10) for _ in range(3 * web.CONNECTIONS)]
+        for _ in range(8):
+            for client in slow:
+                with suppress(ConnectionError):
+                    client.send(b"G")
+            began = time.monotonic()
+            assert get(server, "/health")[0] == 200
+            assert time.monotonic() - began < 0.4
+            assert threading.active_count() == threads
+            time.sleep(0.1)
+        for client in slow:  # 0.8 s have passed
+            with suppress(ConnectionError):
+                assert client.recv(1) == b""
+            client.close()
+
+
+def test_who_does_not_take_the_answer_is_dropped(monkeypatch):
+    monkeypatch.setattr(web, "PATIENCE_S", 0.5)
+    with serving(lambda: {"x": "y" * 20_000_000, "agents": {}}) as server:
+        host, _, port = server.endpoint.rpartition(":")
+        with socket.create_connection((host, int(port)), timeout=10) as lazy:
+            lazy.sendall(b"GET /snapshot.json HTTP/1.1\r\n\r\n")
+            time.sleep(0.2)
+            assert get(server, "/health")[0] == 200
+            assert len(get(server, "/snapshot.json")[2]) > 20_000_000
+            time.sleep(0.8)
+            got = 0
+            with suppress(ConnectionError):
+                while more := lazy.recv(1 << 20):
+                    got += len(more)
+            assert got < 20_000_000
+
+
+# ---------------------------------------------------------------- where it listens
+
+
+def test_a_port_alone_is_of_this_machine_alone():
+    with serving(address="0") as server:
+        assert server.endpoint.startswith("127.0.0.1:") and get(server, "/health")[0] == 200
+
+
+def test_ipv6_and_localhost():
+    for address in ("[::1]:0", "localhost:0"):
+        with serving(address=address) as server:
+            assert get(server, "/health")[0] == 200
+
+
+@pytest.mark.parametrize("address", ["", "host", ":8080", "127.0.0.1:70000", "http://127.0.0.1:80", "a b:1"])
+def test_what_is_no_address(address):
+    with pytest.raises(UsageError, match="expected HOST:PORT"):
+        StatusServer(address, lambda: REPORT)
+
+
+def test_a_port_in_use_is_said():
+    with serving() as server, pytest.raises(TransportError, match="port is in use"):
+        StatusServer(server.endpoint, lambda: REPORT)
+
+
+def test_an_address_of_nobody_is_said():
+    with pytest.raises(TransportError, match="this machine has no such address"):
+        StatusServer("192.0.2.1:0", lambda: REPORT)
+
+
+def test_a_page_from_elsewhere_cannot_ask_this_machine():
+    with serving() as server:
+        assert get(server, "/health", headers={"Host": "evil.example:80"})[0] == 403
+        for host in ("localhost", "LocalHost:80", "127.0.0.1:1", "[::1]:80"):
+            assert get(server, "/health", headers={"Host": host})[0] == 200
+
+
+def test_closed_it_is_gone_and_its_port_free():
+    with serving() as server:
+        endpoint = server.endpoint
+        get(server, "/health")
+    server.close()
+    with pytest.raises(ConnectionError):
+        get(server, "/health")
+    assert "web" not in {thread.name for thread in threading.enumerate()}
+    with serving(address=endpoint) as again:
+        assert again.endpoint == endpoint
