@@ -43,8 +43,7 @@ def guess(state: State, px: F32, known_px: F32) -> Guess:
         each = np.ones(N)
         return Guess(ROOM * each, DIFFER * ROOM * each, np.zeros((N, 0)), ROOMS * ROOM * each)
     here = inverse_depths(state)
-    at = state.features_at + np.arange(M)
-    unsure = state.cov[at, at] / here**2
+    unsure = state.rho_variance / here**2
     apart = ((px[:, None] - known_px[None]) ** 2).sum(axis=2)
     weight = 1 / (apart + _NEAR_PX**2) / (unsure + DIFFER**2)
     weight /= weight.sum(axis=1, keepdims=True)

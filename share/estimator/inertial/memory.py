@@ -37,8 +37,7 @@ class Memory:
 
     def sleep(self, state: State, looks: Looks, which: I64) -> None:
         """Remember features number `which` of the state if their depth is known."""
-        at = state.features_at + which
-        sigma = _FORGETFUL * np.sqrt(state.cov[at, at])
+        sigma = _FORGETFUL * np.sqrt(state.rho_variance[which])
         known = (sigma < _KNOWN * np.abs(state.rho[which])) | (sigma < 0.003)
         known &= looks.age[which] >= 5
         for host in np.unique(state.host[which[known]]):

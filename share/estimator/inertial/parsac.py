@@ -85,8 +85,8 @@ class _Fit:
     def __init__(self, state: State, rows: Sight) -> None:
         prior = ekf.motion_since(state) + np.diag(_FLOOR)
         J = rows.core[:, :, POSE] @ se3.adjoint(state.T) @ np.linalg.cholesky(prior)
-        at = state.features_at + rows.which
-        rho = rows.by_rho[:, :, None] * rows.by_rho[:, None, :] * state.cov[at, at][:, None, None]
+        rho_variance = state.rho_variance[rows.which, None, None]
+        rho = rows.by_rho[:, :, None] * rows.by_rho[:, None, :] * rho_variance
         lasts = state.lasting_at + 2 * rows.which[:, None] + (0, 1)
         own: F64 = rho + state.cov[lasts[:, :, None], lasts[:, None, :]]
         white = np.linalg.inv(np.linalg.cholesky(own + rows.sigma[:, None, None] ** 2 * np.eye(2)))

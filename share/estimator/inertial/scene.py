@@ -85,8 +85,7 @@ class Scene:
         T_cam_odom = se3.inverse(s.T @ s.T_body_cam)
         R = T_cam_odom @ s.poses[s.host] @ s.T_body_cam
         z = (R[:, 2, :3] * rays(s.ray)).sum(axis=1) / np.maximum(s.rho, _FARTHEST) + R[:, 2, 3]
-        variance = np.diag(s.cov)[s.features_at : s.lasting_at]
-        sure = (variance < (_SURE * s.rho) ** 2) | measures_depth(frame, self._rig)
+        sure = (s.rho_variance < (_SURE * s.rho) ** 2) | measures_depth(frame, self._rig)
         return self.looks.px[sure], np.maximum(z, _NEAREST_M)[sure]
 
     def _shun(self, px: F32) -> None:
@@ -125,9 +124,7 @@ class Scene:
 
     def _vague(self) -> NDArray[np.bool_]:
         """Which features' depth (N,) is hardly known, nor therefore where they should be."""
-        out: NDArray[np.bool_] = (
-            np.diag(self.state.cov)[self.state.features_at : self.state.lasting_at] > _VAGUE**2
-        )
+        out: NDArray[np.bool_] = self.state.rho_variance > _VAGUE**2
         return out
 
     def _add_features(self, frame: Frame, host: int) -> None:

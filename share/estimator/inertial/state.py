@@ -68,6 +68,11 @@ class State:
         """The first column of the first feature's lasting error."""
         return self.features_at + len(self.ids)
 
+    @property
+    def rho_variance(self) -> F64:
+        """(N,) 1/m^2."""
+        return np.diag(self.cov)[self.features_at : self.lasting_at]
+
     def means(self) -> tuple[Any, ...]:
         """All but the covariance, for `restore`."""
         calibration = self.bg, self.ba, self.T_body_cam, self.offset_s
