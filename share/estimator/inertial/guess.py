@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.columns import Columns
+from share.estimator.inertial.observe import hosts_in_camera
 from share.estimator.inertial.state import State
-from share.geometry import se3
 from share.geometry.camera import rays
 from share.types import F32, F64
 
@@ -53,8 +53,7 @@ def guess(state: State, px: F32, known_px: F32) -> Guess:
 
 def inverse_depths(state: State) -> F64:
     """1/m (M,) of the state's features, along cam0's axis where it is now; 0.03 at least."""
-    T_cam_odom = se3.inverse(state.T @ state.T_body_cam)
-    T = T_cam_odom @ state.poses[state.host] @ state.T_body_cam
+    T = hosts_in_camera(state)
     z = (T[:, 2, :3] * rays(state.ray)).sum(axis=1) + state.rho * T[:, 2, 3]
     out: F64 = np.maximum(state.rho, _LEAST) / np.maximum(z, 0.1)
     return np.maximum(out, _LEAST)

@@ -54,8 +54,7 @@ def predict(state: State, which: I64, T_right_left: F64 | None = None) -> Predic
 def warp(state: State, which: I64, spread: F64, slant: F64, T_right_left: F64 | None = None) -> F64:
     """(N, 2, 2) how normalised coordinates change with the pixel of the host: what a patch round a feature
     looks like. spread (N, 2, 2): d ray / d px of the host. slant (N, 2): d rho / d px, of the surface."""
-    T_cam_odom = se3.inverse(state.T @ state.T_body_cam)
-    T = T_cam_odom @ state.poses[state.host[which]] @ state.T_body_cam
+    T = hosts_in_camera(state, which)
     if T_right_left is not None:
         T = T_right_left @ T
     R, t = T[:, :3, :3], T[:, :3, 3]
@@ -63,6 +62,11 @@ def warp(state: State, which: I64, spread: F64, slant: F64, T_right_left: F64 | 
     _, D = _projected(q)
     out: F64 = D @ (R[:, :, :2] @ spread + t[:, :, None] * slant[:, None, :])
     return out
+
+
+def hosts_in_camera(state: State, which: I64 | slice = slice(None)) -> F64:
+    """T_cam_host (N, 4, 4): from cam0 of the hosts of features `which` (N,), all by default, to cam0 now."""
+    return se3.inverse(state.T @ state.T_body_cam) @ state.poses[state.host[which]] @ state.T_body_cam
 
 
 def _lever(R: F64, q: F64, rho: F64) -> F64:

@@ -82,9 +82,8 @@ class Scene:
         """px (N, 2) and depth (N,) m of the features in `frame`, the last one; only of those whose depth is
         known well, where nothing else in the frame tells."""
         s = self.state
-        T_cam_odom = se3.inverse(s.T @ s.T_body_cam)
-        R = T_cam_odom @ s.poses[s.host] @ s.T_body_cam
-        z = (R[:, 2, :3] * rays(s.ray)).sum(axis=1) / np.maximum(s.rho, _FARTHEST) + R[:, 2, 3]
+        T = observe.hosts_in_camera(s)
+        z = (T[:, 2, :3] * rays(s.ray)).sum(axis=1) / np.maximum(s.rho, _FARTHEST) + T[:, 2, 3]
         sure = (s.rho_variance < (_SURE * s.rho) ** 2) | measures_depth(frame, self._rig)
         return self.looks.px[sure], np.maximum(z, _NEAREST_M)[sure]
 

@@ -11,6 +11,7 @@ from share.estimator.inertial import bundle, ekf
 from share.estimator.inertial.bundle import Fit, Model, Shot
 from share.estimator.inertial.guess import DIFFER, ROOM, ROOMS
 from share.estimator.inertial.normal import SHOT
+from share.estimator.inertial.observe import hosts_in_camera
 from share.estimator.inertial.samples import coasting
 from share.estimator.inertial.scene import Scene
 from share.estimator.inertial.state import CORE, EXTRINSIC, State
@@ -78,8 +79,7 @@ class Window:
 
     def _moved_px(self, s: State, uv: F64) -> float:
         """How far features have moved since their keyframes saw them, less what turning did."""
-        C = s.T @ s.T_body_cam
-        q = ((C.T @ (s.poses @ s.T_body_cam)[s.host])[:, :3, :3] @ rays(s.ray)[:, :, None])[:, :, 0]
+        q = (hosts_in_camera(s)[:, :3, :3] @ rays(s.ray)[:, :, None])[:, :, 0]
         moved = np.linalg.norm(q[:, :2] / q[:, 2:] - uv, axis=1)
         return float(np.quantile(moved, 0.75)) * self._camera.focal if len(moved) else 0.0
 
