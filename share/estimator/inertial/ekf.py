@@ -86,9 +86,8 @@ def sight(state: State, which: I64, seen: Prediction, uv: F64, sigma: F64, rate:
     core = np.zeros((len(which), 2, CORE))
     core[:, :, POSE], core[:, :, EXTRINSIC] = seen.by_pose, seen.by_extrinsic
     core[:, :, OFFSET] = seen.by_pose @ twist(state, rate)
-    return Sight(
-        which, state.host[which], uv - seen.uv - state.lasting[which], core, -seen.by_pose, seen.by_rho, sigma
-    )
+    residual = uv - seen.uv - state.lasting[which]
+    return Sight(which, state.host[which], residual, core, -seen.by_pose, seen.by_rho, sigma)
 
 
 def gains(state: State, rows: Sight, common: F64 | None = None) -> tuple[F64, F64]:
@@ -110,7 +109,7 @@ def gains(state: State, rows: Sight, common: F64 | None = None) -> tuple[F64, F6
     for columns, part in groups:
         S[:, part] += HP[:, columns] @ by_host[part].T
     S[np.diag_indices(2 * M)] += np.repeat(rows.sigma**2, 2)
-    if common is not None and common.any():
+    if common is not None:
         B = core[:, POSE] @ se3.adjoint(state.T)
         S += B @ common @ B.T
     return HP, S
