@@ -143,6 +143,10 @@ class ImuBatch:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    def take(self, which: slice | I64 | NDArray[np.bool_]) -> ImuBatch:
+        """These samples, by numbers or a mask (N,)."""
+        return ImuBatch(self.stamps_ns[which], self.gyro[which], self.accel[which])
+
     def join(self, *others: ImuBatch) -> ImuBatch:
         """All samples, one batch after the other."""
         parts = (self, *others)

@@ -63,7 +63,7 @@ def drop20(frames: Frames, *_: object) -> Frames:
             continue
         step = frame.stamp_ns - out[-1].stamp_ns if out else 0
         gap = step if step > _GAP * usual else 0
-        out.append(replace(frame, index=len(out), imu=_joined(waiting), gap_ns=gap))
+        out.append(replace(frame, index=len(out), imu=ImuBatch.empty().join(*waiting), gap_ns=gap))
         waiting = []
     return out
 
@@ -124,7 +124,7 @@ def white_wall(frames: Frames, *_: object) -> Frames:
 
 def blur(frames: Frames, rig: Rig, *_: object) -> Frames:
     """Box blur along the way that the middle of the image goes by the gyro while it is exposed."""
-    imu = _joined([frame.imu for frame in frames])
+    imu = ImuBatch.empty().join(*(frame.imu for frame in frames))
     fastest = np.quantile(np.linalg.norm(imu.gyro, axis=1), 0.99) if len(imu) else 0.0
     if fastest == 0:
         return frames
@@ -153,7 +153,7 @@ def imu_never(frames: Frames, *_: object) -> Frames:
 
 def saturating(frames: Frames, *_: object) -> Frames:
     """Where any axis goes beyond what 5 % of the samples do, it stops."""
-    imu = _joined([frame.imu for frame in frames])
+    imu = ImuBatch.empty().join(*(frame.imu for frame in frames))
     most = [np.quantile(np.abs(x).max(axis=1), 1 - _CLIPPED) for x in (imu.gyro, imu.accel)]
 
     def clip(b: ImuBatch) -> ImuBatch:
@@ -241,14 +241,6 @@ def _noise(image: U8, sigma: float, rng: np.random.Generator) -> F32:
 
 def _mute(frame: Frame) -> Frame:
     return replace(frame, imu=ImuBatch.empty())
-
-
-def _joined(batches: Sequence[ImuBatch]) -> ImuBatch:
-    return ImuBatch(
-        np.concatenate([b.stamps_ns for b in batches]),
-        np.concatenate([b.gyro for b in batches]),
-        np.concatenate([b.accel for b in batches]),
-    )
 
 
 def _smear(camera: Camera, turn: F64) -> F32:

@@ -12,7 +12,6 @@ from share.estimator.inertial import ekf, observe
 from share.estimator.inertial.guess import guess
 from share.estimator.inertial.state import CORE, State, begin
 from share.geometry import se3
-from share.types import ImuBatch
 
 FRAME_HZ, IMU_HZ = 20, 200
 SHIPPED = InertialConfig()
@@ -75,7 +74,7 @@ def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
         stamp = k / FRAME_HZ
         to_ns = round((stamp + state.offset_s) * 1e9)
         near = slice(*np.searchsorted(imu.stamps_ns, (state.stamp_ns - 10**7, to_ns + 10**7)))
-        part = ImuBatch(imu.stamps_ns[near], imu.gyro[near], imu.accel[near])
+        part = imu.take(near)
         rate = ekf.propagate(state, part, to_ns, NOISE, GRAVITY)
         ekf.fade(state, 1 / FRAME_HZ, LASTING_PX / CAMERA.focal, LASTING_S)
         taken = stamp + offset

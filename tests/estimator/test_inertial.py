@@ -173,14 +173,12 @@ def test_lost_without_imu_and_sight_and_found_again(walk):
 
 
 def test_dropped_frames(walk):
-    kept, waiting = [], []
+    kept, waiting = [], ImuBatch.empty()
     for k, frame in enumerate(walk[0]):
-        waiting.append(frame.imu)
+        waiting = waiting.join(frame.imu)
         if k <= 5 or k % 4:
-            names = ("stamps_ns", "gyro", "accel")
-            imu = ImuBatch(*(np.concatenate([getattr(b, name) for b in waiting]) for name in names))
-            kept.append(dataclasses.replace(frame, imu=imu))
-            waiting = []
+            kept.append(dataclasses.replace(frame, imu=waiting))
+            waiting = ImuBatch.empty()
     results, _, _ = run(walk, kept)
     assert error_m(walk, kept, results) < 0.01
 
@@ -208,9 +206,7 @@ def test_a_renderer_knows_the_pose_between_frames(walk):
     frames, _, truth = walk
     _, _, tracker = run(walk, frames[:40])
     to = frames[41].stamp_ns
-    imu = ImuBatch(
-        *(np.concatenate([getattr(f.imu, n) for f in frames[40:42]]) for n in ("stamps_ns", "gyro", "accel"))
-    )
+    imu = frames[40].imu.join(frames[41].imu)
     at = {int(t): T for t, T in zip(truth.stamps_ns, truth.T, strict=True)}
     true = se3.inverse(at[frames[39].stamp_ns]) @ at[to]
     before = tracker.state.T

@@ -9,7 +9,6 @@ from share.estimator.inertial.bundle import Model, Shot, fit
 from share.estimator.inertial.shooting import SIDE, gap
 from share.estimator.inertial.state import ACCEL_BIAS, CORE, GYRO_BIAS, VELOCITY, begin
 from share.geometry import se3
-from share.types import ImuBatch
 
 SIGMA, SHOTS, STEP_S, KEYFRAMES, EACH = 0.5 / CAMERA.focal, 16, 0.12, (0, 6), 50
 MODEL = Model(NOISE, GRAVITY, SIGMA, 1e-12 * np.eye(6), 0.4, 0.8, 0.5)
@@ -47,7 +46,7 @@ def scene(seed, outliers=0.0):
         near = slice(
             *np.searchsorted(imu.stamps_ns, np.rint([(t[k] - STEP_S) * 1e9 - 1e7, t[k] * 1e9 + 1e7]))
         )
-        part = ImuBatch(imu.stamps_ns[near], imu.gyro[near], imu.accel[near])
+        part = imu.take(near)
         stamp, keyframe = round(t[k] * 1e9), k if k in KEYFRAMES else -1
         shots.append(Shot(stamp, part, keyframe, seen, hosts[seen], ray[seen], uv[seen]))
     return shots, first, T, v

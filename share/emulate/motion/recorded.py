@@ -43,7 +43,7 @@ class RecordedPath:
     def recorded(self) -> ImuBatch:
         """The IMU's samples within the span, untouched."""
         keep = (self.imu.stamps_ns >= self.start_ns) & (self.imu.stamps_ns <= self.end_ns)
-        return ImuBatch(self.imu.stamps_ns[keep], self.imu.gyro[keep], self.imu.accel[keep])
+        return self.imu.take(keep)
 
     def poses(self, stamps_ns: I64) -> F64:
         """T_world_body (N, 4, 4). Raises ValueError outside the span."""

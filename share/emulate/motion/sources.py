@@ -172,7 +172,7 @@ def _span(folder: Path, imu: ImuBatch, mocap: Mocap, start: float, seconds: floa
 
 def _imu_between(imu: ImuBatch, start_ns: int, end_ns: int) -> ImuBatch:
     keep = (imu.stamps_ns >= start_ns) & (imu.stamps_ns <= end_ns)
-    return ImuBatch(imu.stamps_ns[keep], imu.gyro[keep], imu.accel[keep])
+    return imu.take(keep)
 
 
 def _said(path: RecordedPath) -> str:

@@ -149,4 +149,4 @@ def _between(imu: ImuBatch | None, start_ns: int, end_ns: int) -> ImuBatch | Non
     if imu is None:
         return None
     keep = (imu.stamps_ns >= start_ns) & (imu.stamps_ns <= end_ns)
-    return ImuBatch(imu.stamps_ns[keep], imu.gyro[keep], imu.accel[keep])
+    return imu.take(keep)

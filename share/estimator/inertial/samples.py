@@ -30,11 +30,7 @@ class Samples:
         old = self.all
         self._most = np.abs(np.hstack([imu.gyro, imu.accel])).max(axis=0, initial=0.0).clip(self._most)
         start = int(np.searchsorted(imu.stamps_ns, old.stamps_ns[-1], side="right")) if len(old) else 0
-        self.all = ImuBatch(
-            np.concatenate([old.stamps_ns[-_KEPT:], imu.stamps_ns[start:]]),
-            np.concatenate([old.gyro[-_KEPT:], imu.gyro[start:]]),
-            np.concatenate([old.accel[-_KEPT:], imu.accel[start:]]),
-        )
+        self.all = old.take(slice(-_KEPT, None)).join(imu.take(slice(start, None)))
 
     def with_more(self, imu: ImuBatch) -> Samples:
         """These and later ones; this one stays as it is."""
@@ -54,10 +50,11 @@ class Samples:
         stamps = self.all.stamps_ns
         first = max(int(np.searchsorted(stamps, from_ns, side="right")) - 1, 0)
         last = int(np.searchsorted(stamps, to_ns)) + 1
-        part = stamps[first:last]
-        if len(part) == 0 or np.diff(np.r_[part, max(to_ns, int(part[-1]))]).max() > silent_ns:
+        part = self.all.take(slice(first, last))
+        told = part.stamps_ns
+        if len(told) == 0 or np.diff(np.r_[told, max(to_ns, int(told[-1]))]).max() > silent_ns:
             return None
-        return ImuBatch(part, self.all.gyro[first:last], self.all.accel[first:last])
+        return part
 
     def still(self, now_ns: int) -> bool:
         """Whether the IMU shows a body at rest, no motor running, since _REST_S before."""
