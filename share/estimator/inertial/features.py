@@ -80,17 +80,18 @@ def runaways(looks: Looks, which: I64, residual: F64) -> NDArray[np.bool_]:
 def heard(looks: Looks) -> NDArray[np.bool_]:
     """Which (N,) the filter hears in an image: new ones always, others in every second. What is wrong with a
     sight is the same in the next one."""
-    out: NDArray[np.bool_] = (looks.age < _NEW) | (_turn(looks) % 2 == 0)
+    out: NDArray[np.bool_] = (looks.age < _NEW) | (turn(looks) % 2 == 0)
     return out | (len(out) < _FEW)
 
 
 def seen_twice(looks: Looks) -> NDArray[np.bool_]:
     """Which of these a second camera is asked for: young ones always, for their depth, others by turns."""
-    out: NDArray[np.bool_] = heard(looks) & ((looks.age < _YOUNG) | (_turn(looks) % 4 == 0))
+    out: NDArray[np.bool_] = heard(looks) & ((looks.age < _YOUNG) | (turn(looks) % 4 == 0))
     return out
 
 
-def _turn(looks: Looks) -> I64:
+def turn(looks: Looks) -> I64:
+    """(N,) counts frames, each feature from another number: by it features take turns."""
     out: I64 = looks.age + np.arange(len(looks.age))
     return out
 

@@ -73,8 +73,8 @@ class Scene:
         left.astray[away] = True
         self._shun(left.px[left.astray])
         self._wary = _WARY_FRAMES if left.astray.sum() >= _CROWD else max(self._wary - 1, 0)
-        turn = np.flatnonzero(seen & ((self.looks.age + np.arange(len(seen))) % _SLANT_EVERY == 0))
-        features.learn_slant(self.looks, turn, left.error[turn], left.along[turn])
+        now = np.flatnonzero(seen & (features.turn(self.looks) % _SLANT_EVERY == 0))
+        features.learn_slant(self.looks, now, left.error[now], left.along[now])
         self._memory.sleep(self.state, self.looks, np.flatnonzero(~left.found))
         self.keep(seen)
 
