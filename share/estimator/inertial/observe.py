@@ -40,8 +40,8 @@ def predict(state: State, which: I64, T_right_left: F64 | None = None) -> Predic
     R, t = T_cam_odom[:3, :3], T_cam_odom[:3, 3]
     q_odom = (R_odom_host @ f[:, :, None])[:, :, 0] + rho[:, None] * t_odom_host
     q = q_odom @ R.T + rho[:, None] * t
-    by_pose = -_lever(R, q_odom, rho)
-    by_extrinsic = _lever(R @ R_odom_host, f, rho) - _lever(np.eye(3), q, rho)
+    by_pose = -lever(R, q_odom, rho)
+    by_extrinsic = lever(R @ R_odom_host, f, rho) - lever(np.eye(3), q, rho)
     by_rho = t_odom_host @ R.T + t
     if T_right_left is not None:
         turn, shift = T_right_left[:3, :3], T_right_left[:3, 3]
@@ -69,7 +69,7 @@ def hosts_in_camera(state: State, which: I64 | slice = slice(None)) -> F64:
     return se3.inverse(state.T @ state.T_body_cam) @ state.poses[state.host[which]] @ state.T_body_cam
 
 
-def _lever(R: F64, q: F64, rho: F64) -> F64:
+def lever(R: F64, q: F64, rho: F64) -> F64:
     """R [-hat(q) | rho I], (N, 3, 6): what Exp(xi) does to q (N, 3), seen through R (3, 3) or (N, 3, 3)."""
     return np.concatenate([-R @ se3.hat(q), R * rho[:, None, None]], axis=2)
 

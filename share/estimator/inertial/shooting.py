@@ -14,6 +14,8 @@ import numpy as np
 
 from share.columns import Columns
 from share.estimator.inertial.imu import Motion
+from share.estimator.inertial.normal import inverse
+from share.estimator.inertial.observe import lever
 from share.estimator.inertial.state import EXTRINSIC, State
 from share.geometry import se3
 from share.geometry.camera import rays
@@ -50,7 +52,7 @@ class Shooting:
         depth: float,
     ) -> None:
         self._first, self._carry, self._sights, self._usual_depth = first, carry, sights, depth
-        self._prior = np.asarray(np.linalg.inv(first.cov[:SIDE, :SIDE]), np.float64)
+        self._prior = inverse(first.cov[:SIDE, :SIDE])
         self.state, self.depth = first, np.full(features, depth)
         self.T, self.v, self._by_first = self._carried()
 
@@ -85,8 +87,8 @@ class Shooting:
         r = -(across @ seen[:, :, None])[:, :, 0]
         weight = 1 / np.sqrt(1 + (r**2).sum(axis=1) / usual**2)
         across = (across @ turn) * weight[:, None, None]
-        lever = np.concatenate([-se3.hat(point), np.tile(np.eye(3), (len(s.at), 1, 1))], axis=2)
-        J = across @ (lever @ (self._by_first[s.host, :6] - self._by_first[s.at, :6]))
+        by_pose = lever(np.eye(3), point, np.ones(len(point)))
+        J = across @ (by_pose @ (self._by_first[s.host, :6] - self._by_first[s.at, :6]))
         return r * weight[:, None], J, (across @ along)[:, :, 0]
 
     def _step(self, r: F64, J: F64, by_depth: F64) -> None:
