@@ -61,10 +61,13 @@ class RunLog:
         self._rows.append(row)
         self._by_stamp[stamp_ns] = row
 
-    def add_wait(self, wait: Wait | None) -> None:
-        """Of a frame; None where nothing was waited for."""
-        if wait is not None:
-            self.waited[wait] += 1
+    def add_result(self, new_stretch: bool, sound: bool, waits: Wait | None) -> None:
+        """Of a frame: whether odometry broke before it, whether images and IMU agree, and what is still
+        waited for; None: nothing."""
+        self.stretches += new_stretch
+        self.contradicted += not sound
+        if waits is not None:
+            self.waited[waits] += 1
 
     def add_decode(self, cpu_s: float) -> None:
         self.decode_s += cpu_s

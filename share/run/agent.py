@@ -189,9 +189,7 @@ class AgentRun:
             new_stretch=result.new_stretch,
         )
         self._post(tracked)  # the pose goes out before others are served
-        self._log.stretches += result.new_stretch
-        self._log.contradicted += not result.sound
-        self._log.add_wait(result.waits)
+        self._log.add_result(result.new_stretch, result.sound, result.waits)
         self._waits = result.waits
         if result.keyframe:
             self._post(ev.KeyframeMade(tracked, self._tracker.keyframe(frame)))

@@ -36,9 +36,7 @@ def track(source: Source, settings: config.Config, progress: Callable[[int], Non
         began, cpu = time.perf_counter(), time.process_time()
         result = tracker.track(frame)
         track_ms = 1e3 * (time.perf_counter() - began)
-        log.stretches += result.new_stretch
-        log.contradicted += not result.sound
-        log.add_wait(result.waits)
+        log.add_result(result.new_stretch, result.sound, result.waits)
         if result.keyframe:
             tracker.keyframe(frame)
         log.cpu_s += time.process_time() - cpu
