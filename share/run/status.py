@@ -19,9 +19,9 @@ KEPT_S = 0.2  # an answer is given again so long: however many ask, the edge is 
 class StatusServer:
     """Serves at `address`, HOST:PORT or a PORT of this machine alone, until closed.
 
-    report: the edge's report as in edge.json, and of now `trouble`, a list of what is wrong, `queue`,
-    `last_solve_s`, `uptime_s`, so far as there are such. It is called from the server's own thread;
-    if it fails, that is answered, and told once. Raises UsageError or TransportError as `WebServer`.
+    report: the edge's report as in edge.json, and of now `trouble`, a list of what is wrong, `last_solve_s`
+    and `uptime_s`, so far as there are such. It is called from the server's own thread; if it fails, that
+    is answered, and told once. Raises UsageError or TransportError as `WebServer`.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ def _health(report: dict[str, Any]) -> Answer:
         "status": "trouble" if trouble else "ok",
         "trouble": trouble,
         "agents": sorted(name for name, agent in agents if not agent.get("gone")),
-        **{key: report[key] for key in ("uptime_s", "queue", "last_solve_s") if key in report},
+        **{key: report[key] for key in ("uptime_s", "waiting", "last_solve_s") if key in report},
     }
     return _json(HTTPStatus.SERVICE_UNAVAILABLE if trouble else HTTPStatus.OK, health)
 

@@ -28,7 +28,7 @@ class Row:
 _AGENT = ("agents", ("agent", "kind"))
 ROWS = (
     Row("share_edge_uptime_seconds", "Time since the edge began.", "uptime_s"),
-    Row("share_edge_queue_keyframes", "Keyframes that wait to be looked up.", "queue"),
+    Row("share_edge_waiting_keyframes", "Keyframes that wait to be looked up.", "waiting"),
     Row("share_edge_last_solve_age_seconds", "Time since poses were solved for.", "last_solve_s"),
     Row("share_edge_troubles", "What is wrong now; /health says what.", "trouble"),
     Row("share_edge_failed_jobs_total", "Jobs that raised an error.", "failed_jobs"),

@@ -92,7 +92,7 @@ function show(now) {
   mark(trouble.length ? "trouble" : "ok", trouble.length);
   at("trouble").replaceChildren(...trouble.map(t => node("li", t)));
   const about = [`up ${lasted(now.uptime_s)}`];
-  if (now.queue !== undefined) about.push(`queue ${shown(now.queue)}`);
+  if (now.waiting !== undefined) about.push(`waiting ${shown(now.waiting)}`);
   if (typeof now.last_solve_s === "number") about.push(`solved ${lasted(now.last_solve_s)} ago`);
   if (now.failed_jobs) about.push(`failed jobs ${now.failed_jobs}`);
   at("about").textContent = [...about, now.policy, now.version].filter(Boolean).join(" · ");

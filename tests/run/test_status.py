@@ -16,7 +16,8 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from share.config import Config
-from share.core.edge import Edge, Received
+from share.core.edge import Edge, Join, Received
+from share.core.mapper import Mapper
 from share.errors import TransportError, UsageError
 from share.run import status_metrics, web
 from share.run.status import KEPT_S, StatusServer
@@ -82,22 +83,24 @@ def metrics(body):
 
 def real_report():
     """Of an edge that knows one agent and nothing more."""
-    edge = Edge(Config(), session=5)
+    edge, mapper = Edge(Config(), session=5), Mapper(Config())
     hello = Hello("ann", AgentKind.AR, 1, 400.0, np.eye(4))
-    edge.handle(Received(peer_id(1), encode(hello)), 10**9)
-    return edge.report()
+    for effect in edge.handle(Received(peer_id(1), encode(hello)), 10**9):
+        if isinstance(effect, Join):
+            mapper.join(effect.key, effect.hello)
+    return edge.report(mapper.report())
 
 
 # ---------------------------------------------------------------- what is served
 
 
 def test_health_says_who_is_there():
-    with serving(lambda: {**REPORT, "queue": 3, "last_solve_s": 0.5}) as server:
+    with serving(lambda: {**REPORT, "waiting": 3, "last_solve_s": 0.5}) as server:
         status, headers, body = get(server, "/health")
     assert (status, headers["Content-Type"]) == (200, "application/json")
     health = json.loads(body)
     assert 0 <= health.pop("uptime_s") < 60
-    expected = {"status": "ok", "trouble": [], "agents": ["ann"], "queue": 3, "last_solve_s": 0.5}
+    expected = {"status": "ok", "trouble": [], "agents": ["ann"], "waiting": 3, "last_solve_s": 0.5}
     assert health == expected
 
 
@@ -151,7 +154,7 @@ def test_what_the_report_lacks_is_left_out():
 
 
 def test_all_that_an_edge_reports_is_in_a_metric():
-    body, _ = status_metrics.text({**real_report(), "uptime_s": 1.0, "queue": 0, "trouble": []})
+    body, _ = status_metrics.text({**real_report(), "uptime_s": 1.0, "trouble": []})
     names = {name for name, _ in metrics(body)}
     absent = {row.name for row in status_metrics.ROWS} - names
     by_others = {"share_edge_last_solve_age_seconds", "share_edge_refused_handshakes_total"}
