@@ -25,7 +25,7 @@ def covariances(n: int, edges: Edges, at: Minimum, anchor: int, wanted: I64, eno
     """Covariances (K, 6, 6) of `wanted` (K,) of n poses relative to `anchor`, right perturbation.
 
     The part has `enough` edges if there are so many ways. Every wanted pose must be joined to the
-    anchor; where the minimum is none, all are infinite.
+    anchor.
     """
     out = np.zeros((len(wanted), 6, 6))
     free = np.flatnonzero(wanted != anchor)

@@ -74,8 +74,8 @@ class Solution:
 
     numbers (N,), poses (N, 4, 4): rising, all of the part. covariances (K, 6, 6): of the poses asked
     for relative to the anchor, right perturbation, never too small (`share.graph.bound`). loop_ids
-    (L,), loop_chi2 (L,): squared Mahalanobis residual. reason: why it could not be solved and the
-    poses are as they were; empty if it was.
+    (L,), loop_chi2 (L,): squared Mahalanobis residual. reason: why it could not be solved, the poses
+    are as they were and there are no covariances; empty if it was.
     """
 
     numbers: I64

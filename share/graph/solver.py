@@ -57,7 +57,9 @@ class Solver:
         held = int(rank[np.searchsorted(numbers, anchor)])
         minimum = minimise(self._poses[part][order], chained, held, self._config)
         poses = minimum.poses[rank]
-        if not minimum.reason:
+        if minimum.reason:
+            goals = goals[:0]
+        else:
             self._poses = _replaced(self._poses, part, poses)
         return Solution(
             numbers,
