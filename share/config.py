@@ -210,6 +210,7 @@ class GraphConfig:
     step_tolerance: float = 3e-3  # rad and m; solved once no pose is moved by more
     inner_tolerance: float = 3e-2  # of the residual of a step's equations, relative
     covariance_edges: int = 250  # the surest, by which covariances are told; more: tighter and slower
+    covariance_rounds: int = 16  # of looking for surest ways, at most
 
     def __post_init__(self) -> None:
         _require_positive(self, *(setting.name for setting in fields(self)))

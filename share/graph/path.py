@@ -7,7 +7,7 @@ factorisation. It is what a new loop has to agree with.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from share.geometry import se3
 from share.graph.posegraph import Edge
 from share.graph.ways import Ways
 from share.types import F64, I64
+
+Placed = Sequence[F64] | Mapping[int, F64] | F64  # poses (4, 4) by number
 
 
 class Roads:
@@ -58,7 +60,7 @@ class Roads:
                 self._free.append(self._places.pop(end))
         self._ways = None
 
-    def known_from(self, start: int, goals: Sequence[int], poses: Sequence[F64]) -> list[F64 | None]:
+    def known_from(self, start: int, goals: Sequence[int], poses: Placed) -> list[F64 | None]:
         """Covariance (6, 6) of T_start_goal for each goal along the surest path from `start` to it, each
         step laid along the current `poses`; None where there is no path. One search serves all."""
         if start not in self._places:
@@ -110,7 +112,7 @@ class Roads:
             here = int(before[here])
         return path
 
-    def _steps(self, before: I64, met: I64, start: int, poses: Sequence[F64]) -> F64:
+    def _steps(self, before: I64, met: I64, start: int, poses: Placed) -> F64:
         """Covariances (K, 6, 6) of the steps to places `met` from those before, perturbing T_start_start."""
         rows = self._search().edges(before, met)
         table = self._table[rows]
@@ -122,12 +124,12 @@ class Roads:
         return se3.inverse_cov(se3.inverse(poses[start]) @ there, cov)
 
 
-def _seen_from_goal(steps: F64, start: int, goal: int, poses: Sequence[F64]) -> F64:
+def _seen_from_goal(steps: F64, start: int, goal: int, poses: Placed) -> F64:
     """The sum of covariances (K, 6, 6) that perturb `start`, as one that perturbs `goal`."""
     return se3.inverse_cov(se3.inverse(poses[goal]) @ poses[start], steps.sum(0))
 
 
-def covariance_between(path: Sequence[Edge], start: int, poses: Sequence[F64]) -> F64:
+def covariance_between(path: Sequence[Edge], start: int, poses: Placed) -> F64:
     """Covariance (6, 6) of T_start_goal along `path`, each step laid along the current `poses`."""
     cov = np.zeros((6, 6))
     here = start

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from share.config import GraphConfig
-from share.geometry import se3
 from share.graph.bound import covariances
 from share.graph.chains import chain_order
 from share.graph.change import Change, Solution
@@ -64,7 +63,7 @@ class Solver:
         return Solution(
             numbers,
             poses,
-            covariances(len(part), chained, minimum, held, rank[goals], self._config.covariance_edges),
+            covariances(len(part), chained, minimum, held, rank[goals], self._config),
             self._ids[touching][edges.is_loop],
             minimum.at.chi2[edges.is_loop],
             minimum.iterations,
@@ -89,7 +88,7 @@ class Solver:
         numbers = np.union1d(self._numbers[kept], change.numbers)
         poses = np.empty((len(numbers), 4, 4))
         poses[np.searchsorted(numbers, self._numbers[kept])] = self._poses[kept]
-        poses[np.searchsorted(numbers, change.numbers)] = se3.orthonormal(change.poses)
+        poses[np.searchsorted(numbers, change.numbers)] = change.poses
         return numbers, poses
 
     def _edges_after(self, change: Change, numbers: I64) -> tuple[I64, Edges]:
