@@ -1,6 +1,6 @@
-"""How long the edge's map takes: place query, match, verify, solve. Prints JSON, medians in ms.
+"""How long recognising a place takes: query, match, verify. Prints JSON, medians in ms.
 
-    python tools/bench_map.py [--recording FOLDER] [--keyframes 300 3000] [--poses 300 2000]
+    python tools/bench_map.py [--recording FOLDER] [--keyframes 300 3000]
 
 Without a recording the views are simulated. To fill the index, views are repeated with 6 % of their
 descriptor bits flipped: every place is then stored many times over, which is the dear case.
@@ -23,32 +23,28 @@ process.prepare()
 
 import numpy as np  # noqa: E402
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[1] / "tests" / d) for d in ("place", "graph")]
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "place"))
 
 from place_real import load  # noqa: E402
 from place_sim import sights  # noqa: E402
-from test_posegraph import loops_of_a_room  # noqa: E402
 
-from share.config import GraphConfig, PlaceConfig  # noqa: E402
+from share.config import PlaceConfig  # noqa: E402
 from share.geometry import se3  # noqa: E402
-from share.graph.posegraph import solve  # noqa: E402
 from share.place.index import PlaceIndex  # noqa: E402
 from share.place.matching import match  # noqa: E402
 from share.place.verify import Sight, Verified, verify  # noqa: E402
 
-PLACE, GRAPH = PlaceConfig(), GraphConfig()
+PLACE = PlaceConfig()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--recording", type=Path, help="EuRoC or TUM RGB-D folder with a ground truth")
     parser.add_argument("--keyframes", type=int, nargs="*", default=[300, 3000])
-    parser.add_argument("--poses", type=int, nargs="*", default=[300, 2000])
     options = parser.parse_args()
     views = load(options.recording).sights if options.recording else simulated()
     report = {f"{n}_keyframes": bench_place(views, n) for n in options.keyframes}
     report |= {"pair": bench_pair(views)}
-    report |= {f"{n}_poses": bench_solve(n) for n in options.poses}
     print(json.dumps(report, indent=2))
 
 
@@ -102,17 +98,6 @@ def bench_pair(views: list[Sight]) -> dict[str, float]:
         "match": median_ms(matching),
         "verify_accepted": median_ms(verifying(True)),
         "verify_refused": median_ms(verifying(False)),
-    }
-
-
-def bench_solve(n: int) -> dict[str, float]:
-    """A graph of n poses and 0.15 n loops, without and with the covariances of three poses."""
-    _, guess, odometry, loops = loops_of_a_room(n, 0, int(0.15 * n))
-    last = [n // 3, n // 2, n - 1]
-    solve(guess[:2], odometry[:1], [], [0], GRAPH)  # imports gtsam
-    return {
-        "solve": median_ms([lambda: solve(guess, odometry, loops, [0], GRAPH)] * 5),
-        "solve_with_covariances": median_ms([lambda: solve(guess, odometry, loops, [0], GRAPH, last)] * 5),
     }
 
 

@@ -12,26 +12,24 @@ from typing import Any
 
 import numpy as np
 
+from share.config import GraphConfig
 from share.graph.chains import Equations
 from share.graph.descent import Minimum, weighted_jacobians
 from share.graph.linear import Edges
 from share.graph.ways import Ways, on_the_way
 from share.types import F64, I64
 
-MOST_ROUNDS = 16
 
-
-def covariances(n: int, edges: Edges, at: Minimum, anchor: int, wanted: I64, enough: int) -> F64:
+def covariances(n: int, edges: Edges, at: Minimum, anchor: int, wanted: I64, config: GraphConfig) -> F64:
     """Covariances (K, 6, 6) of `wanted` (K,) of n poses relative to `anchor`, right perturbation.
 
-    The part has `enough` edges if there are so many ways. Every wanted pose must be joined to the
-    anchor; where the minimum is none, all are infinite.
+    Every wanted pose must be joined to the anchor.
     """
     out = np.zeros((len(wanted), 6, 6))
     free = np.flatnonzero(wanted != anchor)
     if not len(free):
         return out
-    part = _surest(n, edges, edges.spread / at.weights, anchor, wanted[free], enough)
+    part = _surest(n, edges, edges.spread / at.weights, anchor, wanted[free], config)
     poses = np.unique(np.concatenate([edges.a[part], edges.b[part]]))
     inside = edges[part].between(*(np.searchsorted(poses, end[part]) for end in (edges.a, edges.b)))
     equations = Equations(len(poses), inside, int(np.searchsorted(poses, anchor)))
@@ -40,17 +38,17 @@ def covariances(n: int, edges: Edges, at: Minimum, anchor: int, wanted: I64, eno
     return out
 
 
-def _surest(n: int, edges: Edges, cost: F64, anchor: int, wanted: I64, enough: int) -> I64:
+def _surest(n: int, edges: Edges, cost: F64, anchor: int, wanted: I64, config: GraphConfig) -> I64:
     """Indices of the edges on the surest ways from the anchor to the wanted poses."""
     used, dear = np.zeros(len(edges), bool), cost.copy()
-    for _ in range(MOST_ROUNDS):
+    for _ in range(config.covariance_rounds):
         ways = Ways(n, edges.a, edges.b, dear)
         before = ways.before(anchor)
         met = on_the_way(before, wanted)
         walked = ways.edges(before[met], met)
         used[walked] = True
         dear[walked] += 2 * cost[walked]
-        if used.sum() >= enough:
+        if used.sum() >= config.covariance_edges:
             break
     return np.flatnonzero(used)
 

@@ -15,7 +15,7 @@ from share.types import F64, I64, checked
 class Change:
     """News of the graph. What is gone goes first, and a gone pose takes its edges along.
 
-    numbers (N,), poses (N, 4, 4): new poses, and known ones that lie elsewhere now. edge_ids (E,),
+    numbers (N,), poses (N, 4, 4), rigid: new ones, and known ones that lie elsewhere now. edge_ids (E,),
     ends (E, 2), measured (E, 4, 4), covs (E, 6, 6): new edges, T_a_b with ends (a, b), right
     perturbation. is_loop (E,): may be false, so it is judged robustly. gone_edges, gone_poses: ids.
     """
@@ -57,7 +57,7 @@ class Change:
         edges = list(edges)
         return Change(
             np.array(list(poses), np.int64),
-            np.array(list(poses.values()), np.float64).reshape(-1, 4, 4),
+            np.array(list(poses.values()) or np.zeros((0, 4, 4)), np.float64),
             np.array([i for i, _, _ in edges], np.int64),
             np.array([(edge.a, edge.b) for _, edge, _ in edges], np.int64).reshape(-1, 2),
             np.array([edge.T_a_b for _, edge, _ in edges], np.float64).reshape(-1, 4, 4),
@@ -74,8 +74,8 @@ class Solution:
 
     numbers (N,), poses (N, 4, 4): rising, all of the part. covariances (K, 6, 6): of the poses asked
     for relative to the anchor, right perturbation, never too small (`share.graph.bound`). loop_ids
-    (L,), loop_chi2 (L,): squared Mahalanobis residual. reason: why it could not be solved and the
-    poses are as they were; empty if it was.
+    (L,), loop_chi2 (L,): squared Mahalanobis residual. reason: why it could not be solved, the poses
+    are as they were and there are no covariances; empty if it was.
     """
 
     numbers: I64

@@ -13,22 +13,66 @@ import numpy as np
 
 from share.geometry import se3
 from share.graph.posegraph import Edge
-from share.types import F64
+from share.graph.ways import Ways
+from share.types import F64, I64
+
+Placed = Sequence[F64] | Mapping[int, F64] | F64  # poses (4, 4) by number
 
 
 class Roads:
-    """The edges of a growing pose graph, by the poses that they touch."""
+    """The edges of a pose graph that grows and is thinned, by the poses that they touch."""
 
     def __init__(self) -> None:
         self._touching: dict[int, list[Edge]] = {}
+        self._places: dict[int, int] = {}  # of the poses in the search, by number
+        self._free: list[int] = []
+        self._rows: dict[Edge, int] = {}
+        self._edges: list[Edge] = []
+        self._table = np.zeros((64, 3 + 16 + 36))  # places of a and b, spread, T_a_b, cov
+        self._ways: Ways | None = None  # None once an edge has come or gone
 
     def add(self, edge: Edge) -> None:
+        """Raises ValueError if it is here already."""
+        if edge in self._rows:
+            raise ValueError(f"edge {edge.a} - {edge.b} is here already")
         for end in (edge.a, edge.b):
             self._touching.setdefault(end, []).append(edge)
+            if end not in self._places:
+                self._places[end] = self._free.pop() if self._free else len(self._places)
+        row = self._rows[edge] = len(self._edges)
+        self._edges.append(edge)
+        if row == len(self._table):
+            self._table = np.concatenate([self._table, np.zeros_like(self._table)])
+        ends = self._places[edge.a], self._places[edge.b], edge.spread
+        self._table[row] = np.concatenate([ends, edge.T_a_b.ravel(), edge.cov.ravel()])
+        self._ways = None
 
     def remove(self, edge: Edge) -> None:
+        """Raises KeyError if it is not here."""
+        row, last = self._rows.pop(edge), self._edges.pop()
+        if last is not edge:
+            self._edges[row], self._rows[last] = last, row
+            self._table[row] = self._table[len(self._edges)]
         for end in (edge.a, edge.b):
             self._touching[end].remove(edge)
+            if not self._touching[end]:
+                del self._touching[end]
+                self._free.append(self._places.pop(end))
+        self._ways = None
+
+    def known_from(self, start: int, goals: Sequence[int], poses: Placed) -> list[F64 | None]:
+        """Covariance (6, 6) of T_start_goal for each goal along the surest path from `start` to it, each
+        step laid along the current `poses`; None where there is no path. One search serves all."""
+        if start not in self._places:
+            return [np.zeros((6, 6)) if goal == start else None for goal in goals]
+        before = self._search().before(self._places[start])
+        paths = [self._path(before, start, goal) for goal in goals]
+        met = np.array(sorted({place for path in paths for place in path or ()}), np.int64)
+        steps = self._steps(before[met], met, start, poses)
+        return [
+            None if path is None else _seen_from_goal(steps[np.searchsorted(met, path)], start, goal, poses)
+            for goal, path in zip(goals, paths, strict=True)
+        ]
 
     def surest(self, start: int, goal: int) -> list[Edge] | None:
         """The path of least summed trace(cov) as the edges to walk, None if there is none (Dijkstra 1959)."""
@@ -50,8 +94,42 @@ class Roads:
                     heapq.heappush(heap, (cost + road.spread, there, here, road))
         return None
 
+    def _search(self) -> Ways:
+        if self._ways is None:
+            a, b, spread = self._table[: len(self._edges), :3].T
+            size = len(self._places) + len(self._free)
+            self._ways = Ways(size, a.astype(np.int64), b.astype(np.int64), spread)
+        return self._ways
 
-def covariance_between(path: Sequence[Edge], start: int, poses: Mapping[int, F64]) -> F64:
+    def _path(self, before: I64, start: int, goal: int) -> list[int] | None:
+        """Places on the way from `goal` back to `start`, the latter left out."""
+        here, home = self._places.get(goal, -1), self._places[start]
+        path: list[int] = []
+        while here != home:
+            if here < 0:
+                return None
+            path.append(here)
+            here = int(before[here])
+        return path
+
+    def _steps(self, before: I64, met: I64, start: int, poses: Placed) -> F64:
+        """Covariances (K, 6, 6) of the steps to places `met` from those before, perturbing T_start_start."""
+        rows = self._search().edges(before, met)
+        table = self._table[rows]
+        onward = table[:, 1] == met
+        ends = np.array([self._edges[r].b if f else self._edges[r].a for r, f in zip(rows, onward)])
+        T_a_b, cov = table[:, 3:19].reshape(-1, 4, 4), table[:, 19:].reshape(-1, 6, 6)
+        cov = np.where(onward[:, None, None], cov, se3.inverse_cov(T_a_b, cov))
+        there = np.array([poses[end] for end in ends]).reshape(-1, 4, 4)
+        return se3.inverse_cov(se3.inverse(poses[start]) @ there, cov)
+
+
+def _seen_from_goal(steps: F64, start: int, goal: int, poses: Placed) -> F64:
+    """The sum of covariances (K, 6, 6) that perturb `start`, as one that perturbs `goal`."""
+    return se3.inverse_cov(se3.inverse(poses[goal]) @ poses[start], steps.sum(0))
+
+
+def covariance_between(path: Sequence[Edge], start: int, poses: Placed) -> F64:
     """Covariance (6, 6) of T_start_goal along `path`, each step laid along the current `poses`."""
     cov = np.zeros((6, 6))
     here = start

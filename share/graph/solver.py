@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from share.config import GraphConfig
-from share.geometry import se3
 from share.graph.bound import covariances
 from share.graph.chains import chain_order
 from share.graph.change import Change, Solution
@@ -61,12 +60,14 @@ class Solver:
         held = int(rank[np.searchsorted(numbers, anchor)])
         minimum = minimise(self._poses[part][order], chained, held, self._config)
         poses = minimum.poses[rank]
-        if not minimum.reason:
+        if minimum.reason:
+            goals = goals[:0]
+        else:
             self._poses = _replaced(self._poses, part, poses)
         return Solution(
             numbers,
             poses,
-            covariances(len(part), chained, minimum, held, rank[goals], self._config.covariance_edges),
+            covariances(len(part), chained, minimum, held, rank[goals], self._config),
             self._ids[touching][edges.is_loop],
             minimum.at.chi2[edges.is_loop],
             minimum.iterations,
@@ -91,7 +92,7 @@ class Solver:
         numbers = np.union1d(self._numbers[kept], change.numbers)
         poses = np.empty((len(numbers), 4, 4))
         poses[np.searchsorted(numbers, self._numbers[kept])] = self._poses[kept]
-        poses[np.searchsorted(numbers, change.numbers)] = se3.orthonormal(change.poses)
+        poses[np.searchsorted(numbers, change.numbers)] = change.poses
         return numbers, poses
 
     def _edges_after(self, change: Change, numbers: I64) -> tuple[I64, Edges]:

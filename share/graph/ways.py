@@ -11,18 +11,15 @@ class Ways:
     """n poses and E edges between them: ends a, b (E,), cost (E,) each, to be walked either way."""
 
     def __init__(self, n: int, a: I64, b: I64, cost: F64) -> None:
-        from scipy.sparse import csr_array
+        from scipy.sparse import csc_array, csr_array
 
-        key = np.minimum(a, b) * n + np.maximum(a, b)
-        order = np.lexsort((cost, key))
-        cheapest = np.ones(len(key), bool)  # of parallel ones
-        cheapest[1:] = key[order[1:]] != key[order[:-1]]
-        self._edge = order[cheapest]
-        self._key = key[self._edge]
-        self._n = n
-        a, b, cost = a[self._edge], b[self._edge], np.maximum(cost[self._edge], 1e-300)
-        ends = np.concatenate([a, b]), np.concatenate([b, a])
-        self._graph = csr_array((np.concatenate([cost, cost]), ends), shape=(n, n))
+        e = len(a)
+        ends, others = np.concatenate([a, b]), np.concatenate([b, a])
+        leaving = csc_array((np.ones(2 * e), ends, np.arange(2 * e + 1)), shape=(n, 2 * e)).tocsr()
+        self._starts, way = leaving.indptr, leaving.indices  # sorted by where they leave, parallel ones kept
+        self._to, self._edge = others[way], way % max(e, 1)
+        self._cost = np.maximum(cost[self._edge], 1e-300)  # zero would be no edge
+        self._graph = csr_array((self._cost, self._to, self._starts), shape=(n, n))
 
     def before(self, start: int) -> I64:
         """The pose before each (n,) on the way to it from `start`; negative at the start and out of reach."""
@@ -32,7 +29,13 @@ class Ways:
 
     def edges(self, u: I64, v: I64) -> I64:
         """Index (K,) of the cheapest edge between each u and v, which are neighbours."""
-        return self._edge[np.searchsorted(self._key, np.minimum(u, v) * self._n + np.maximum(u, v))]
+        count = self._starts[u + 1] - self._starts[u]
+        first = np.cumsum(count) - count
+        all_of_u = np.arange(count.sum()) + np.repeat(self._starts[u] - first, count)
+        arrives = self._to[all_of_u] == np.repeat(v, count)
+        fits, pair = all_of_u[arrives], np.repeat(np.arange(len(u)), count)[arrives]
+        order = np.lexsort((self._cost[fits], pair))
+        return self._edge[fits[order[np.searchsorted(pair[order], np.arange(len(u)))]]]
 
 
 def on_the_way(before: I64, goals: I64) -> I64:
