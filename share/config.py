@@ -226,10 +226,12 @@ class MergeConfig:
     odometry_scale: float = 2.0  # agents' sigmas are this much too small
     odometry_floor_deg: float = 0.02  # per edge, added in quadrature
     odometry_floor_m: float = 0.002  # the same, for the position
-    sole_witness_inliers: int = 0  # a loop with so many inliers joins two maps alone; 0 = never
     max_pending: int = 200  # loops that wait for a witness; the oldest is dropped
     place_m: float = 0.7  # views further apart than this,
     place_rad: float = 0.5  # or turned by more, are of different places
+    near_m: float = 1.0  # two views further apart than this,
+    near_rad: float = 0.52  # or turned by more, are no witnesses for a join
+    join_places: int = 4  # at so many places, maps must be seen to fit before they are joined
     rebel_places: int = 3  # so many places at least, and more than stand against them, take a map apart
     drop_chi2: float = 1000.0  # a solved graph at odds with a loop by more than this drops it
 

@@ -12,7 +12,6 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from share.geometry import se3
-from share.graph.path import covariance_between
 from share.graph.posegraph import Edge
 from share.merge.join import Key, Known, Loop
 from share.merge.ties import Ties
@@ -133,12 +132,14 @@ class Chart:
         T_odom_body = self.trails.nodes[number].T_odom_body
         return se3.orthonormal(self.poses[number] @ se3.inverse(T_odom_body))
 
-    def between(self, a: int, b: int) -> Known:
-        """Pose of node b in node a of the same map, as the map has it now."""
-        path = self.ties.roads.surest(a, b)
-        if path is None:
-            raise ValueError(f"nodes {a} and {b} are not in one map")
-        return Known(se3.inverse(self.poses[a]) @ self.poses[b], covariance_between(path, a, self.poses))
+    def between(self, a: int, goals: Sequence[int]) -> list[Known]:
+        """Pose of each goal in node a of the same map, as the map has it now."""
+        out = []
+        for goal, cov in zip(goals, self.ties.roads.known_from(a, goals, self.poses), strict=True):
+            if cov is None:
+                raise ValueError(f"nodes {a} and {goal} are not in one map")
+            out.append(Known(se3.inverse(self.poses[a]) @ self.poses[goal], cov))
+        return out
 
     def _find_maps(self) -> None:
         """Every stretch's founder, from the loops: the connected parts."""

@@ -72,6 +72,11 @@ class Disagreement:
         return f"{self.metres:.2f} m and {self.degrees:.1f}° apart, chi2 {self.chi2:.0f}"
 
 
+def opposite(known: Known) -> Known:
+    """The same, from the other end."""
+    return Known(se3.inverse(known.T), se3.inverse_cov(known.T, known.cov))
+
+
 def disagreement(first: Known, second: Known) -> Disagreement:
     """Of two independent estimates of the same pose."""
     xi = se3.log(se3.inverse(first.T) @ second.T)

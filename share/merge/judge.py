@@ -1,7 +1,8 @@
 """Which loops are believed: those that fit the map, or that others, elsewhere, bear witness to.
 
 A verified loop may still be false: two places can look alike. Within a map it has to agree with what the
-map knows; between two maps, or against the map, other loops have to tell the same story.
+map knows. Between two maps, or against the map, loops at several places have to tell the same story; and
+places of which a look-alike is known bear no witness.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.config import MergeConfig
+from share.geometry import se3
 from share.merge.chart import Chart
 from share.merge.cut import fewest
-from share.merge.join import Disagreement, Known, Loop, disagreement, witness_disagreement
-from share.merge.places import distinct
+from share.merge.join import Disagreement, Known, Loop, disagreement, opposite, witness_disagreement
+from share.merge.places import distinct, near_any
 from share.types import F64
 
 
@@ -34,12 +36,13 @@ class Decision:
 class Judge:
     """Of the loops of one chart, which it changes by what it believes.
 
-    waiting: for a witness, oldest first. rebels: those that contradict their map.
+    waiting: for witnesses, oldest first. rebels: those that contradict their map.
     """
 
     def __init__(self, config: MergeConfig, chart: Chart) -> None:
         self.waiting: list[Loop] = []
         self.rebels: list[Loop] = []
+        self._alike: set[int] = set()  # nodes at places of which a look-alike is known
         self._config, self._chart = config, chart
 
     def decide(self, loop: Loop) -> Decision:
@@ -67,37 +70,38 @@ class Judge:
         if gap.chi2 <= self._config.agree_chi2:
             return self._accept([loop], f"loop {loop}: fits the map, {gap}")
         if gap.chi2 > self._config.surprise_chi2:
-            return self._rebel(loop, f"loop {loop}: contradicts the map, {gap}")
-        return self._seek_witness(loop, f"fits the map badly ({gap})")
+            return self._contradiction(loop, f"loop {loop}: contradicts the map, {gap}")
+        return self._corrected(loop, f"loop {loop}: fits the map badly ({gap})")
 
     def _gap(self, loop: Loop) -> Disagreement:
         """Between what the loop says and what its map knows."""
-        return disagreement(self._chart.between(*self._chart.ends(loop)), Known(loop.T_a_b, loop.cov))
+        a, b = self._chart.ends(loop)
+        (known,) = self._chart.between(b, [a])
+        return disagreement(opposite(known), Known(loop.T_a_b, loop.cov))
 
-    def _rebel(self, loop: Loop, why: str) -> Decision:
-        """If more places contradict the map than tie the two stretches as they lie, the map is wrong."""
+    def _corrected(self, loop: Loop, why: str) -> Decision:
+        """The map has drifted, if another loop elsewhere says so too."""
+        story = self._same_story(loop, self.waiting)
+        if not story:
+            self._wait(loop)
+            return Decision(False, f"{why}: waits for a witness")
+        return self._accept([*story, loop], f"{why}: agrees with {story[-1]}")
+
+    def _contradiction(self, loop: Loop, why: str) -> Decision:
+        """Odometry does not lie so much: the places look alike. Between stretches the map may be wrong:
+        it is, if more places contradict it than tie the two."""
         a, b = (self._chart.stretch_of(key) for key in (loop.a, loop.b))
         if a == b:
-            return Decision(False, why)
-        allies = [*self._allies(loop), loop]
+            self._alike.update(self._chart.ends(loop))
+            return Decision(False, f"{why}: two places look alike")
+        story = [*self._same_story(loop, self.rebels), loop]
         self.rebels = [*self.rebels, loop][-self._config.max_pending :]
         against = self._ties_between(a, b)
-        standing = self._places([self._chart.ties.loops[n] for n in against])
-        have, need = self._places(allies), max(standing + 1, self._config.rebel_places)
+        standing = self._witnesses([self._chart.ties.loops[n] for n in against])
+        have, need = self._witnesses(story), max(standing + 1, self._config.rebel_places)
         if have < need:
             return Decision(False, f"{why}; {have} places say so, {need} needed")
-        return self._overthrow(allies, against, f"{why}; {have} places say so")
-
-    def _allies(self, loop: Loop) -> list[Loop]:
-        """Rebels between the same two stretches that tell the same story."""
-        ours = {self._chart.stretch_of(key) for key in (loop.a, loop.b)}
-        return [
-            other
-            for other in self.rebels
-            if {self._chart.stretch_of(key) for key in (other.a, other.b)} == ours
-            and not {loop.a, loop.b} & {other.a, other.b}
-            and self._against(loop, other).chi2 <= self._config.agree_chi2
-        ]
+        return self._overthrow(story, against, f"{why}; {have} places say so")
 
     def _ties_between(self, a: int, b: int) -> list[int]:
         """The fewest loops without which stretches a and b are not of one map."""
@@ -109,59 +113,82 @@ class Judge:
         numbers = list(loops)
         return [numbers[i] for i in fewest([(x, y) for x, y in loops.values()], a, b)]
 
-    def _places(self, loops: Sequence[Loop]) -> int:
-        """How many places they tie: counted on either side, the lesser."""
-        sides: dict[int, list[F64]] = {}
-        for loop in loops:
-            for number in self._chart.ends(loop):
-                stretch = self._chart.trails.nodes[number].stretch
-                sides.setdefault(stretch, []).append(self._chart.poses[number])
-        apart = self._config.place_m, self._config.place_rad
-        counts = [distinct(np.array(poses), *apart) for poses in sides.values()]
-        return min(counts, default=0)
-
     def _overthrow(self, loops: list[Loop], against: list[int], why: str) -> Decision:
         dropped = self._chart.drop(against)
         names = ", ".join(map(str, dropped))
-        self.rebels, waiting = [], self.rebels
-        self.waiting += [loop for loop in waiting if loop not in loops]
+        self.rebels, others = [], [loop for loop in self.rebels if loop not in loops]
+        self.waiting += others
         accepted = self._accept(loops, f"{why}; taken out: {names}")
         return Decision(True, accepted.reason, accepted.joined, accepted.tied, dropped)
 
     # ------------------------------------------------------------ between two maps
 
     def _join(self, loop: Loop) -> Decision:
-        alone = self._config.sole_witness_inliers
-        if 0 < alone <= loop.inliers:
-            return self._accept([loop], f"loop {loop}: {loop.inliers} inliers, {alone} join alone")
-        return self._seek_witness(loop, "would join two maps")
+        story = [*self._same_story(loop, self.waiting), loop]
+        have, need = self._witnesses(story), self._config.join_places
+        why = f"loop {loop}: would join two maps, {have} of {need} places that say so"
+        if have < need:
+            self._wait(loop)
+            return Decision(False, f"{why}: waits")
+        return self._accept(story, why)
 
-    def _seek_witness(self, loop: Loop, why: str) -> Decision:
-        heard = [
-            (self._against(loop, other), other) for other in self.waiting if self._may_witness(loop, other)
+    # ------------------------------------------------------------ witnesses
+
+    def _same_story(self, loop: Loop, others: Sequence[Loop]) -> list[Loop]:
+        """Of others between the same two maps (in one map: the same stretches), those that agree."""
+        facing = [turned for other in others if (turned := self._facing(loop, other)) is not None]
+        if not facing:
+            return []
+        (a, b), ends = self._chart.ends(loop), [self._chart.ends(x) for x in facing]
+        from_a = self._chart.between(a, [x for x, _ in ends])
+        to_b = [opposite(known) for known in self._chart.between(b, [y for _, y in ends])]
+        return [
+            other
+            for other, a_a, b_b in zip(facing, from_a, to_b, strict=True)
+            if witness_disagreement(loop, a_a, other, b_b).chi2 <= self._config.agree_chi2
         ]
-        self.waiting = [*self.waiting, loop][-self._config.max_pending :]
-        if not heard:
-            return Decision(False, f"loop {loop}: {why}: first witness, waits for a second")
-        gap, other = min(heard, key=lambda pair: pair[0].chi2)
-        if gap.chi2 > self._config.agree_chi2:
-            nobody = f"none of {len(heard)} witnesses agrees, best {gap}; waits"
-            return Decision(False, f"loop {loop}: {why}: {nobody}")
-        return self._accept([other, loop], f"loop {loop}: {why}: agrees with {other}, {gap}")
 
-    def _may_witness(self, loop: Loop, other: Loop) -> bool:
-        """It ties the same two maps, by other keyframes on either side."""
-        maps = [{self._chart.founder_of(key) for key in (x.a, x.b)} for x in (loop, other)]
-        return maps[0] == maps[1] and not {loop.a, loop.b} & {other.a, other.b}
-
-    def _against(self, loop: Loop, other: Loop) -> Disagreement:
+    def _facing(self, loop: Loop, other: Loop) -> Loop | None:
+        """The other loop, from where this one comes from to where it goes, if it has such ends and is
+        not about the very same keyframes."""
+        if {loop.a, loop.b} == {other.a, other.b}:
+            return None
         chart = self._chart
-        if chart.stretch_of(other.a) != chart.stretch_of(loop.a) == chart.stretch_of(other.b):
-            other = other.reverse()
-        if not chart.same_map(*(chart.trails.number(x.a) for x in (loop, other))):
-            other = other.reverse()
-        (a1, b1), (a2, b2) = chart.ends(loop), chart.ends(other)
-        return witness_disagreement(loop, chart.between(a1, a2), other, chart.between(b2, b1))
+        side = chart.stretch_of if chart.founder_of(loop.a) == chart.founder_of(loop.b) else chart.founder_of
+        ours = side(loop.a), side(loop.b)
+        for turned in (other, other.reverse()):
+            if (side(turned.a), side(turned.b)) == ours:
+                return turned
+        return None
+
+    def _witnesses(self, loops: Sequence[Loop]) -> int:
+        """At how many places they were seen from near, where nothing else is known to look the same."""
+        c = self._config
+        near = [
+            loop
+            for loop in loops
+            if np.linalg.norm(loop.T_a_b[:3, 3]) <= c.near_m and se3.angle(loop.T_a_b) <= c.near_rad
+        ]
+        return self._places([loop for loop in near if not self._looks_alike(loop)])
+
+    def _looks_alike(self, loop: Loop) -> bool:
+        chart, c = self._chart, self._config
+        for number in chart.ends(loop):
+            stretch = chart.trails.nodes[number].stretch
+            known = [n for n in self._alike if n in chart.poses and chart.trails.nodes[n].stretch == stretch]
+            if near_any(chart.poses[number], [chart.poses[n] for n in known], c.place_m, c.place_rad):
+                return True
+        return False
+
+    def _places(self, loops: Sequence[Loop]) -> int:
+        """How many places they tie: counted on either side, the lesser."""
+        apart = self._config.place_m, self._config.place_rad
+        sides: dict[int, list[F64]] = {}
+        for loop in loops:
+            for number in self._chart.ends(loop):
+                founder = self._chart.trails.nodes[number].stretch
+                sides.setdefault(founder, []).append(self._chart.poses[number])
+        return min((distinct(np.array(poses), *apart) for poses in sides.values()), default=0)
 
     # ------------------------------------------------------------ believing
 
@@ -179,9 +206,13 @@ class Judge:
         return Decision(True, reason, (survivor, gone), (*loops, *waited))
 
     def _believe(self, loops: Sequence[Loop]) -> None:
-        self.waiting = [loop for loop in self.waiting if loop not in loops]
+        told = {frozenset((loop.a, loop.b)) for loop in loops}
+        self.waiting = [loop for loop in self.waiting if frozenset((loop.a, loop.b)) not in told]
         for loop in loops:
             self._chart.tie(loop)
+
+    def _wait(self, loop: Loop) -> None:
+        self.waiting = [*self.waiting, loop][-self._config.max_pending :]
 
 
 def that_waited(loops: Sequence[Loop]) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from share.geometry import se3
@@ -13,10 +15,15 @@ def distinct(poses: F64, apart_m: float, apart_rad: float) -> int:
     was counted before it."""
     counted: list[F64] = []
     for T in poses:
-        if counted:
-            step = se3.inverse(np.array(counted)) @ T
-            away = np.linalg.norm(step[:, :3, 3], axis=1)
-            if ((away <= apart_m) & (se3.angle(step) <= apart_rad)).any():
-                continue
-        counted.append(T)
+        if not near_any(T, counted, apart_m, apart_rad):
+            counted.append(T)
     return len(counted)
+
+
+def near_any(T: F64, poses: Sequence[F64], within_m: float, within_rad: float) -> bool:
+    """Whether pose T (4, 4) lies as near as this to one of the others."""
+    if not len(poses):
+        return False
+    step = se3.inverse(np.array(poses)) @ T
+    away = np.linalg.norm(step[:, :3, 3], axis=1)
+    return bool(((away <= within_m) & (se3.angle(step) <= within_rad)).any())

@@ -9,9 +9,7 @@ from share.graph.posegraph import Edge
 def roads_of(room: Room, seed: int) -> tuple[Roads, list[Edge]]:
     """With no two edges equally sure, so that there is one surest path."""
     rng = np.random.default_rng(seed)
-    edges = [
-        Edge(e.a, e.b, e.T_a_b, e.cov * rng.uniform(0.5, 2)) for e in (*room.chain, *room.closures)
-    ]
+    edges = [Edge(e.a, e.b, e.T_a_b, e.cov * rng.uniform(0.5, 2)) for e in (*room.chain, *room.closures)]
     roads = Roads()
     for edge in edges:
         roads.add(edge)
