@@ -103,7 +103,8 @@ def is_bare(path: Path) -> bool:
 
 def check_header(path: Path) -> None:
     """Raises DamageError if a byte is wrong by which SQLite would take it for another kind of file."""
-    head, expected = path.open("rb").read(_HEADER_BYTES), first_page()
+    with path.open("rb") as file:
+        head, expected = file.read(_HEADER_BYTES), first_page()
     kinds = set(head[18:20])  # of file, for writing and reading: 1 without a log, 2 with one
     if not is_bare(path) and (any(head[at] != expected[at] for at in _FIXED) or kinds - {1, 2}):
         raise DamageError("the header is damaged")

@@ -10,11 +10,14 @@ from share.errors import StoreError
 
 
 def obstacle(path: Path) -> str:
-    """Why the map at `path` cannot be written, for a person; "" if it can."""
+    """Why the map at `path` cannot be written, for a person; "" if it can.
+
+    The file itself is not opened: closing it would end all locks that this process has on it (POSIX, fcntl).
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists():
-            os.close(os.open(path, os.O_RDWR))
+        if path.exists() and not os.access(path, os.W_OK):
+            return "the file is read-only"
         with tempfile.TemporaryFile(dir=path.parent):  # SQLite puts files beside it
             return ""
     except OSError as error:

@@ -59,7 +59,7 @@ class MapStore:
 
     @staticmethod
     def read(path: Path, reason: str = "it was opened for reading") -> MapStore:
-        """A map to read only, beside a running edge too. Raises UsageError, StoreError."""
+        """A map to read only, beside an edge in another process too. Raises UsageError, ShareError."""
         return MapStore(path, *look(path), reason)
 
     def write(self, news: Sequence[Change]) -> None:
@@ -68,6 +68,7 @@ class MapStore:
         Raises StoreError if the disk is full or fails: then none was kept, and it may be tried again.
         """
         db = self._writer()
+        self._kept = None  # of before
         try:
             db.execute("BEGIN IMMEDIATE")
             for change in news:
