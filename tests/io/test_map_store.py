@@ -100,7 +100,9 @@ def test_retired_keyframes_go_but_not_their_numbers(path):
 
 def test_the_order_of_stretches_outlives_their_keyframes(path):
     with MapStore.open(path) as store:
-        store.write([run(ANN), run(BOB), keyframe(ANN, 0), keyframe(BOB, 0), keyframe(ANN, 1, stretch=1, first=True)])
+        store.write(
+            [run(ANN), run(BOB), keyframe(ANN, 0), keyframe(BOB, 0), keyframe(ANN, 1, stretch=1, first=True)]
+        )
         store.write([Retire((Key(ANN, 0),))])
     assert again(path).stretches == (f"{ANN}/0", f"{BOB}/0", f"{ANN}/1")
 
@@ -148,7 +150,9 @@ def keyframes_for_a_reader(path) -> int:
         "import sys; from pathlib import Path; from share.io.map_store import MapStore\n"
         "print(len(MapStore.read(Path(sys.argv[1])).load().keyframes))"
     )
-    return int(subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, check=True).stdout)
+    return int(
+        subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, check=True).stdout
+    )
 
 
 def test_what_is_no_map_is_left_as_it_is(tmp_path):

@@ -14,6 +14,7 @@ from share.io.files import writing
 from share.io.map_store import connect, reading, schema
 from share.io.map_store.connect import DamageError, complaints
 from share.io.map_store.salvage import copied, finish, salvage, whole_of
+from share.io.map_store.scan import whole_rows, with_copies
 
 
 def examine(path: Path) -> Kept:
@@ -46,7 +47,7 @@ def look(path: Path) -> tuple[Kept, int]:
             _migrate(copy, found)
             return _contents(copy), found
     except DamageError:
-        kept = reading.kept(reading.with_copies(whole_of(path)))
+        kept = reading.kept(with_copies(whole_of(path)))
         return _with(kept, "the file is damaged; only what is whole was read"), schema.SCHEMA
 
 
@@ -88,7 +89,7 @@ def _contents(path: Path) -> Kept:
         (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
         if verdict != "ok":
             raise DamageError(verdict)
-        found = reading.whole_rows(connection)
+        found = whole_rows(connection)
     if found.damaged:
         raise DamageError("rows")
     return reading.kept(found)

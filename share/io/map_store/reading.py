@@ -1,96 +1,20 @@
-"""All that is whole in a map file, as values; what is not is counted, never guessed."""
+"""The rows of a map file as values, and what is missing as lines for a person."""
 
 from __future__ import annotations
 
-import contextlib
-import sqlite3
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from share.core.keeping import KeepKeyframe, KeepPoses, Kept
 from share.core.mending import mended
 from share.errors import WireError
 from share.io.map_store import rows
-from share.io.map_store.connect import BROKEN
-from share.io.map_store.rows import COLUMNS, Row, is_whole
+from share.io.map_store.rows import Row
+from share.io.map_store.scan import Found
 from share.merge.join import Key
 
-PROBES = 100_000  # numbers looked up one by one between two parts of a damaged table
-
-
-@dataclass
-class Found:
-    """Whole rows by table, with their numbers, and how many others there are."""
-
-    tables: dict[str, list[tuple[int, Row]]] = field(default_factory=dict)
-    lost: Counter[str] = field(default_factory=Counter)
-
-    def size(self) -> int:
-        return sum(map(len, self.tables.values()))
-
-    @property
-    def damaged(self) -> bool:
-        return any(self.lost.values())
-
-
-def whole_rows(connection: sqlite3.Connection) -> Found:
-    """Every row of every table that can be read and whose CRC is right."""
-    found = Found()
-    for table in COLUMNS:
-        everything = dict(_scan(connection, table))
-        good = {n: row for n, row in everything.items() if is_whole(table, n, row)}
-        found.tables[table] = [(n, row[:-1]) for n, row in sorted(good.items())]
-        found.lost[table] = max(_count(connection, table), len(everything)) - len(good)
-    return found
-
-
-def with_copies(found: Found) -> Found:
-    """Runs that can be read in only one of their two tables, in both."""
-    first, second = (dict(found.tables[table]) for table in ("run", "run_copy"))
-    both = sorted((second | first).items())
-    there = max(len(first) + found.lost["run"], len(second) + found.lost["run_copy"])
-    lost = found.lost.copy()
-    lost["run"], lost["run_copy"] = there - len(both), 0
-    return Found(found.tables | {"run": both, "run_copy": both}, lost)
-
-
-def _scan(connection: sqlite3.Connection, table: str) -> Iterator[tuple[int, Row]]:
-    """From the front; where that breaks, from the back; and in between number by number."""
-    columns = ", ".join(COLUMNS[table])
-    select = f"SELECT number, {columns}, crc FROM {table} NOT INDEXED"
-    low, high = 0, None
-    try:
-        connection.execute(f"{select} LIMIT 0")
-    except BROKEN:
-        return  # not even the table is known
-    try:
-        for number, *row in connection.execute(f"{select} ORDER BY number"):
-            low = number
-            yield number, tuple(row)
-        return
-    except BROKEN:
-        pass
-    with contextlib.suppress(*BROKEN):
-        for number, *row in connection.execute(f"{select} WHERE number > ? ORDER BY number DESC", (low,)):
-            high = number
-            yield number, tuple(row)
-    for number in range(low + 1, min(high or low + PROBES, low + PROBES)):
-        with contextlib.suppress(*BROKEN):
-            for _, *row in connection.execute(f"{select} WHERE number = ?", (number,)):
-                yield number, tuple(row)
-
-
-def _count(connection: sqlite3.Connection, table: str) -> int:
-    """As an index has it, which is another part of the file; 0 where that cannot be read either."""
-    try:
-        return int(connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0])
-    except BROKEN:
-        return 0
-
-
-# ---------------------------------------------------------------- values
+_TIED = "keyframes lost the one before them and are tied to an earlier one"
+_UNSOLVED = "solutions could not be read: odometry and loops say where keyframes are"
 
 
 def kept(found: Found) -> Kept:
@@ -105,17 +29,17 @@ def kept(found: Found) -> Kept:
     whole = mended([k for k in keyframes if k.key in runs], {link.key: link for link in links})
     there = {k.at for k in whole.keyframes}
     tied = tuple(loop for loop in loops if loop.a in there and loop.b in there)
-    lost = {
-        "agent runs could not be read": bad_runs,
-        "keyframes could not be read": bad_keyframes,
-        "keyframes are of a run that could not be read": len(homeless),
-        "keyframes lost the one before them and are tied to an earlier one": whole.tied,
-        "odometry edges could not be read": bad_links,
-        "loops could not be read": bad_loops,
-        "loops led to lost keyframes": len(loops) - len(tied),
-        "stretches could not be read": found.lost["stretch"],
-        "solutions could not be read: odometry and loops say where keyframes are": bad_poses,
-    }
+    lost = [
+        _counted(found, "run", bad_runs, "agent runs could not be read"),
+        _counted(found, "keyframe", bad_keyframes, "keyframes could not be read"),
+        _counted(found, "", len(homeless), "keyframes are of a run that could not be read"),
+        _counted(found, "", whole.tied if found.damaged else 0, _TIED),
+        _counted(found, "link", bad_links, "odometry edges could not be read"),
+        _counted(found, "loop", bad_loops, "loops could not be read"),
+        _counted(found, "", len(loops) - len(tied), "loops led to lost keyframes"),
+        _counted(found, "stretch", found.lost["stretch"], "stretches could not be read"),
+        _counted(found, "poses", bad_poses, _UNSOLVED),
+    ]
     return Kept(
         tuple(runs.values()),
         _stretches(found, whole.keyframes),
@@ -124,8 +48,15 @@ def kept(found: Found) -> Kept:
         tied,
         _present(poses[0], there) if poses else None,
         _next(found, whole.keyframes),
-        tuple(f"{n} {what}" for what, n in lost.items() if n),
+        tuple(line for line in lost if line),
     )
+
+
+def _counted(found: Found, table: str, lost: int, what: str) -> str:
+    """One line, "" if nothing is lost."""
+    if table in found.uncounted:
+        return f"an unknown number of {what}"
+    return f"{lost} {what}" if lost else ""
 
 
 def _values(found: Found, table: str, value: Callable[[Row], Any]) -> tuple[list[Any], int]:

@@ -16,8 +16,8 @@ from pathlib import Path
 from share.io.files import sync_folder, writing
 from share.io.map_store import connect, schema
 from share.io.map_store.connect import BROKEN
-from share.io.map_store.reading import Found, whole_rows, with_copies
 from share.io.map_store.rows import insert
+from share.io.map_store.scan import Found, whole_rows, with_copies
 
 # What hangs on rows that are lost. A keyframe that its agent still has may come again under its number.
 _ORPHANS = (
@@ -43,7 +43,7 @@ def copied(path: Path, folder: Path | None = None) -> Iterator[Path]:
 def whole_of(path: Path, folder: Path | None = None) -> Found:
     """What is whole of a damaged file, read from a copy; with a first page of our own, if that finds more.
 
-    The first page, where all tables begin, is the same in all maps, but for counters that reading does without.
+    The first page says where tables begin. It is the same in all maps, but for counters.
     """
     with copied(path, folder) as copy:
         as_it_is = _found(copy)

@@ -12,6 +12,7 @@ from share.core.keeping import Change, Kept
 from share.errors import StoreError, UsageError
 from share.io.map_store import changes, lock, reading, schema
 from share.io.map_store.opening import examine, look, make
+from share.io.map_store.scan import whole_rows
 
 
 class MapStore:
@@ -88,7 +89,7 @@ class MapStore:
             return kept
         if self._db is None:
             return look(self.path)[0]
-        return reading.kept(reading.whole_rows(self._db))
+        return reading.kept(whole_rows(self._db))
 
     def close(self) -> None:
         """Moves the log into the file and gives it free."""
