@@ -1,4 +1,4 @@
-"""A writer that is killed: what `write` returned for is there, once; of the rest at most the list in flight."""
+"""A writer that is killed: what `write` returned for is there, once; and at most the list in flight."""
 
 import os
 import random
@@ -56,7 +56,7 @@ def test_killed_at_random_instants(tmp_path, kills):
 
 def life_and_death(path: Path, seed: int, seconds: float) -> tuple[int, int]:
     """The last numbers that were offered and written."""
-    command = [sys.executable, "-c", WRITER, str(path), str(seed), str(Path(__file__).parent)]
+    command = [sys.executable, "-c", WRITER, str(path), str(seed), str(Path(__file__).parents[1])]
     writer = subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"}
     )
