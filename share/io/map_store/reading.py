@@ -18,7 +18,8 @@ _UNSOLVED = "solutions could not be read: odometry and loops say where keyframes
 
 
 def kept(found: Found) -> Kept:
-    """What the rows say. Raises StoreError if they are of another wire version."""
+    """What the rows say; they are taken out of `found`. Raises StoreError for another wire version."""
+    following = {key: next for _, (key, next, *_) in found.tables["run"]}
     all_runs, bad_runs = _values(found, "run", rows.run)
     runs = {run.key: run for run in all_runs}
     keyframes, bad_keyframes = _values(found, "keyframe", rows.keyframe)
@@ -47,7 +48,7 @@ def kept(found: Found) -> Kept:
         whole.links,
         tied,
         _present(poses[0], there) if poses else None,
-        _next(found, whole.keyframes),
+        _next(following, whole.keyframes),
         tuple(line for line in lost if line),
     )
 
@@ -60,9 +61,11 @@ def _counted(found: Found, table: str, lost: int, what: str) -> str:
 
 
 def _values(found: Found, table: str, value: Callable[[Row], Any]) -> tuple[list[Any], int]:
-    """Values of a table's rows, and how many are lost."""
-    out, lost = [], found.lost[table]
-    for _, row in found.tables[table]:
+    """Values of a table's rows, and how many are lost. Takes the rows out: both together would fill memory."""
+    out, lost, numbered = [], found.lost[table], found.tables[table]
+    numbered.reverse()
+    while numbered:
+        _, row = numbered.pop()
         try:
             out.append(value(row))
         except (ValueError, WireError):  # written by something that was wrong already
@@ -75,11 +78,10 @@ def _stretches(found: Found, keyframes: Sequence[KeepKeyframe]) -> tuple[str, ..
     return tuple(dict.fromkeys((*named, *(k.stretch for k in keyframes))))
 
 
-def _next(found: Found, keyframes: Sequence[KeepKeyframe]) -> dict[str, int]:
-    out = {key: following for _, (key, following, *_) in found.tables["run"]}
+def _next(following: dict[str, int], keyframes: Sequence[KeepKeyframe]) -> dict[str, int]:
     for keyframe in keyframes:
-        out[keyframe.key] = max(out[keyframe.key], keyframe.at.id + 1)
-    return out
+        following[keyframe.key] = max(following[keyframe.key], keyframe.at.id + 1)
+    return following
 
 
 def _present(poses: KeepPoses, there: set[Key]) -> KeepPoses:
