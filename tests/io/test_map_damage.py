@@ -206,3 +206,30 @@ def test_a_break_while_it_is_salvaged_loses_nothing(whole, tmp_path, monkeypatch
         assert told(store.load())["keyframes"] == good["keyframes"]
     assert path.with_name("room.sqlite.damaged-1").read_bytes() == as_it_was
     assert not path.with_name("room.sqlite.salvaged").exists()
+
+
+def test_a_damaged_log_costs_what_comes_after(tmp_path):
+    """As of a killed writer, whose log is not in the file yet. Of each commit all or nothing."""
+    path, copy = tmp_path / "room.sqlite", tmp_path / "killed" / "room.sqlite"
+    copy.parent.mkdir()
+    with MapStore.open(path) as store:
+        store.write([run(ANN)])
+        for i in range(0, 40, 2):
+            store.write([keyframe(ANN, i), keyframe(ANN, i + 1)])
+        file, log = path.read_bytes(), path.with_name("room.sqlite-wal").read_bytes()
+    draw, lost = random.Random(3), []
+    for _ in range(25):
+        for old in copy.parent.iterdir():
+            old.unlink()
+        changed = bytearray(log)
+        changed[draw.randrange(len(log))] ^= draw.randrange(1, 256)
+        copy.write_bytes(file)
+        copy.with_name("room.sqlite-wal").write_bytes(changed)
+        with MapStore.open(copy) as store:
+            kept = store.load()
+        numbers = [k.at.id for k in kept.keyframes]
+        assert numbers == list(range(len(numbers)))
+        assert len(numbers) % 2 == 0
+        assert kept.next_keyframe.get(ANN, 0) == len(numbers)
+        lost.append(40 - len(numbers))
+    assert 0 < max(lost) <= 40

@@ -34,7 +34,7 @@ _WORLD = (
 BROKEN = (sqlite3.Error, MemoryError, OverflowError, UnicodeError)  # all that reading damaged pages raises
 
 
-class DamageError(Exception):
+class DamageError(StoreError):
     """The file is a map, and not whole."""
 
 
@@ -68,7 +68,7 @@ def complaints(path: Path, doing: str) -> Iterator[None]:
         yield
     except BROKEN as error:
         if is_damage(error):
-            raise DamageError(str(error)) from None
+            raise DamageError(f"{path}: the map is damaged: {error}") from None
         raise StoreError(f"{path}: the map cannot be {doing}: {error}") from None
 
 
@@ -107,7 +107,7 @@ def check_header(path: Path) -> None:
         head, expected = file.read(_HEADER_BYTES), first_page()
     kinds = set(head[18:20])  # of file, for writing and reading: 1 without a log, 2 with one
     if not is_bare(path) and (any(head[at] != expected[at] for at in _FIXED) or kinds - {1, 2}):
-        raise DamageError("the header is damaged")
+        raise DamageError(f"{path}: the map is damaged: its header")
 
 
 def is_map(path: Path) -> bool:

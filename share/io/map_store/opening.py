@@ -69,7 +69,7 @@ def _version(path: Path) -> int:
             return schema.SCHEMA
         found = schema.version(connection)
     if found is None:
-        raise DamageError("no schema")
+        raise DamageError(f"{path}: the map is damaged: it does not say its schema")
     if found > schema.SCHEMA:
         raise UsageError(
             f"{path}: was made by a newer SHARE (schema {found}, this one knows {schema.SCHEMA}); "
@@ -85,13 +85,13 @@ def _contents(path: Path) -> Kept:
         if schema.is_empty(connection):
             return Kept()
         if not schema.is_ours(connection):
-            raise DamageError("tables")
+            raise DamageError(f"{path}: the map is damaged: its tables")
         (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
         if verdict != "ok":
-            raise DamageError(verdict)
+            raise DamageError(f"{path}: the map is damaged: {verdict}")
         found = whole_rows(connection)
     if found.damaged:
-        raise DamageError("rows")
+        raise DamageError(f"{path}: the map is damaged: its rows")
     return reading.kept(found)
 
 
@@ -112,9 +112,7 @@ def _migrate(path: Path, found: int) -> None:
             connection.isolation_level = None
             schema.migrate(connection, found, schema.STEPS)
     except DamageError as error:
-        raise StoreError(
-            f"{path}: is of schema {found} and damaged ({error}); use the SHARE that made it"
-        ) from None
+        raise StoreError(f"{error}; it is of schema {found}: use the SHARE that made it") from None
 
 
 def _with(kept: Kept, complaint: str) -> Kept:

@@ -61,7 +61,7 @@ def _counted(found: Found, table: str, lost: int, what: str) -> str:
 
 
 def _values(found: Found, table: str, value: Callable[[Row], Any]) -> tuple[list[Any], int]:
-    """Values of a table's rows, and how many are lost. Takes the rows out: both together would fill memory."""
+    """Values of a table's rows, and how many are lost. Takes the rows out, to save memory."""
     out, lost, numbered = [], found.lost[table], found.tables[table]
     numbered.reverse()
     while numbered:

@@ -75,7 +75,7 @@ def of_link(link: KeepLink) -> Row:
 
 
 def of_loop(loop: Loop) -> Row:
-    return (*loop.a, *loop.b, _bytes(loop.T_a_b), _bytes(loop.cov), loop.inliers)
+    return (*loop.a, *loop.b, _bytes(loop.T_a_b), _bytes(loop.cov), int(loop.inliers))
 
 
 def of_poses(poses: KeepPoses) -> Row:
