@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from share.core.keeping import Change, KeepKeyframe, KeepLoop, KeepPoses, KeepRun, Kept
+from share.core.keeping import Change, KeepKeyframe, KeepLoop, KeepPoses, KeepRun, Kept, KeptKeyframe
 from share.geometry import se3
 from share.merge.join import Key, Loop
 from share.types import F64, AgentKind, Keyframe, View
@@ -22,7 +22,7 @@ def run(key: str) -> KeepRun:
     return KeepRun(key, Hello(name, AgentKind.AR, int(number, 16), 400.0, pose(3)))
 
 
-def keyframe(key: str, i: int, points: int = 40, stretch: int = 0, first: bool = False) -> KeepKeyframe:
+def keyframe(key: str, i: int, points: int = 40, first: bool = False) -> KeepKeyframe:
     """Number i of a run, relative to the one before unless it is the first of a stretch."""
     rng = np.random.default_rng([i, *key.encode()])
     view = View(
@@ -35,7 +35,13 @@ def keyframe(key: str, i: int, points: int = 40, stretch: int = 0, first: bool =
     cov = np.diag([1e-6, 1e-6, 1e-6, 1e-5, 1e-5, 2e-5])
     up = np.array([0.0, 0.0, 1.0])
     own = Keyframe(i, -1 if begins else i - 1, 10**9 + i * 10**8, T, cov, up, view, i - 1)
-    return KeepKeyframe(key, own, pose(i), f"{key}/{stretch}")
+    return KeepKeyframe(key, own, pose(i))
+
+
+def kept_keyframe(key: str, i: int, stretch: int = 0) -> KeptKeyframe:
+    """The same, found again."""
+    sent = keyframe(key, i)
+    return KeptKeyframe(key, sent.keyframe, sent.T_odom_body, f"{key}/{stretch}", i)
 
 
 def loop(i: int, j: int) -> Loop:
@@ -67,7 +73,7 @@ def told(kept: Kept) -> dict[str, object]:
     }
 
 
-def _keyframe(k: KeepKeyframe) -> tuple[object, ...]:
+def _keyframe(k: KeptKeyframe) -> tuple[object, ...]:
     own = k.keyframe
     arrays = (
         k.T_odom_body,
@@ -78,4 +84,11 @@ def _keyframe(k: KeepKeyframe) -> tuple[object, ...]:
         own.view.points,
         own.view.descriptors,
     )
-    return (k.at, k.stretch, own.reference, own.stamp_ns, own.follows, *(a.tobytes() for a in arrays))
+    return (
+        k.at,
+        (k.stretch, k.ordinal),
+        own.reference,
+        own.stamp_ns,
+        own.follows,
+        *(a.tobytes() for a in arrays),
+    )

@@ -59,9 +59,7 @@ def keyframes() -> Callable[[int], KeepKeyframe]:
     step, up = np.eye(4), np.array([0.0, 0.0, 1.0])
 
     def make(i: int) -> KeepKeyframe:
-        return KeepKeyframe(
-            RUN, Keyframe(i, i - 1, i * 10**8, step, np.eye(6) * 1e-6, up, view), step, f"{RUN}/0"
-        )
+        return KeepKeyframe(RUN, Keyframe(i, i - 1, i * 10**8, step, np.eye(6) * 1e-6, up, view), step)
 
     return make
 

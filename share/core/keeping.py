@@ -28,7 +28,7 @@ class KeepRun:
 
 @dataclass(frozen=True, eq=False)
 class KeepKeyframe:
-    """A keyframe as it came. key: of its run. T_odom_body (4, 4): on its stretch, `stretch` by name.
+    """A keyframe of a run, and where it stands in its odometry: T_odom_body (4, 4).
 
     Numbers of a run rise; one that is not above all before was kept already, or retired, and changes nothing.
     """
@@ -36,7 +36,6 @@ class KeepKeyframe:
     key: str
     keyframe: Keyframe
     T_odom_body: F64
-    stretch: str
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_odom_body", checked_pose("T_odom_body", self.T_odom_body))
@@ -44,6 +43,15 @@ class KeepKeyframe:
     @property
     def at(self) -> Key:
         return Key(self.key, self.keyframe.id)
+
+
+@dataclass(frozen=True, eq=False)
+class KeptKeyframe(KeepKeyframe):
+    """Found again. stretch: `key/n`, the n-th of its run; a keyframe without a reference begins one.
+    ordinal: how many came before it there, retired ones too, if they were not its newest."""
+
+    stretch: str
+    ordinal: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +128,7 @@ class Kept:
 
     runs: tuple[KeepRun, ...] = ()
     stretches: tuple[str, ...] = ()
-    keyframes: tuple[KeepKeyframe, ...] = ()
+    keyframes: tuple[KeptKeyframe, ...] = ()
     links: Mapping[Key, KeepLink] = field(default_factory=dict)
     loops: tuple[Loop, ...] = ()
     poses: KeepPoses | None = None

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from share.core.keeping import KeepKeyframe, Kept, placed
+from share.core.keeping import Kept, KeptKeyframe, placed
 from share.errors import UsageError
 from share.geometry import se3
 from share.io.files import atomic_write, writable_dir, writing
@@ -71,7 +71,7 @@ def file_names(kept: Kept) -> dict[str, str]:
 
 def _write_all(kept: Kept, work: Path, progress: Callable[[int], None]) -> dict[str, Exported]:
     poses = placed(kept)
-    by_map: dict[str, list[KeepKeyframe]] = {}
+    by_map: dict[str, list[KeptKeyframe]] = {}
     for keyframe in kept.keyframes:
         by_map.setdefault(poses[keyframe.at][0], []).append(keyframe)
     done = {}
@@ -88,10 +88,10 @@ def _write_all(kept: Kept, work: Path, progress: Callable[[int], None]) -> dict[
 
 
 def _write_trajectories(
-    kept: Kept, keyframes: list[KeepKeyframe], T: dict[Key, F64], folder: Path
+    kept: Kept, keyframes: list[KeptKeyframe], T: dict[Key, F64], folder: Path
 ) -> tuple[str, ...]:
     names = file_names(kept)
-    by_run: dict[str, list[KeepKeyframe]] = {}
+    by_run: dict[str, list[KeptKeyframe]] = {}
     for keyframe in keyframes:
         by_run.setdefault(keyframe.key, []).append(keyframe)
     for run, own in by_run.items():
@@ -103,7 +103,7 @@ def _write_trajectories(
 
 
 def _clouds(
-    kept: Kept, keyframes: list[KeepKeyframe], T: dict[Key, F64], progress: Callable[[int], None]
+    kept: Kept, keyframes: list[KeptKeyframe], T: dict[Key, F64], progress: Callable[[int], None]
 ) -> Iterator[tuple[F64, Colour]]:
     """The points that each keyframe saw, in the map, in its agent's colour."""
     runs = {run.key: (run.hello.T_body_cam0, COLOURS[i % len(COLOURS)]) for i, run in enumerate(kept.runs)}

@@ -117,9 +117,14 @@ def test_a_row_that_says_something_else_is_not_believed(whole, tmp_path):
     connection.execute("UPDATE loop SET inliers = 999 WHERE number = 2")
     connection.execute("UPDATE keyframe SET number = 1000 WHERE number = 7")
     connection.execute("UPDATE run SET next = 3")
+    connection.execute("UPDATE stretch SET nth = 7 WHERE number = 1")
     connection.close()
     with MapStore.open(path) as store:
         kept = store.load()
+        store.write([keyframe(ANN, 20)])
+        newest = store.load().keyframes[-1]
+    assert (newest.stretch, newest.ordinal) == (f"{ANN}/0", 20)
+    assert kept.stretches == (f"{BOB}/0", f"{ANN}/0")
     assert len(kept.loops) == 4
     assert len(kept.keyframes) == 39
     assert kept.next_keyframe == {ANN: 20, BOB: 20}

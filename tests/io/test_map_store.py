@@ -100,11 +100,14 @@ def test_retired_keyframes_go_but_not_their_numbers(path):
 
 def test_the_order_of_stretches_outlives_their_keyframes(path):
     with MapStore.open(path) as store:
-        store.write(
-            [run(ANN), run(BOB), keyframe(ANN, 0), keyframe(BOB, 0), keyframe(ANN, 1, stretch=1, first=True)]
-        )
+        store.write([run(ANN), run(BOB), keyframe(ANN, 0), keyframe(BOB, 0), keyframe(ANN, 1, first=True)])
         store.write([Retire((Key(ANN, 0),))])
-    assert again(path).stretches == (f"{ANN}/0", f"{BOB}/0", f"{ANN}/1")
+        store.write([keyframe(ANN, 2), keyframe(ANN, 3), Retire((Key(ANN, 2),)), keyframe(ANN, 4)])
+        store.write([keyframe(ANN, 5, first=True)])
+    kept = again(path)
+    assert kept.stretches == (f"{ANN}/0", f"{BOB}/0", f"{ANN}/1", f"{ANN}/2")
+    places = [(k.at.id, k.stretch, k.ordinal) for k in kept.keyframes if k.key == ANN]
+    assert places == [(1, f"{ANN}/1", 0), (3, f"{ANN}/1", 2), (4, f"{ANN}/1", 3), (5, f"{ANN}/2", 0)]
 
 
 def test_two_loops_may_tie_one_pair(path):

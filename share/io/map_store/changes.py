@@ -55,9 +55,19 @@ def _run(db: sqlite3.Connection, change: KeepRun) -> None:
 def _keyframe(db: sqlite3.Connection, change: KeepKeyframe) -> None:
     if change.at.id < _next(db, change.key):
         return
-    if not _one(db, "SELECT 1 FROM stretch WHERE name = ?", change.stretch):
-        insert(db, "stretch", (change.stretch,))
-    insert(db, "keyframe", rows.of_keyframe(change))
+    stretch, ordinal = _place(db, change.key, begins=change.keyframe.reference < 0)
+    insert(db, "keyframe", rows.of_keyframe(change, stretch, ordinal))
+
+
+def _place(db: sqlite3.Connection, run: str, begins: bool) -> tuple[int, int]:
+    """The run's newest stretch, since a keyframe refers to the one before it, or a new one; the place on it."""
+    (stretch,) = _one(db, "SELECT ifnull(max(nth), -1) FROM stretch WHERE run = ?", run)
+    if begins or stretch < 0:
+        insert(db, "stretch", (run, stretch + 1))
+        return stretch + 1, 0
+    newest = "SELECT stretch, ordinal FROM keyframe WHERE run = ? ORDER BY id DESC LIMIT 1"
+    before, ordinal = _one(db, newest, run) or (-1, -1)
+    return stretch, ordinal + 1 if before == stretch else 0
 
 
 def _next(db: sqlite3.Connection, run: str) -> int:

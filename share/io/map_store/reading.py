@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from share.core.keeping import KeepKeyframe, KeepPoses, Kept
+from share.core.keeping import KeepPoses, Kept, KeptKeyframe
 from share.core.mending import mended
 from share.errors import WireError
 from share.io.map_store import rows
@@ -73,12 +73,12 @@ def _values(found: Found, table: str, value: Callable[[Row], Any]) -> tuple[list
     return out, lost
 
 
-def _stretches(found: Found, keyframes: Sequence[KeepKeyframe]) -> tuple[str, ...]:
-    named = [row[0] for _, row in found.tables["stretch"]]
+def _stretches(found: Found, keyframes: Sequence[KeptKeyframe]) -> tuple[str, ...]:
+    named = [rows.stretch_name(*row) for _, row in found.tables["stretch"]]
     return tuple(dict.fromkeys((*named, *(k.stretch for k in keyframes))))
 
 
-def _next(following: dict[str, int], keyframes: Sequence[KeepKeyframe]) -> dict[str, int]:
+def _next(following: dict[str, int], keyframes: Sequence[KeptKeyframe]) -> dict[str, int]:
     for keyframe in keyframes:
         following[keyframe.key] = max(following[keyframe.key], keyframe.at.id + 1)
     return following

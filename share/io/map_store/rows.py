@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from share.core.keeping import KeepKeyframe, KeepLink, KeepPoses, KeepRun
+from share.core.keeping import KeepKeyframe, KeepLink, KeepPoses, KeepRun, KeptKeyframe
 from share.errors import StoreError
 from share.merge.join import Key, Loop
 from share.types import F64, Keyframe
@@ -22,8 +22,8 @@ COLUMNS = {
     "about": ("name", "value"),
     "run": ("key", "next", "codec", "hello"),
     "run_copy": ("key", "next", "codec", "hello"),
-    "stretch": ("name",),
-    "keyframe": ("run", "id", "stretch", "codec", "T_odom_body", "message"),
+    "stretch": ("run", "nth"),
+    "keyframe": ("run", "id", "stretch", "ordinal", "codec", "T_odom_body", "message"),
     "link": ("run", "id", "reference", "T_ref_body", "cov"),
     "loop": ("a_run", "a_id", "b_run", "b_id", "T_a_b", "cov", "inliers"),
     "poses": ("keys", "T_map_body"),
@@ -65,9 +65,9 @@ def of_run(run: KeepRun, next_keyframe: int) -> Row:
     return run.key, next_keyframe, codec.VERSION, _message(run.hello)
 
 
-def of_keyframe(keyframe: KeepKeyframe) -> Row:
+def of_keyframe(keyframe: KeepKeyframe, stretch: int, ordinal: int) -> Row:
     place = _bytes(keyframe.T_odom_body)
-    return (*keyframe.at, keyframe.stretch, codec.VERSION, place, _message(keyframe.keyframe))
+    return (*keyframe.at, stretch, ordinal, codec.VERSION, place, _message(keyframe.keyframe))
 
 
 def of_link(link: KeepLink) -> Row:
@@ -91,12 +91,17 @@ def run(row: Row) -> KeepRun:
     return KeepRun(key, _decoded(messages.Hello, version, hello))
 
 
-def keyframe(row: Row) -> KeepKeyframe:
-    agent, id, stretch, version, place, message = row
+def keyframe(row: Row) -> KeptKeyframe:
+    agent, id, stretch, ordinal, version, place, message = row
     own = _decoded(Keyframe, version, message)
     if own.id != id:
         raise ValueError(f"keyframe {agent}:{id} says that it is {own.id}")
-    return KeepKeyframe(agent, own, _array(place, 4, 4), stretch)
+    return KeptKeyframe(agent, own, _array(place, 4, 4), stretch_name(agent, stretch), ordinal)
+
+
+def stretch_name(run: str, nth: int) -> str:
+    """As the atlas calls it."""
+    return f"{run}/{nth}"
 
 
 def link(row: Row) -> KeepLink:

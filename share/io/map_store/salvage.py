@@ -27,6 +27,12 @@ _ORPHANS = (
     " OR (b_run, b_id) NOT IN (SELECT run, id FROM keyframe)",
 )
 
+# Stretches whose own row is lost.
+_NAMELESS = (
+    "SELECT DISTINCT run, stretch FROM keyframe"
+    " WHERE (run, stretch) NOT IN (SELECT run, nth FROM stretch) ORDER BY number"
+)
+
 
 @contextlib.contextmanager
 def copied(path: Path, folder: Path | None = None) -> Iterator[Path]:
@@ -108,4 +114,6 @@ def _write(found: Found, part: Path) -> None:
                     insert(connection, table, row, number)
         for statement in _ORPHANS:
             connection.execute(statement)
+        for stretch in connection.execute(_NAMELESS).fetchall():
+            insert(connection, "stretch", stretch)
         connection.execute("COMMIT")

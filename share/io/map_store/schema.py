@@ -19,9 +19,9 @@ TABLES = """
 CREATE TABLE about(number INTEGER PRIMARY KEY, name TEXT UNIQUE, value TEXT, crc INTEGER);
 CREATE TABLE run(number INTEGER PRIMARY KEY, key TEXT UNIQUE, next INTEGER, codec INTEGER, hello BLOB, crc INTEGER);
 CREATE TABLE run_copy(number INTEGER PRIMARY KEY, key TEXT UNIQUE, next INTEGER, codec INTEGER, hello BLOB, crc INTEGER);
-CREATE TABLE stretch(number INTEGER PRIMARY KEY, name TEXT UNIQUE, crc INTEGER);
-CREATE TABLE keyframe(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, stretch TEXT, codec INTEGER,
-    T_odom_body BLOB, message BLOB, crc INTEGER, UNIQUE(run, id));
+CREATE TABLE stretch(number INTEGER PRIMARY KEY, run TEXT, nth INTEGER, crc INTEGER, UNIQUE(run, nth));
+CREATE TABLE keyframe(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, stretch INTEGER, ordinal INTEGER,
+    codec INTEGER, T_odom_body BLOB, message BLOB, crc INTEGER, UNIQUE(run, id));
 CREATE TABLE link(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, reference INTEGER, T_ref_body BLOB, cov BLOB,
     crc INTEGER, UNIQUE(run, id));
 CREATE TABLE loop(number INTEGER PRIMARY KEY, a_run TEXT, a_id INTEGER, b_run TEXT, b_id INTEGER, T_a_b BLOB,
