@@ -33,3 +33,7 @@ class WireError(ShareError):
 
 class TransportError(ShareError):
     """A socket cannot be opened or used (port in use, address not local)."""
+
+
+class StoreError(ShareError):
+    """The file of a map cannot be opened, read or written."""

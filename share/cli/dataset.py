@@ -1,4 +1,4 @@
-"""`share dataset`: look into, convert and recover recordings."""
+"""`share dataset`: look into, convert and recover recordings; look into and export maps."""
 
 from __future__ import annotations
 
@@ -8,35 +8,46 @@ from typing import Any
 
 import click
 
-from share.cli import options
+from share.cli import dataset_map, options
 from share.cli.progress import progress
 from share.errors import UsageError
 
 
 @click.group()
 def dataset() -> None:
-    """Look into, convert and recover recordings.
+    """Look into, convert and recover recordings; look into and export maps.
 
     \b
     Example:  share dataset info rec/kitchen
     """
 
 
-@dataset.command(short_help="Say what is in a recording.")
+dataset.add_command(dataset_map.export)
+
+
+@dataset.command(short_help="Say what is in a recording, or in a map.")
 @click.argument("source")
 @options.calib
 @options.frames
 @options.as_json
 def info(source: str, calib: str | None, frames: slice | None, as_json: bool) -> None:
-    """Say what is in a recording: streams, rates, gaps, calibration, truth.
+    """Say what is in a recording: streams, rates, gaps, calibration, truth; or in an edge's map.
 
     \b
     Example:  share dataset info rec/kitchen
               share dataset info session/ann --json
+              share dataset info room.sqlite
     """
     from share.io.describe import describe
+    from share.io.map_store import is_map
     from share.io.source import open_source
 
+    if is_map(Path(source)):
+        if calib or frames:
+            raise UsageError(f"{source}: is a map; --calib and --frames are for recordings")
+        found = dataset_map.info(Path(source))
+        click.echo(json.dumps(found) if as_json else dataset_map.info_text(found))
+        return
     description = describe(open_source(source, calib, frames))
     click.echo(json.dumps(description) if as_json else _text(description))
 

@@ -24,7 +24,7 @@ COMMANDS = {
     "track": ("share.cli.track", "track", "Track one agent, without an edge, as fast as it goes."),
     "agent": ("share.cli.agent", "agent", "Track one agent at sensor rate and share its map."),
     "edge": ("share.cli.edge", "edge", "Join the maps of all agents and send corrections back."),
-    "dataset": ("share.cli.dataset", "dataset", "Look into, convert and recover recordings."),
+    "dataset": ("share.cli.dataset", "dataset", "Look into, convert and recover recordings; export maps."),
     "emulate": ("share.cli.emulate", "emulate", "Record agents that move through a virtual room."),
     "keys": ("share.cli.keys", "keys", "Who may connect to an edge from another machine."),
 }

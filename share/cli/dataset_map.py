@@ -1,0 +1,69 @@
+"""`share dataset` for the edge's map: what is in it, and its export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from share.cli import options
+from share.cli.progress import progress
+from share.errors import UsageError
+
+
+@click.command(short_help="Write an edge's map as TUM and PLY files.")
+@click.argument("map_file", metavar="MAP")
+@click.option("--out", required=True, metavar="DIR", help="A new folder.")
+@options.as_json
+def export(map_file: str, out: str, as_json: bool) -> None:
+    """Write an edge's map for other programs: trajectories, points, loops.
+
+    DIR gets NAME.tum for each agent, points.ply and loops.csv; if there are several maps, each gets a folder
+    of its own. An edge may be running with the map.
+
+    \b
+    Example:  share dataset export room.sqlite --out room
+    """
+    import json
+
+    from share.io.map_export import export as run
+    from share.io.map_store import MapStore
+
+    if not Path(map_file).is_file():
+        raise UsageError(f"{map_file}: no such file")
+    kept = MapStore.read(Path(map_file)).load()
+    for complaint in kept.complaints:
+        click.echo(f"share: {map_file}: {complaint}", err=True)
+    with progress(len(kept.keyframes), "exporting") as bar:
+        done = run(kept, Path(out), bar)
+    if as_json:
+        click.echo(json.dumps({name: {**vars(e), "folder": str(e.folder)} for name, e in done.items()}))
+        return
+    for name, e in done.items():
+        click.echo(
+            f"{e.folder}: map {name}, {e.keyframes} keyframes of {', '.join(e.agents)}; "
+            f"{e.points} points, {e.loops} loops"
+        )
+
+
+def info(path: Path) -> dict[str, Any]:
+    """Of a map file. Raises ShareError."""
+    from share.io.map_describe import describe_map
+    from share.io.map_store import MapStore
+
+    return describe_map(MapStore.read(path))
+
+
+def info_text(d: dict[str, Any]) -> str:
+    """For a person."""
+    lines = [f"{d['name']}: map, schema {d['schema']}, {d['bytes'] / 1e6:.1f} MB"]
+    for name, agent in d["agents"].items():
+        retired = agent["next_keyframe"] - agent["keyframes"]
+        stretches = f", {agent['stretches']} stretches" if agent["stretches"] > 1 else ""
+        lines.append(
+            f"  {name:<10} {agent['kind']:<6} {agent['keyframes']:>6} keyframes, {retired} gone{stretches}"
+        )
+    lines += [f"  map {name}: {count} keyframes" for name, count in d["maps"].items()]
+    lines.append(f"  {d['loops']} loops, {d['solved']} keyframes in the newest solution")
+    return "\n".join(lines + [f"  damage: {line}" for line in d["damage"]])

@@ -1,0 +1,118 @@
+"""One way to open a map file with SQLite, and one to say what SQLite complains of."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import quote
+
+from share.errors import StoreError, UsageError
+from share.io.map_store.schema import PAGE_BYTES, first_page
+
+BUSY_S = 5.0  # how long a commit waits for a reader of another process
+WAL_PAGES = 512  # after as many (4 MiB) the log is moved into the file
+MAGIC = b"SQLite format 3\0"
+_HEADER_BYTES = 100
+_FIXED = (*range(18), *range(20, 24), *range(44, 48), *range(52, 60))  # sqlite.org/fileformat.html, 1.3
+_OURS = b"CREATE TABLE keyframe(", b"CREATE TABLE run_copy("  # one survives a flipped byte
+
+# The world's troubles; whatever else SQLite says of a file, the file is damaged.
+_WORLD = (
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED,
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_NOMEM,
+    sqlite3.SQLITE_READONLY,
+    sqlite3.SQLITE_PERM,
+)
+
+BROKEN = (sqlite3.Error, MemoryError, OverflowError, UnicodeError)  # all that reading damaged pages raises
+
+
+class DamageError(StoreError):
+    """The file is a map, and not whole."""
+
+
+def for_writing(path: Path, power_cut: bool) -> sqlite3.Connection:
+    """The one writer. power_cut: a commit waits for the disk, so that not even that costs one."""
+    connection = sqlite3.connect(path, BUSY_S, isolation_level=None, check_same_thread=False)
+    connection.execute(f"PRAGMA page_size = {PAGE_BYTES}")
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute(f"PRAGMA synchronous = {'FULL' if power_cut else 'NORMAL'}")
+    connection.execute(f"PRAGMA wal_autocheckpoint = {WAL_PAGES}")
+    connection.execute(f"PRAGMA journal_size_limit = {4 * WAL_PAGES * PAGE_BYTES}")
+    return connection
+
+
+def for_reading(path: Path) -> sqlite3.Connection:
+    """Beside a living writer too. Without a log nobody writes, and no file beside it is needed."""
+    mode = "mode=ro" if log_of(path).exists() else "immutable=1"
+    uri = f"file:{quote(str(path.resolve()))}?{mode}"
+    return sqlite3.connect(uri, BUSY_S, uri=True, isolation_level=None, check_same_thread=False)
+
+
+def log_of(path: Path) -> Path:
+    """Where SQLite keeps what is committed, but not yet in the file."""
+    return path.with_name(path.name + "-wal")
+
+
+@contextlib.contextmanager
+def complaints(path: Path, doing: str) -> Iterator[None]:
+    """SQLite's errors inside become a StoreError that names `path`, or DamageError: the file is to blame."""
+    try:
+        yield
+    except BROKEN as error:
+        if is_damage(error):
+            raise DamageError(f"{path}: the map is damaged: {error}") from None
+        raise StoreError(f"{path}: the map cannot be {doing}: {error}") from None
+
+
+def is_damage(error: Exception) -> bool:
+    return getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF not in _WORLD
+
+
+def check_is_map(path: Path) -> bool:
+    """Whether there is something in it. Raises UsageError if that is not a map of ours.
+
+    A writer killed before its first commit leaves nothing or a bare first page; what follows is in the log.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(PAGE_BYTES)
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    if any(text in head for text in _OURS):
+        return True
+    if head and not is_bare(path):
+        raise UsageError(f"{path}: is not a map of SHARE, and was left as it is; give another file")
+    return log_of(path).exists() and bool(log_of(path).stat().st_size)
+
+
+def is_bare(path: Path) -> bool:
+    """A first page without tables and nothing else."""
+    head = path.read_bytes() if os.stat(path).st_size <= PAGE_BYTES else b"CREATE "
+    return head.startswith(MAGIC) and b"CREATE " not in head
+
+
+def check_header(path: Path) -> None:
+    """Raises DamageError if a byte is wrong by which SQLite would take it for another kind of file."""
+    with path.open("rb") as file:
+        head, expected = file.read(_HEADER_BYTES), first_page()
+    kinds = set(head[18:20])  # of file, for writing and reading: 1 without a log, 2 with one
+    if not is_bare(path) and (any(head[at] != expected[at] for at in _FIXED) or kinds - {1, 2}):
+        raise DamageError(f"{path}: the map is damaged: its header")
+
+
+def is_map(path: Path) -> bool:
+    """Whether a file looks like a map, whole or damaged."""
+    try:
+        return path.is_file() and check_is_map(path)
+    except UsageError:
+        return False

@@ -1,0 +1,145 @@
+"""Values as rows of a map file, and back. A row is whole if its CRC-32 says so."""
+
+from __future__ import annotations
+
+import sqlite3
+import zlib
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+
+from share.core.keeping import KeepKeyframe, KeepLink, KeepPoses, KeepRun, KeptKeyframe
+from share.errors import StoreError
+from share.merge.join import Key, Loop
+from share.types import F64, Keyframe
+from share.wire import codec, messages
+
+M = TypeVar("M")
+Row = tuple[Any, ...]  # the columns of COLUMNS, without number and crc
+
+COLUMNS = {
+    "about": ("name", "value"),
+    "run": ("key", "next", "codec", "hello"),
+    "run_copy": ("key", "next", "codec", "hello"),
+    "stretch": ("run", "nth"),
+    "keyframe": ("run", "id", "stretch", "ordinal", "codec", "T_odom_body", "message"),
+    "link": ("run", "id", "reference", "T_ref_body", "cov"),
+    "loop": ("a_run", "a_id", "b_run", "b_id", "T_a_b", "cov", "inliers"),
+    "poses": ("keys", "T_map_body"),
+}
+
+_pack = msgspec.msgpack.encode
+_frames = msgspec.msgpack.Decoder(list[bytes]).decode
+_placed = msgspec.msgpack.Decoder(list[tuple[str, int, str]]).decode
+
+
+def check(table: str, number: int, row: Row) -> int:
+    """CRC-32 over the table's name, the row's number and its columns, as msgpack."""
+    return zlib.crc32(_pack((table, number, *row)))
+
+
+def is_whole(table: str, number: int, row_and_crc: Row) -> bool:
+    *row, crc = row_and_crc
+    try:
+        return bool(check(table, number, tuple(row)) == crc)
+    except (TypeError, OverflowError, ValueError):  # what is not even packable
+        return False
+
+
+def insert(connection: sqlite3.Connection, table: str, row: Row, number: int | None = None) -> None:
+    """One row with its CRC, behind all others unless its number is given."""
+    if number is None:
+        behind = f"SELECT ifnull(max(number), 0) + 1 FROM {table}"
+        number = int(connection.execute(behind).fetchone()[0])
+    columns = ("number", *COLUMNS[table], "crc")
+    marks = ", ".join("?" * len(columns))
+    values = (number, *row, check(table, number, row))
+    connection.execute(f"INSERT INTO {table}({', '.join(columns)}) VALUES({marks})", values)
+
+
+# ---------------------------------------------------------------- values to rows
+
+
+def of_run(run: KeepRun, next_keyframe: int) -> Row:
+    return run.key, next_keyframe, codec.VERSION, _message(run.hello)
+
+
+def of_keyframe(keyframe: KeepKeyframe, stretch: int, ordinal: int) -> Row:
+    place = _bytes(keyframe.T_odom_body)
+    return (*keyframe.at, stretch, ordinal, codec.VERSION, place, _message(keyframe.keyframe))
+
+
+def of_link(link: KeepLink) -> Row:
+    return (*link.key, link.reference, _bytes(link.T_ref_body), _bytes(link.cov))
+
+
+def of_loop(loop: Loop) -> Row:
+    return (*loop.a, *loop.b, _bytes(loop.T_a_b), _bytes(loop.cov), int(loop.inliers))
+
+
+def of_poses(poses: KeepPoses) -> Row:
+    keys = [(*key, name) for key, name in zip(poses.keys, poses.maps, strict=True)]
+    return _pack(keys), _bytes(poses.T_map_body)
+
+
+# ---------------------------------------------------------------- rows to values; ValueError if they are none
+
+
+def run(row: Row) -> KeepRun:
+    key, _, version, hello = row
+    return KeepRun(key, _decoded(messages.Hello, version, hello))
+
+
+def keyframe(row: Row) -> KeptKeyframe:
+    agent, id, stretch, ordinal, version, place, message = row
+    own = _decoded(Keyframe, version, message)
+    if own.id != id:
+        raise ValueError(f"keyframe {agent}:{id} says that it is {own.id}")
+    return KeptKeyframe(agent, own, _array(place, 4, 4), stretch_name(agent, stretch), ordinal)
+
+
+def stretch_name(run: str, nth: int) -> str:
+    """As the atlas calls it."""
+    return f"{run}/{nth}"
+
+
+def link(row: Row) -> KeepLink:
+    agent, id, reference, T, cov = row
+    return KeepLink(Key(agent, id), reference, _array(T, 4, 4), _array(cov, 6, 6))
+
+
+def loop(row: Row) -> Loop:
+    a, a_id, b, b_id, T, cov, inliers = row
+    return Loop(Key(a, a_id), Key(b, b_id), _array(T, 4, 4), _array(cov, 6, 6), inliers)
+
+
+def poses(row: Row) -> KeepPoses:
+    keys = _placed(row[0])
+    T = _array(row[1], len(keys), 4, 4)
+    return KeepPoses(tuple(Key(a, i) for a, i, _ in keys), T, tuple(name for *_, name in keys))
+
+
+def _message(message: messages.Message) -> bytes:
+    """Its frames on the wire, as one."""
+    return _pack([bytes(frame) for frame in codec.encode(message)])
+
+
+def _decoded(kind: type[M], version: int, data: bytes) -> M:
+    if version != codec.VERSION:
+        raise StoreError(
+            f"keyframes in it are of wire version {version}, this SHARE reads {codec.VERSION}: "
+            "use the SHARE that wrote it"
+        )
+    message = codec.decode(_frames(data))
+    if not isinstance(message, kind):
+        raise ValueError(f"is a {type(message).__name__}")
+    return message
+
+
+def _bytes(array: F64) -> bytes:
+    return np.ascontiguousarray(array, "<f8").tobytes()
+
+
+def _array(data: bytes, *shape: int) -> F64:
+    return np.frombuffer(data, "<f8").reshape(shape)

@@ -1,0 +1,112 @@
+"""The edge's map on disk: one SQLite file with a log (WAL), and one writer. Read docs/map-file.md."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+from collections.abc import Sequence
+from pathlib import Path
+
+from share.core.keeping import Change, Kept
+from share.errors import StoreError, UsageError
+from share.io.map_store import changes, lock, reading, schema
+from share.io.map_store.opening import examine, look, make
+from share.io.map_store.scan import whole_rows
+
+
+class MapStore:
+    """Opened by `MapStore.open`. May be called from any one thread at a time.
+
+    writable: whether `write` can be called. reason: why not. schema: of the file, as it was found.
+    """
+
+    def __init__(self, path: Path, kept: Kept, schema: int, reason: str) -> None:
+        self.path, self.schema, self.reason = path, schema, reason
+        self._kept: Kept | None = kept
+        self._db: sqlite3.Connection | None = None
+        self._lock: int | None = None
+
+    @property
+    def writable(self) -> bool:
+        return self._db is not None
+
+    @staticmethod
+    def open(path: Path, power_cut: bool = False) -> MapStore:
+        """The map in `path`, made if there is none; all of it is read and checked.
+
+        An older schema is brought up to date after a copy, FILE.schema-N, was made. From a damaged file
+        what is whole is taken over; it stays beside as FILE.damaged-N. A file that may not be written is
+        opened for reading. power_cut: even that costs no commit, for the price of waiting for the disk.
+        Raises UsageError if it is no map, or of a newer SHARE; StoreError if another edge has it; ShareError
+        if the disk is full or fails. The file is then as it was.
+        """
+        path = path.resolve() if path.is_symlink() else path
+        if path.is_dir():
+            raise UsageError(f"{path}: is a folder; give the name of a file")
+        reason = lock.obstacle(path)
+        if reason and not path.exists():
+            raise UsageError(f"{path}: a map cannot be made there: {reason}")
+        if reason:
+            return MapStore.read(path, reason)
+        held = lock.take(path)
+        try:
+            store = MapStore(path, examine(path), schema.SCHEMA, "")
+            store._db, store._lock = make(path, power_cut), held
+            return store
+        except BaseException:
+            os.close(held)
+            raise
+
+    @staticmethod
+    def read(path: Path, reason: str = "it was opened for reading") -> MapStore:
+        """A map to read only, beside an edge in another process too. Raises UsageError, ShareError."""
+        return MapStore(path, *look(path), reason)
+
+    def write(self, news: Sequence[Change]) -> None:
+        """All of them or none; on return they survive the end of this process, however it ends.
+
+        Raises StoreError if the disk is full or fails: then none was kept, and it may be tried again.
+        """
+        db = self._writer()
+        self._kept = None  # of before
+        try:
+            db.execute("BEGIN IMMEDIATE")
+            for change in news:
+                changes.apply(db, change)
+            db.execute("COMMIT")
+        except BaseException as error:
+            with contextlib.suppress(sqlite3.Error):  # a full disk has rolled back by itself
+                db.execute("ROLLBACK")
+            if isinstance(error, sqlite3.Error):
+                raise StoreError(f"{self.path}: the map cannot be written: {error}") from None
+            raise
+
+    def load(self) -> Kept:
+        """All that is kept. The first time it is what `open` has read. Raises StoreError."""
+        kept, self._kept = self._kept, None
+        if kept is not None:
+            return kept
+        if self._db is None:
+            return look(self.path)[0]
+        return reading.kept(whole_rows(self._db))
+
+    def close(self) -> None:
+        """Moves the log into the file and gives it free."""
+        if self._db is not None:
+            self._db.close()
+            self._db = None
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def __enter__(self) -> MapStore:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _writer(self) -> sqlite3.Connection:
+        if self._db is None:
+            raise StoreError(f"{self.path}: the map cannot be written: {self.reason or 'it was closed'}")
+        return self._db

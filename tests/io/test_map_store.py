@@ -1,0 +1,300 @@
+"""The map file: what was written is found again, to the last bit, by whoever may."""
+
+import os
+import resource
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from map_changes import ANN, BOB, keyframe, loop, pose, run, small_map, solution, told
+
+from share.core.keeping import DropLoop, KeepLink, KeepLoop, Retire
+from share.errors import StoreError, UsageError
+from share.io.map_store import MapStore, is_map, schema
+from share.io.map_store.rows import insert
+from share.merge.join import Key
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "room.sqlite"
+
+
+def again(path):
+    with MapStore.open(path) as store:
+        return store.load()
+
+
+def files(path):
+    return sorted(os.listdir(path.parent))
+
+
+def test_a_new_file_is_empty(path):
+    with MapStore.open(path) as store:
+        assert told(store.load()) == told(type(store.load())())
+        assert (store.writable, store.reason, store.schema) == (True, "", schema.SCHEMA)
+    assert is_map(path)
+    assert files(path) == ["room.sqlite", "room.sqlite.lock"]
+
+
+def test_all_is_found_again(path):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        before = told(store.load())
+    kept = again(path)
+    assert told(kept) == before
+    frames = [keyframe(key, i) for i in range(20) for key in (ANN, BOB)]
+    assert [k.at for k in kept.keyframes] == [k.at for k in frames]
+    for found, sent in zip(kept.keyframes, frames, strict=True):
+        assert np.array_equal(found.keyframe.view.descriptors, sent.keyframe.view.descriptors)
+        assert np.array_equal(found.keyframe.view.points, sent.keyframe.view.points)
+        assert np.array_equal(found.T_odom_body, sent.T_odom_body)
+    assert [(x.a.id, x.inliers) for x in kept.loops] == [(i, 20 + i) for i in range(0, 20, 4)]
+    assert np.array_equal(kept.poses.T_map_body[5], pose(7) @ pose(2))
+    assert kept.stretches == (f"{ANN}/0", f"{BOB}/0")
+    assert kept.next_keyframe == {ANN: 20, BOB: 20}
+    assert kept.complaints == ()
+
+
+def test_the_same_again_changes_nothing(path):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        before = told(store.load())
+        store.write(small_map())
+        assert told(store.load()) == before
+
+
+def test_a_new_solution_takes_the_place_of_the_old(path):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        store.write([solution([Key(ANN, 3)], "elsewhere")])
+        poses = store.load().poses
+    assert (poses.keys, poses.maps) == ((Key(ANN, 3),), ("elsewhere",))
+
+
+def test_retired_keyframes_go_but_not_their_numbers(path):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        link = KeepLink(Key(ANN, 5), 3, pose(2), np.eye(6) * 1e-3)
+        moved = KeepLoop(loop(3, 4))
+        store.write([DropLoop(Key(BOB, 4), Key(ANN, 4)), moved, link, Retire((Key(ANN, 4), Key(ANN, 19)))])
+        store.write([keyframe(ANN, 4), keyframe(ANN, 19)])  # late copies
+    kept = again(path)
+    numbers = [k.at.id for k in kept.keyframes if k.key == ANN]
+    assert numbers == [i for i in range(19) if i != 4]
+    assert kept.next_keyframe[ANN] == 20
+    assert [x.a.id for x in kept.loops] == [0, 8, 12, 16, 3]
+    assert kept.links.keys() == {Key(ANN, 5)}
+    assert (kept.links[Key(ANN, 5)].reference, kept.links[Key(ANN, 5)].cov[0, 0]) == (3, 1e-3)
+    assert Key(ANN, 4) not in kept.poses.keys
+    assert len(kept.poses.keys) == 38
+    assert kept.complaints == ()
+
+
+def test_the_order_of_stretches_outlives_their_keyframes(path):
+    with MapStore.open(path) as store:
+        store.write([run(ANN), run(BOB), keyframe(ANN, 0), keyframe(BOB, 0), keyframe(ANN, 1, first=True)])
+        store.write([Retire((Key(ANN, 0),))])
+        store.write([keyframe(ANN, 2), keyframe(ANN, 3), Retire((Key(ANN, 2),)), keyframe(ANN, 4)])
+        store.write([keyframe(ANN, 5, first=True)])
+    kept = again(path)
+    assert kept.stretches == (f"{ANN}/0", f"{BOB}/0", f"{ANN}/1", f"{ANN}/2")
+    places = [(k.at.id, k.stretch, k.ordinal) for k in kept.keyframes if k.key == ANN]
+    assert places == [(1, f"{ANN}/1", 0), (3, f"{ANN}/1", 2), (4, f"{ANN}/1", 3), (5, f"{ANN}/2", 0)]
+
+
+def test_two_loops_may_tie_one_pair(path):
+    with MapStore.open(path) as store:
+        store.write([*small_map(), KeepLoop(loop(4, 4)), KeepLoop(loop(4, 4).reverse())])
+        assert len(store.load().loops) == 6
+        store.write([DropLoop(Key(ANN, 4), Key(BOB, 4))])
+        assert len(store.load().loops) == 4
+
+
+def test_a_list_of_changes_is_kept_whole_or_not_at_all(path):
+    with MapStore.open(path) as store:
+        store.write([run(ANN), keyframe(ANN, 0)])
+        with pytest.raises(ValueError, match=r"bob-0002 is not kept; its KeepRun comes first"):
+            store.write([keyframe(ANN, 1), keyframe(BOB, 0)])
+        assert [k.at.id for k in store.load().keyframes] == [0]
+
+
+def test_another_thread_may_write(path):
+    with MapStore.open(path) as store:
+        thread = threading.Thread(target=store.write, args=(small_map(),))
+        thread.start()
+        thread.join()
+        assert len(store.load().keyframes) == 40
+
+
+def test_one_edge_a_map_but_any_number_of_readers(path):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        with pytest.raises(StoreError, match="another edge uses this map"):
+            MapStore.open(path)
+        assert keyframes_for_a_reader(path) == 40
+        store.write([keyframe(ANN, 20)])
+        assert keyframes_for_a_reader(path) == 41
+    with MapStore.read(path) as reader, pytest.raises(StoreError, match="opened for reading"):
+        reader.write([])
+    MapStore.open(path).close()
+
+
+def keyframes_for_a_reader(path) -> int:
+    """In a process of its own."""
+    code = (
+        "import sys; from pathlib import Path; from share.io.map_store import MapStore\n"
+        "print(len(MapStore.read(Path(sys.argv[1])).load().keyframes))"
+    )
+    return int(
+        subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, check=True).stdout
+    )
+
+
+def test_what_is_no_map_is_left_as_it_is(tmp_path):
+    text, other = tmp_path / "notes.txt", tmp_path / "browser.sqlite"
+    text.write_text("SQLite is nice" * 1000)
+    with sqlite3.connect(other) as connection:
+        connection.execute("CREATE TABLE bookmarks(url TEXT)")
+    connection.close()
+    for path in (text, other):
+        before = path.read_bytes()
+        for how in (MapStore.open, MapStore.read):
+            with pytest.raises(UsageError, match="is not a map of SHARE, and was left as it is"):
+                how(path)
+        assert path.read_bytes() == before
+        assert not is_map(path)
+    with pytest.raises(UsageError, match="is a folder"):
+        MapStore.open(tmp_path)
+    with pytest.raises(UsageError, match="cannot be made there"):
+        MapStore.open(text / "room.sqlite")
+
+
+# ---------------------------------------------------------------- schemas
+
+
+def schema_said(path, number):
+    """As a SHARE of schema `number` would have left it."""
+    connection = sqlite3.connect(path, isolation_level=None)
+    connection.execute("DELETE FROM about WHERE name = 'schema'")
+    insert(connection, "about", ("schema", str(number)))
+    if number == 0:  # made up: loops did not count their inliers
+        connection.execute("ALTER TABLE loop RENAME COLUMN inliers TO matches")
+    connection.close()
+
+
+STEP = ("ALTER TABLE loop RENAME COLUMN matches TO inliers",)
+
+
+def test_a_newer_schema_is_left_alone(path):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+    schema_said(path, 2)
+    before = path.read_bytes()
+    with pytest.raises(UsageError, match=r"newer SHARE \(schema 2, this one knows 1\)"):
+        MapStore.open(path)
+    assert path.read_bytes() == before
+
+
+def test_an_older_schema_is_brought_up_to_date_and_kept_beside(path, monkeypatch):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+        whole = told(store.load())
+    schema_said(path, 0)
+    before = path.read_bytes()
+    with pytest.raises(UsageError, match="is of schema 0, from which no way leads to 1"):
+        MapStore.open(path)
+    monkeypatch.setattr(schema, "STEPS", {0: STEP})
+    with MapStore.read(path) as reader:
+        assert reader.schema == 0
+        assert told(reader.load()) == whole
+    assert path.read_bytes() == before
+    assert told(again(path)) == whole
+    assert path.with_name("room.sqlite.schema-0").read_bytes() == before
+    assert told(again(path)) == whole
+    assert [name for name in files(path) if "damaged" in name] == []
+
+
+def test_a_step_that_fails_leaves_the_old_file(path, monkeypatch):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+    schema_said(path, 0)
+    before = path.read_bytes()
+    monkeypatch.setattr(schema, "STEPS", {0: (*STEP, "ALTER TABLE nonsense RENAME TO sense")})
+    with pytest.raises(
+        StoreError, match="no such table: nonsense; it is of schema 0: use the SHARE that made it"
+    ):
+        MapStore.open(path)
+    monkeypatch.setattr(schema, "STEPS", {0: STEP})
+    assert len(again(path).keyframes) == 40
+    assert path.with_name("room.sqlite.schema-0").read_bytes() == before
+
+
+# ---------------------------------------------------------------- the disk
+
+
+def test_a_full_disk_keeps_nothing_half_and_works_again_afterwards(path):
+    """No file of this process may grow beyond a limit for a while."""
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with MapStore.open(path) as store:
+        store.write([run(ANN), *(keyframe(ANN, i, 500) for i in range(3))])
+        resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))
+        try:
+            with pytest.raises(StoreError, match=r"room\.sqlite: the map cannot be written: "):
+                store.write([keyframe(ANN, i, 500) for i in range(3, 20)])
+            assert [k.at.id for k in store.load().keyframes] == [0, 1, 2]
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+            signal.signal(signal.SIGXFSZ, before)
+        store.write([keyframe(ANN, i, 500) for i in range(3, 20)])
+    assert [k.at.id for k in again(path).keyframes] == list(range(20))
+
+
+@pytest.mark.parametrize("killed", [False, True], ids=["closed", "killed"])
+def test_a_map_that_may_only_be_read(killed):
+    """As somebody who is not root: root may write everything."""
+    folder = Path(tempfile.mkdtemp())
+    path = folder / "room.sqlite"
+    try:
+        store = MapStore.open(path)
+        store.write(small_map())
+        if killed:  # its log is still there
+            for name in os.listdir(folder):
+                shutil.copyfile(folder / name, folder / name.replace("room", "copy"))
+            path = folder / "copy.sqlite"
+        store.close()
+        for name in os.listdir(folder):
+            (folder / name).chmod(0o444)
+        folder.chmod(0o555)
+        code = (
+            "import os, sys; from pathlib import Path; from share.io.map_store import MapStore\n"
+            "if os.geteuid() == 0: os.setuid(65534)\n"
+            "store = MapStore.open(Path(sys.argv[1]))\n"
+            "print(len(store.load().keyframes), store.writable, store.reason)"
+        )
+        done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True)
+        assert (done.stdout, done.stderr) == ("40 False the file is read-only\n", "")
+    finally:
+        folder.chmod(0o755)
+        shutil.rmtree(folder)
+
+
+def test_the_file_stays_bounded_when_as_many_retire_as_come(path):
+    with MapStore.open(path) as store:
+        store.write([run(ANN)])
+        sizes = []
+        for start in range(0, 600, 20):
+            batch = [keyframe(ANN, i, 500) for i in range(start, start + 20)]
+            store.write([*batch, Retire(tuple(Key(ANN, i) for i in range(start - 60, start - 40)))])
+            sizes.append(sum(f.stat().st_size for f in path.parent.iterdir()))
+        assert len(store.load().keyframes) == 60
+    assert max(sizes[10:]) < 1.1 * max(sizes[:10])
+    assert path.stat().st_size < 1.5 * 80 * 27_000

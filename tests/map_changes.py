@@ -1,0 +1,94 @@
+"""A small map as changes: two agents, their keyframes along a line, loops between them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from share.core.keeping import Change, KeepKeyframe, KeepLoop, KeepPoses, KeepRun, Kept, KeptKeyframe
+from share.geometry import se3
+from share.merge.join import Key, Loop
+from share.types import F64, AgentKind, Keyframe, View
+from share.wire.messages import Hello
+
+ANN, BOB = "ann-0001", "bob-0002"
+
+
+def pose(i: int) -> F64:
+    return se3.exp(np.array([0.01 * i, 0.02 * i, -0.03 * i, 0.1 * i, 0.2, 0.3]))
+
+
+def run(key: str) -> KeepRun:
+    name, _, number = key.rpartition("-")
+    return KeepRun(key, Hello(name, AgentKind.AR, int(number, 16), 400.0, pose(3)))
+
+
+def keyframe(key: str, i: int, points: int = 40, first: bool = False) -> KeepKeyframe:
+    """Number i of a run, relative to the one before unless it is the first of a stretch."""
+    rng = np.random.default_rng([i, *key.encode()])
+    view = View(
+        rng.normal(size=(points, 2)),
+        rng.normal(size=(points, 3)),
+        rng.integers(0, 256, (points, 32), np.uint8),
+    )
+    begins = first or i == 0
+    T = pose(i) if begins else se3.inverse(pose(i - 1)) @ pose(i)
+    cov = np.diag([1e-6, 1e-6, 1e-6, 1e-5, 1e-5, 2e-5])
+    up = np.array([0.0, 0.0, 1.0])
+    own = Keyframe(i, -1 if begins else i - 1, 10**9 + i * 10**8, T, cov, up, view, i - 1)
+    return KeepKeyframe(key, own, pose(i))
+
+
+def kept_keyframe(key: str, i: int, stretch: int = 0) -> KeptKeyframe:
+    """The same, found again."""
+    sent = keyframe(key, i)
+    return KeptKeyframe(key, sent.keyframe, sent.T_odom_body, f"{key}/{stretch}", i)
+
+
+def loop(i: int, j: int) -> Loop:
+    return Loop(Key(ANN, i), Key(BOB, j), pose(i - j), np.eye(6) * 1e-4, 20 + i)
+
+
+def solution(keys: list[Key], name: str = f"{ANN}/0") -> KeepPoses:
+    return KeepPoses(tuple(keys), np.array([pose(7) @ pose(k.id) for k in keys]), (name,) * len(keys))
+
+
+def small_map(count: int = 20, points: int = 40) -> list[Change]:
+    """Two runs of `count` keyframes each, by turns, a loop for every fourth, and a solution of all."""
+    frames = [keyframe(key, i, points) for i in range(count) for key in (ANN, BOB)]
+    loops = [KeepLoop(loop(i, i)) for i in range(0, count, 4)]
+    return [run(ANN), run(BOB), *frames, *loops, solution([k.at for k in frames])]
+
+
+def told(kept: Kept) -> dict[str, object]:
+    """All of it in a form that can be compared to the last bit."""
+    return {
+        "runs": [(r.key, r.hello.name, r.hello.run_id, r.hello.T_body_cam0.tobytes()) for r in kept.runs],
+        "stretches": kept.stretches,
+        "keyframes": [_keyframe(k) for k in kept.keyframes],
+        "links": {k: (x.reference, x.T_ref_body.tobytes(), x.cov.tobytes()) for k, x in kept.links.items()},
+        "loops": [(x.a, x.b, x.T_a_b.tobytes(), x.cov.tobytes(), x.inliers) for x in kept.loops],
+        "poses": kept.poses and (kept.poses.keys, kept.poses.T_map_body.tobytes(), kept.poses.maps),
+        "next": dict(kept.next_keyframe),
+        "complaints": kept.complaints,
+    }
+
+
+def _keyframe(k: KeptKeyframe) -> tuple[object, ...]:
+    own = k.keyframe
+    arrays = (
+        k.T_odom_body,
+        own.T_ref_body,
+        own.cov,
+        own.up,
+        own.view.uv,
+        own.view.points,
+        own.view.descriptors,
+    )
+    return (
+        k.at,
+        (k.stretch, k.ordinal),
+        own.reference,
+        own.stamp_ns,
+        own.follows,
+        *(a.tobytes() for a in arrays),
+    )
