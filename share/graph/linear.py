@@ -64,6 +64,7 @@ class Edges:
         spread = np.maximum(np.trace(covs, axis1=1, axis2=2), _SUREST**2)
         return Edges(ends[:, 0], ends[:, 1], se3.inverse(T_a_b), _whitening(covs), spread, is_loop)
 
+
 @dataclass(frozen=True, eq=False)
 class Residuals:
     """At some poses: T_a_b (E, 4, 4), xi (E, 6), whitened (E, 6), and its square chi2 (E,)."""

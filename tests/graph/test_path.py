@@ -9,9 +9,7 @@ from share.graph.posegraph import Edge
 def roads_of(room: Room, seed: int) -> tuple[Roads, list[Edge]]:
     """With no two edges equally sure, so that there is one surest path."""
     rng = np.random.default_rng(seed)
-    edges = [
-        Edge(e.a, e.b, e.T_a_b, e.cov * rng.uniform(0.5, 2)) for e in (*room.chain, *room.closures)
-    ]
+    edges = [Edge(e.a, e.b, e.T_a_b, e.cov * rng.uniform(0.5, 2)) for e in (*room.chain, *room.closures)]
     roads = Roads()
     for edge in edges:
         roads.add(edge)
@@ -34,7 +32,7 @@ def test_one_search_tells_what_walking_each_path_tells(seed: int) -> None:
     roads, _ = roads_of(room, seed)
     rng = np.random.default_rng(seed)
     for start in (0, 7, 299):
-        agree(roads, room, start, rng.choice(300, 8).tolist() + [start])
+        agree(roads, room, start, [*rng.choice(300, 8).tolist(), start])
 
 
 def test_edges_come_and_go() -> None:

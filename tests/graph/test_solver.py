@@ -51,7 +51,9 @@ def test_residuals_are_the_logarithm(size: float) -> None:
     rng = np.random.default_rng(0)
     poses = se3.exp(rng.normal(0, size, (40, 6)))
     ends = np.column_stack([np.zeros(39, int), np.arange(1, 40)])
-    edges = Edges.measured(ends, np.tile(np.eye(4), (39, 1, 1)), np.tile(np.eye(6), (39, 1, 1)), ends[:, 0] > 0)
+    edges = Edges.measured(
+        ends, np.tile(np.eye(4), (39, 1, 1)), np.tile(np.eye(6), (39, 1, 1)), ends[:, 0] > 0
+    )
     assert residuals(poses, edges).xi == pytest.approx(se3.log(se3.inverse(poses[0]) @ poses[1:]), abs=1e-11)
 
 
