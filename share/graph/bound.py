@@ -20,12 +20,14 @@ from share.graph.ways import Ways, on_the_way
 from share.types import F64, I64
 
 _LEAST_WEIGHT = 1e-9  # of a loop that all else speaks against, so that it can be divided by
+_UNKNOWN = 1e6 * np.eye(6)
 
 
 def covariances(n: int, edges: Edges, at: Minimum, anchor: int, wanted: I64, config: GraphConfig) -> F64:
     """Covariances (K, 6, 6) of `wanted` (K,) of n poses relative to `anchor`, right perturbation.
 
-    Every wanted pose must be joined to the anchor.
+    Every wanted pose must be joined to the anchor. Where edges differ so much in certainty (beyond some
+    16 orders of magnitude) that nothing can be told, a sigma of 1000 rad and m says so.
     """
     out = np.zeros((len(wanted), 6, 6))
     free = np.flatnonzero(wanted != anchor)
@@ -68,4 +70,6 @@ def _blocks_of_inverse(information: Any, wanted: I64) -> F64:
     right[rows.ravel(), np.arange(6 * k)] = 1
     blocks = factor.solve(right)[rows.ravel()].reshape(k, 6, k, 6)
     blocks = blocks[np.arange(k), :, np.arange(k)]
-    return np.asarray(blocks + np.swapaxes(blocks, 1, 2)) / 2
+    blocks = (blocks + np.swapaxes(blocks, 1, 2)) / 2
+    told = np.linalg.eigvalsh(blocks)[:, 0] > 0
+    return np.where(told[:, None, None], blocks, _UNKNOWN)

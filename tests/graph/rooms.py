@@ -42,7 +42,8 @@ class Room:
 
 
 def simulate(n: int, agents: int, seed: int, density: float = 1.0) -> Room:
-    """n keyframes; every second has 1 to 3 loops to older ones within a metre (`density` below 1 thins them, above adds)."""
+    """n keyframes; every second has 1 to 3 loops to older ones within a metre; `density` below 1 thins
+    them, above 1 it adds."""
     rng = np.random.default_rng(seed)
     walks = [_walk(rng) for _ in range(agents)]
     truth = np.array([next(walks[i % agents]) for i in range(n)])
