@@ -49,7 +49,9 @@ def main() -> None:
     parser.add_argument("--gtsam", action="store_true", help="solve it once by gtsam too")
     options = parser.parse_args()
     bench(100, 1.0, False)  # imports
-    print(json.dumps({f"{n}_poses": bench(n, options.density, options.gtsam) for n in options.poses}, indent=2))
+    print(
+        json.dumps({f"{n}_poses": bench(n, options.density, options.gtsam) for n in options.poses}, indent=2)
+    )
 
 
 def bench(n: int, density: float, by_gtsam: bool) -> dict[str, Any]:

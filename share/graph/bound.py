@@ -19,21 +19,26 @@ from share.graph.linear import Edges
 from share.graph.ways import Ways, on_the_way
 from share.types import F64, I64
 
+_LEAST_WEIGHT = 1e-9  # of a loop that all else speaks against, so that it can be divided by
+_UNKNOWN = 1e6 * np.eye(6)
+
 
 def covariances(n: int, edges: Edges, at: Minimum, anchor: int, wanted: I64, config: GraphConfig) -> F64:
     """Covariances (K, 6, 6) of `wanted` (K,) of n poses relative to `anchor`, right perturbation.
 
-    Every wanted pose must be joined to the anchor.
+    Every wanted pose must be joined to the anchor. Where edges differ so much in certainty (beyond some
+    16 orders of magnitude) that nothing can be told, a sigma of 1000 rad and m says so.
     """
     out = np.zeros((len(wanted), 6, 6))
     free = np.flatnonzero(wanted != anchor)
     if not len(free):
         return out
-    part = _surest(n, edges, edges.spread / at.weights, anchor, wanted[free], config)
+    weights = np.maximum(at.weights, _LEAST_WEIGHT)
+    part = _surest(n, edges, edges.spread / weights, anchor, wanted[free], config)
     poses = np.unique(np.concatenate([edges.a[part], edges.b[part]]))
     inside = edges[part].between(*(np.searchsorted(poses, end[part]) for end in (edges.a, edges.b)))
     equations = Equations(len(poses), inside, int(np.searchsorted(poses, anchor)))
-    J = weighted_jacobians(at.at[part], at.weights[part], inside)
+    J = weighted_jacobians(at.at[part], weights[part], inside)
     out[free] = _blocks_of_inverse(equations.information(J), np.searchsorted(poses, wanted[free]))
     return out
 
@@ -64,4 +69,7 @@ def _blocks_of_inverse(information: Any, wanted: I64) -> F64:
     right = np.zeros((information.shape[0], 6 * k))
     right[rows.ravel(), np.arange(6 * k)] = 1
     blocks = factor.solve(right)[rows.ravel()].reshape(k, 6, k, 6)
-    return np.asarray(blocks[np.arange(k), :, np.arange(k)])
+    blocks = blocks[np.arange(k), :, np.arange(k)]
+    blocks = (blocks + np.swapaxes(blocks, 1, 2)) / 2
+    told = np.linalg.eigvalsh(blocks)[:, 0] > 0
+    return np.where(told[:, None, None], blocks, _UNKNOWN)

@@ -18,6 +18,7 @@ from share.graph.linear import Edges, Residuals, jacobians, residuals
 from share.types import F64
 
 _FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e8
+_LEAST_CURVATURE = 0.5  # of a loop along its residual, beside that across; 0.3 overshot at times
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +70,24 @@ def weighted_jacobians(at: Residuals, weights: F64, edges: Edges) -> tuple[F64, 
 
 def _step(equations: Equations, at: Residuals, edges: Edges, damping: float, config: GraphConfig) -> F64:
     weights = _weights(at, edges, config)
-    J = weighted_jacobians(at, weights, edges)
-    whitened = at.whitened * np.sqrt(weights)[:, None]
+    J, softness = weighted_jacobians(at, weights, edges), np.ones(len(edges))
+    if not damping:
+        J, softness = _softened(J, at, weights, edges)
+    whitened = at.whitened * (np.sqrt(weights) / softness)[:, None]
     try:
         return equations.step(J, whitened, damping, config.inner_tolerance)
     except np.linalg.LinAlgError:
         return np.full((len(equations), 6), np.nan)
+
+
+def _softened(J: tuple[F64, F64], at: Residuals, weights: F64, edges: Edges) -> tuple[tuple[F64, F64], F64]:
+    """Jacobians less stiff along each loop's residual, where the kernel bends away, and by how much (E,):
+    without that the last millimetres take many steps (Triggs et al., section 4.3)."""
+    softness = np.where(edges.is_loop, np.sqrt(np.maximum(2 * weights - 1, _LEAST_CURVATURE)), 1.0)
+    along = at.whitened / np.sqrt(np.maximum(at.chi2, 1e-300))[:, None]
+    cut = ((1 - softness)[:, None] * along)[:, :, None]
+    by_a, by_b = (each - cut * (along[:, None, :] @ each) for each in J)
+    return (by_a, by_b), softness
 
 
 def _weights(at: Residuals, edges: Edges, config: GraphConfig) -> F64:

@@ -117,7 +117,8 @@ class Roads:
         rows = self._search().edges(before, met)
         table = self._table[rows]
         onward = table[:, 1] == met
-        ends = np.array([self._edges[r].b if f else self._edges[r].a for r, f in zip(rows, onward)])
+        walked = zip([self._edges[row] for row in rows], onward, strict=True)
+        ends = [edge.b if ahead else edge.a for edge, ahead in walked]
         T_a_b, cov = table[:, 3:19].reshape(-1, 4, 4), table[:, 19:].reshape(-1, 6, 6)
         cov = np.where(onward[:, None, None], cov, se3.inverse_cov(T_a_b, cov))
         there = np.array([poses[end] for end in ends]).reshape(-1, 4, 4)

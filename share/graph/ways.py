@@ -35,7 +35,8 @@ class Ways:
         arrives = self._to[all_of_u] == np.repeat(v, count)
         fits, pair = all_of_u[arrives], np.repeat(np.arange(len(u)), count)[arrives]
         order = np.lexsort((self._cost[fits], pair))
-        return self._edge[fits[order[np.searchsorted(pair[order], np.arange(len(u)))]]]
+        first_of_pair = order[np.searchsorted(pair[order], np.arange(len(u)))]
+        return np.asarray(self._edge[fits[first_of_pair]], np.int64)
 
 
 def on_the_way(before: I64, goals: I64) -> I64:

@@ -42,7 +42,8 @@ class Room:
 
 
 def simulate(n: int, agents: int, seed: int, density: float = 1.0) -> Room:
-    """n keyframes; every second has 1 to 3 loops to older ones within a metre (`density` thins them)."""
+    """n keyframes; every second has 1 to 3 loops to older ones within a metre; `density` below 1 thins
+    them, above 1 it adds."""
     rng = np.random.default_rng(seed)
     walks = [_walk(rng) for _ in range(agents)]
     truth = np.array([next(walks[i % agents]) for i in range(n)])
@@ -95,5 +96,5 @@ def _loops(truth: F64, i: int, agents: int, rng: np.random.Generator, density: f
     near = other[away < REACH]
     if i < agents:  # an agent joins: by the nearest
         near = other[[away.argmin()]]
-    chosen = rng.permutation(near)[: rng.integers(1, 4)]
+    chosen = rng.permutation(near)[: round(rng.integers(1, 4) * max(1.0, density))]
     return [measured(truth, int(a), i, LOOP, rng) for a in chosen]

@@ -32,7 +32,7 @@ def test_one_search_tells_what_walking_each_path_tells(seed: int) -> None:
     roads, _ = roads_of(room, seed)
     rng = np.random.default_rng(seed)
     for start in (0, 7, 299):
-        agree(roads, room, start, rng.choice(300, 8).tolist() + [start])
+        agree(roads, room, start, [*rng.choice(300, 8).tolist(), start])
 
 
 def test_edges_come_and_go() -> None:

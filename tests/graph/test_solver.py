@@ -204,6 +204,24 @@ def test_any_covariance_that_is_valid_is_borne(scale: float) -> None:
     assert np.linalg.eigvalsh(solution.covariances[0])[0] > 0
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_nothing_that_is_valid_raises(seed: int) -> None:
+    """Certainties over 40 orders of magnitude, false loops, poses laid anywhere."""
+    rng = np.random.default_rng(seed)
+    room = simulate(40, 3, seed)
+    edges = [*room.chain, *room.closures, *false_loops(room, 10, seed)]
+    scales = 10.0 ** rng.choice([-30, -12, -6, 0, 0, 0, 6, 12], len(edges))
+    edges = [Edge(e.a, e.b, e.T_a_b, e.cov * s) for e, s in zip(edges, scales, strict=True)]
+    poses = dict(enumerate(room.guess.copy()))
+    for i in rng.choice(np.arange(1, 40), 3, replace=False):
+        poses[i][:3, 3] = rng.normal(0, 10.0 ** rng.choice([0, 3, 9, 60]), 3)
+    solver = Solver(CONFIG)
+    solver.update(change(poses, edges[: len(room.chain)], edges[len(room.chain) :]))
+    solution = solver.solve(0, [39, 20])
+    assert np.isfinite(solution.poses).all()
+    assert all(np.linalg.eigvalsh(cov)[0] > 0 for cov in solution.covariances)
+
+
 def test_what_has_no_finite_error_comes_back_as_it_was() -> None:
     far = np.eye(4)
     far[0, 3] = 1e200
