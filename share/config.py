@@ -226,6 +226,7 @@ class MergeConfig:
     odometry_scale: float = 2.0  # agents' sigmas are this much too small
     odometry_floor_deg: float = 0.02  # per edge, added in quadrature
     odometry_floor_m: float = 0.002  # the same, for the position
+    most_loops: int = 10  # of a keyframe, when those of others that are taken out are moved to it
     max_pending: int = 200  # loops that wait for a witness; the oldest is dropped
     place_m: float = 0.7  # views further apart than this,
     place_rad: float = 0.5  # or turned by more, are of different places
@@ -247,12 +248,13 @@ class EdgeConfig:
     silent_s: float = 3.0  # nothing heard of an agent for this long: it is taken as gone
     name_hold_s: float = 3.0  # a name stays taken so long after its agent was last heard
     max_agents: int = 64  # present at a time; more are refused
+    max_keyframes: int = 2000  # kept; beyond, those go of which there are others like them
     max_waiting: int = 12  # keyframes that queue to be looked up; beyond, the oldest is only stored
 
     def __post_init__(self) -> None:
         if self.policy not in POLICIES:
             raise ValueError(f"policy: '{self.policy}' is not known; known: {', '.join(POLICIES)}")
-        _require_positive(self, "max_agents", "max_waiting")
+        _require_positive(self, "max_agents", "max_keyframes", "max_waiting")
 
 
 @dataclass(frozen=True)

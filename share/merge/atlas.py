@@ -6,6 +6,7 @@ new, `apply` takes the solution in.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from share.merge.chart import Chart
 from share.merge.join import Key, Loop
 from share.merge.judge import Decision, Judge, that_waited
 from share.merge.solving import SolveJob
+from share.merge.thinning import TakenOut, bonds, redundant, take_out
 from share.types import F64, Correction, Keyframe
 
 
@@ -29,6 +31,19 @@ class Applied:
     reason: str
     tied: tuple[Loop, ...] = ()
     dropped: tuple[Loop, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A keyframe as an earlier life kept it. stretch: by name. cov (6, 6): of the step that leads to it, as
+    the agent sent it or as the pose graph had it."""
+
+    key: Key
+    stretch: str
+    ordinal: int
+    T_odom_body: F64
+    cov: F64
+    as_sent: bool
 
 
 class Atlas:
@@ -85,13 +100,56 @@ class Atlas:
 
     # ------------------------------------------------------------ what arrives
 
-    def add_keyframe(self, agent: str, keyframe: Keyframe) -> str:
-        """The map that it is in. A keyframe without a reference founds a map of its own.
+    def add_keyframe(self, agent: str, keyframe: Keyframe) -> int:
+        """Its number here. A keyframe without a reference founds a map of its own.
 
         Raises ValueError for a keyframe known already or whose reference is unknown.
         """
-        number = self._chart.add(agent, keyframe, self._believed(keyframe.cov))
-        return self._chart.name(self._chart.trails.nodes[number].stretch)
+        return self._chart.add(agent, keyframe, self._believed(keyframe.cov))
+
+    def restore(
+        self,
+        agents: Sequence[str],
+        keyframes: Iterable[Placed],
+        loops: Iterable[Loop],
+        T_map_body: Mapping[Key, F64],
+    ) -> list[int]:
+        """What an earlier life knew; this one must be empty. agents: of every stretch there was, in order.
+
+        Returns the keyframes' numbers. All maps are due.
+        """
+        chart, at = self._chart, {}
+        for agent in agents:
+            stretch = chart.trails.begin(agent)
+            at[chart.trails.stretches[stretch].name] = stretch
+        numbers = []
+        for found in keyframes:
+            cov = self._believed(found.cov) if found.as_sent else found.cov
+            numbers.append(chart.trails.put(found.key, at[found.stretch], found.T_odom_body, found.ordinal))
+            chart.place(numbers[-1], cov)
+            chart.poses[numbers[-1]] = T_map_body.get(found.key, chart.poses[numbers[-1]])
+        for loop in loops:
+            chart.tie(loop)
+        return numbers
+
+    def thin(self, most: int) -> list[TakenOut]:
+        """Take keyframes out until `most` are left: those of which there are others like them, in the same
+        map. Anchors and the newest of every stretch stay."""
+        chart, c = self._chart, self._config
+        numbers = list(chart.poses)
+        stay = {n for s in chart.trails.stretches for n in (*s.nodes[:1], *s.nodes[-c.min_loop_gap :])}
+        by_map: dict[int, list[int]] = {}
+        for n in numbers:
+            by_map.setdefault(chart.founder[chart.trails.nodes[n].stretch], []).append(n)
+        largest = max(by_map.values(), key=len)
+        may_go = [i for i, n in enumerate(largest) if n not in stay]
+        poses = np.array([chart.poses[n] for n in largest])
+        chosen = redundant(poses, may_go, len(numbers) - most, c.place_m, c.place_rad)
+        counts = bonds(chart)
+        taken = [take_out(chart, largest[i], counts, c.most_loops) for i in chosen]
+        chart.find_maps()
+        self._judge.forget({out.key for out in taken})
+        return taken
 
     def propose(self, loop: Loop) -> Decision:
         """A verified loop from candidate a to query b: accepted, waiting, or refused, with the reason.

@@ -32,16 +32,20 @@ class Chart:
     def add(self, agent: str, keyframe: Keyframe, cov: F64) -> int:
         """The number of the new node. cov (6, 6): of its step from the one before, as it is believed."""
         number = self.trails.add(agent, keyframe)
+        self.place(number, cov)
+        return number
+
+    def place(self, number: int, cov: F64) -> None:
+        """Give a new node its pose, by odometry, and tie it to the one before it."""
         node, before = self.trails.nodes[number], self.trails.before(number)
+        self.founder += range(len(self.founder), len(self.trails.stretches))
         if before is None:
-            self.founder.append(node.stretch)
             self.poses[number] = node.T_odom_body
         else:
             T = self.trails.T_between(before, number)
             self.ties.add(Edge(before, number, T, cov))
             self.poses[number] = se3.orthonormal(self.poses[before] @ T)
         self.ties.moved([number])
-        return number
 
     # ------------------------------------------------------------ changes
 
@@ -50,7 +54,7 @@ class Chart:
         a, b = self.ends(loop)
         self.ties.add(Edge(a, b, loop.T_a_b, loop.cov), loop)
         if not self.same_map(a, b):
-            self._find_maps()
+            self.find_maps()
         self.unsolved = {self.founder[f] for f in self.unsolved} | {self.founder_of(loop.a)}
 
     def drop(self, numbers: Sequence[int]) -> tuple[Loop, ...]:
@@ -60,7 +64,7 @@ class Chart:
         stretches = [s for founder in touched for s in self.stretches_of(founder)]
         for number in numbers:
             self.ties.remove(number)
-        self._find_maps()
+        self.find_maps()
         for founder in sorted({self.founder[s] for s in stretches}):
             anchor = self.anchor(founder)
             self.move(founder, self.trails.nodes[anchor].T_odom_body @ se3.inverse(self.poses[anchor]))
@@ -141,7 +145,7 @@ class Chart:
             out.append(Known(se3.inverse(self.poses[a]) @ self.poses[goal], cov))
         return out
 
-    def _find_maps(self) -> None:
+    def find_maps(self) -> None:
         """Every stretch's founder, from the loops: the connected parts."""
         root = list(range(len(self.founder)))
 

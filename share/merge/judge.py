@@ -7,7 +7,7 @@ places of which a look-alike is known bear no witness.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from share.config import MergeConfig
 from share.geometry import se3
 from share.merge.chart import Chart
 from share.merge.cut import fewest
-from share.merge.join import Disagreement, Known, Loop, disagreement, opposite, witness_disagreement
+from share.merge.join import Disagreement, Key, Known, Loop, disagreement, opposite, witness_disagreement
 from share.merge.places import distinct, near_any
 from share.types import F64
 
@@ -62,6 +62,11 @@ class Judge:
         fitting = [loop for loop in inside if self._gap(loop).chi2 <= self._config.agree_chi2]
         self._believe(fitting)
         return tuple(fitting)
+
+    def forget(self, gone: Collection[Key]) -> None:
+        """Loops of these keyframes are waited with no longer."""
+        self.waiting = [loop for loop in self.waiting if not {loop.a, loop.b} & set(gone)]
+        self.rebels = [loop for loop in self.rebels if not {loop.a, loop.b} & set(gone)]
 
     # ------------------------------------------------------------ within a map
 

@@ -48,16 +48,25 @@ class Trails:
         if key in self._at:
             raise ValueError(f"keyframe {key} was added before")
         if keyframe.reference < 0:
-            stretch, T_odom_body = self._begin(agent), keyframe.T_ref_body
-        else:
-            before = self.nodes[self.number(Key(agent, keyframe.reference))]
-            stretch = before.stretch
-            T_odom_body = se3.orthonormal(before.T_odom_body @ keyframe.T_ref_body)
+            return self.put(key, self.begin(agent), keyframe.T_ref_body)
+        before = self.nodes[self.number(Key(agent, keyframe.reference))]
+        return self.put(key, before.stretch, se3.orthonormal(before.T_odom_body @ keyframe.T_ref_body))
+
+    def begin(self, agent: str) -> int:
+        """A new stretch of this agent, which is on it from now on."""
+        count = self._begun.get(agent, 0)
+        self._begun[agent] = count + 1
+        self._current[agent] = len(self.stretches)
+        self.stretches.append(Stretch(agent, f"{agent}/{count}"))
+        return len(self.stretches) - 1
+
+    def put(self, key: Key, stretch: int, T_odom_body: F64, ordinal: int | None = None) -> int:
+        """The number of a new node at the end of a stretch."""
         at = self.stretches[stretch]
         number, self._next = self._next, self._next + 1
-        self.nodes[number] = Node(key, stretch, at.count, T_odom_body)
+        self.nodes[number] = Node(key, stretch, at.count if ordinal is None else ordinal, T_odom_body)
         at.nodes.append(number)
-        at.count += 1
+        at.count = self.nodes[number].ordinal + 1
         self._at[key] = number
         return number
 
@@ -93,13 +102,6 @@ class Trails:
         """Fewer than `gap` keyframes apart on one stretch, so that odometry knows their pose best."""
         first, second = self.nodes[a], self.nodes[b]
         return first.stretch == second.stretch and abs(first.ordinal - second.ordinal) < gap
-
-    def _begin(self, agent: str) -> int:
-        count = self._begun.get(agent, 0)
-        self._begun[agent] = count + 1
-        self._current[agent] = len(self.stretches)
-        self.stretches.append(Stretch(agent, f"{agent}/{count}"))
-        return len(self.stretches) - 1
 
     def _beside(self, number: int, step: int) -> int | None:
         nodes = self.stretches[self.nodes[number].stretch].nodes

@@ -1,0 +1,130 @@
+"""Fewer keyframes, the same room: those that show what others show as well are taken out.
+
+What is left covers the same views; odometry and loops of a keyframe that goes are moved to its neighbour
+(`share.graph.contract`), so what was known stays known, a little less surely.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.geometry import se3
+from share.graph.contract import contract
+from share.graph.posegraph import Edge
+from share.merge.chart import Chart
+from share.merge.join import Key, Loop
+from share.types import F64
+
+
+Bonds = Counter[frozenset[int]]  # loops by the two stretches that they tie
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """The odometry edge that leads to keyframe `key` now, from keyframe `reference` of the same agent; None:
+    it is the first of its stretch now, and T_ref_body (4, 4) is its T_odom_body. cov (6, 6): of it."""
+
+    key: Key
+    reference: Key | None
+    T_ref_body: F64
+    cov: F64
+
+
+@dataclass(frozen=True, eq=False)
+class TakenOut:
+    """A keyframe that is gone, what leads to the one after it now, and loops that were moved elsewhere."""
+
+    key: Key
+    link: Link | None
+    moved: tuple[Loop, ...]
+
+
+def redundant(poses: F64, may_go: Collection[int], count: int, apart_m: float, apart_rad: float) -> list[int]:
+    """Which `count` of poses (N, 4, 4) to take out, among indices `may_go`: again and again one of the two
+    that are most alike, the one that has the nearer second neighbour.
+
+    Two poses are as unlike as |shift| / apart_m + angle / apart_rad.
+    """
+    gap = _unlike(poses, apart_m, apart_rad)
+    np.fill_diagonal(gap, np.inf)
+    free = np.zeros(len(poses), bool)
+    free[list(may_go)] = True
+    nearest = np.partition(gap, 1, axis=1)[:, :2] if len(poses) > 2 else gap
+    out: list[int] = []
+    for _ in range(min(count, int(free.sum()))):
+        rank = np.where(free, nearest[:, 0] + 1e-3 * nearest[:, 1], np.inf)
+        gone = int(rank.argmin())
+        out.append(gone)
+        free[gone] = False
+        stale = np.flatnonzero(gap[gone] <= nearest[:, 1])
+        gap[gone], gap[:, gone] = np.inf, np.inf
+        nearest[stale] = np.partition(gap[stale], 1, axis=1)[:, :2]
+    return out
+
+
+def bonds(chart: Chart) -> Bonds:
+    """How many loops tie each two stretches."""
+    return Counter(_pair(chart, edge) for n, edge in chart.ties.edges.items() if n in chart.ties.loops)
+
+
+def take_out(chart: Chart, number: int, bonds: Bonds, most_loops: int) -> TakenOut:
+    """Of a keyframe with an odometry neighbour; one without takes its loops along. No keyframe is given
+    more than `most_loops` loops, but for the last between two stretches. `chart.find_maps` is due
+    afterwards."""
+    trails, ties = chart.trails, chart.ties
+    key, before, after = trails.nodes[number].key, trails.before(number), trails.after(number)
+    touching = ties.touching(number)
+    loops = [(ties.loops[n], ties.edges[n]) for n in touching if n in ties.loops]
+    odometry = [ties.edges[n] for n in touching if n not in ties.loops]
+    bonds.subtract(_pair(chart, edge) for _, edge in loops)
+    for n in touching:
+        ties.remove(n)
+    ties.forget(number)
+    trails.take_out(number)
+    del chart.poses[number]
+    if not odometry:
+        return TakenOut(key, None, ())
+    left = contract(number, odometry, [edge for _, edge in loops])
+    for edge in left.odometry:
+        ties.add(edge)
+    link = None if after is None else _link(chart, before, after, left.odometry)
+    pairs = [(old, edge) for (old, _), edge in zip(loops, left.loops, strict=True) if edge is not None]
+    moved = [_move(chart, old, edge, bonds, most_loops) for old, edge in pairs]
+    return TakenOut(key, link, tuple(loop for loop in moved if loop is not None))
+
+
+def _unlike(poses: F64, apart_m: float, apart_rad: float) -> F64:
+    p, R = poses[:, :3, 3], poses[:, :3, :3].reshape(-1, 9)
+    square = (p**2).sum(1)
+    shift = np.sqrt(np.maximum(square[:, None] + square - 2 * p @ p.T, 0.0))
+    angle = np.arccos(np.clip((R @ R.T - 1) / 2, -1, 1))
+    return shift / apart_m + angle / apart_rad
+
+
+def _link(chart: Chart, before: int | None, after: int, odometry: tuple[Edge, ...]) -> Link:
+    node = chart.trails.nodes[after]
+    if before is None:
+        return Link(node.key, None, node.T_odom_body, np.zeros((6, 6)))
+    (edge,) = odometry
+    cov = edge.cov if edge.b == after else se3.inverse_cov(edge.T_a_b, edge.cov)
+    return Link(node.key, chart.trails.nodes[before].key, chart.trails.T_between(before, after), cov)
+
+
+def _move(chart: Chart, old: Loop, edge: Edge, bonds: Bonds, most_loops: int) -> Loop | None:
+    """The loop at its new ends; None where there is one already, or enough."""
+    ties, nodes = chart.ties, chart.trails.nodes
+    at_a, at_b = ({n for n in ties.touching(end) if n in ties.loops} for end in (edge.a, edge.b))
+    if at_a & at_b or (max(len(at_a), len(at_b)) >= most_loops and bonds[_pair(chart, edge)] > 0):
+        return None
+    loop = Loop(nodes[edge.a].key, nodes[edge.b].key, edge.T_a_b, edge.cov, old.inliers)
+    ties.add(edge, loop)
+    bonds[_pair(chart, edge)] += 1
+    return loop
+
+
+def _pair(chart: Chart, edge: Edge) -> frozenset[int]:
+    return frozenset(chart.trails.nodes[end].stretch for end in (edge.a, edge.b))
