@@ -60,7 +60,7 @@ def _keyframe(db: sqlite3.Connection, change: KeepKeyframe) -> None:
 
 
 def _place(db: sqlite3.Connection, run: str, begins: bool) -> tuple[int, int]:
-    """The run's newest stretch, since a keyframe refers to the one before it, or a new one; the place on it."""
+    """The run's newest stretch, since a keyframe refers to the one before it, or a new one; and its place."""
     (stretch,) = _one(db, "SELECT ifnull(max(nth), -1) FROM stretch WHERE run = ?", run)
     if begins or stretch < 0:
         insert(db, "stretch", (run, stretch + 1))
