@@ -142,8 +142,8 @@ class PlaceConfig:
             self, "candidates", "enough", "tables", "hash_bits", "ransac_px", "ransac_iterations"
         )
         _require_positive(self, "sigma_px", "sigma_inverse_depth", "inlier_chi2", "guided_px")
-        if self.hash_bits > 24:
-            raise ValueError(f"hash_bits: {self.hash_bits} must be at most 24")
+        if self.tables << self.hash_bits > 1 << 22:
+            raise ValueError(f"hash_bits: {self.tables} tables of {self.hash_bits} bits are too many words")
 
 
 @dataclass(frozen=True)
