@@ -11,7 +11,7 @@ import dataclasses
 import difflib
 import types as _types
 import typing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
 from share.errors import ConfigError
@@ -208,9 +208,12 @@ class GraphConfig:
     max_iterations: int = 100  # of Levenberg-Marquardt
     relative_tolerance: float = 1e-6  # of the cost, between two iterations
     anchor_sigma: float = 1e-4  # rad and m; holds the gauge, removed again after solving
+    step_tolerance: float = 1e-3  # rad and m; solved once no pose is moved by more
+    inner_tolerance: float = 1e-2  # of the residual of a step's equations, relative
+    covariance_edges: int = 250  # the surest, by which covariances are told; more: tighter and slower
 
     def __post_init__(self) -> None:
-        _require_positive(self, "cauchy", "max_iterations", "relative_tolerance", "anchor_sigma")
+        _require_positive(self, *(setting.name for setting in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -225,6 +228,9 @@ class MergeConfig:
     odometry_floor_m: float = 0.002  # the same, for the position
     sole_witness_inliers: int = 0  # a loop with so many inliers joins two maps alone; 0 = never
     max_pending: int = 200  # loops that wait for a witness; the oldest is dropped
+    place_m: float = 0.7  # views further apart than this,
+    place_rad: float = 0.5  # or turned by more, are of different places
+    rebel_places: int = 3  # so many places at least, and more than stand against them, take a map apart
     drop_chi2: float = 1000.0  # a solved graph at odds with a loop by more than this drops it
 
 
@@ -240,12 +246,11 @@ class EdgeConfig:
     name_hold_s: float = 3.0  # a name stays taken so long after its agent was last heard
     max_agents: int = 64  # present at a time; more are refused
     max_waiting: int = 12  # keyframes that queue to be looked up; beyond, the oldest is only stored
-    solve_every: int = 4  # where keyframes queue, the map is solved once for so many of them
 
     def __post_init__(self) -> None:
         if self.policy not in POLICIES:
             raise ValueError(f"policy: '{self.policy}' is not known; known: {', '.join(POLICIES)}")
-        _require_positive(self, "max_agents", "max_waiting", "solve_every")
+        _require_positive(self, "max_agents", "max_waiting")
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -59,7 +58,7 @@ def edge(
         settings = replace(settings, edge=replace(settings.edge, policy=policy))
     folder = None if out is None else Path(out)
     with closing(bind_link(bind, with_keys)) as link:
-        run = EdgeRun(settings, secrets.randbits(63), link, folder, lambda e: _tell(e, verbose))
+        run = EdgeRun(settings, link, folder, lambda e: _tell(e, verbose))
         with on_stop(run.stop):
             click.echo(f"listening on {link.endpoint}, policy {settings.edge.policy}", err=True)
             _say_keys(with_keys)
@@ -83,7 +82,7 @@ def _say_keys(keys: EdgeKeys | None) -> None:
 
 
 _NEWS = {"joined the edge", "left", "back", "silent", "refused"}
-_NEWS |= {"not let in", "maps joined", "job failed", "not written"}
+_NEWS |= {"not let in", "maps joined", "job failed", "not written", "mapper lost", "odometry leapt"}
 
 
 def _tell(event: dict[str, Any], verbose: bool) -> None:

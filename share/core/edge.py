@@ -1,24 +1,26 @@
-"""The edge as a state machine: who speaks to it, what it answers, and in what order keyframes count.
+"""The edge as a state machine: who speaks to it, what it answers, and when a keyframe is safe.
 
-It sees no socket, thread or clock: `handle(event, now_ns)` answers effects, `share.run.edge` carries
-them out. Heavy work is given away as jobs (`share.core.mapper`), one at a time, and comes back as an
-event; so the same code runs under test without threads.
+It sees no socket, thread, disk or clock: `handle(event, now_ns)` answers effects, `share.run.edge` carries
+them out. What keyframes mean is the mapper's business (`share.core.mapper`), which has a process of its
+own and answers with findings; what must survive a crash goes to the keeper, which answers once it has.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from share import __version__
 from share.config import Config, to_mapping
+from share.core.finding import Finding
 from share.core.inorder import InOrder
-from share.core.mapper import Finding, Job, Mapper
+from share.core.keeping import Change, KeepKeyframe, KeepRun
+from share.core.peer import Foot, Peer
 from share.core.rate import seconds
 from share.errors import WireError
-from share.types import Keyframe, TrackState
+from share.types import Keyframe
 from share.wire import messages as wire
 from share.wire.codec import Bytes, decode, encode
 
@@ -34,12 +36,18 @@ class Received:
 
 
 @dataclass(frozen=True)
-class Done:
-    """A job that `Work` asked for: what it came to, and how long it took."""
+class Found:
+    """What the mapper has decided, and what of it must survive a crash."""
 
-    job: Job
-    result: Any
-    ms: float
+    findings: Sequence[Finding]
+    changes: Sequence[Change] = ()
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Everything up to this ticket will be there after a crash."""
+
+    ticket: int
 
 
 @dataclass(frozen=True)
@@ -47,7 +55,7 @@ class Tick:
     """Time has passed."""
 
 
-Event = Received | Done | Tick
+Event = Received | Found | Kept | Tick
 
 # ---------------------------------------------------------------- effects
 
@@ -59,10 +67,27 @@ class Send:
 
 
 @dataclass(frozen=True)
-class Work:
-    """Run `job.run()` off the receive path and answer with `Done`."""
+class Join:
+    """To the mapper: a run of an agent, before its first keyframe."""
 
-    job: Job
+    key: str
+    hello: wire.Hello
+
+
+@dataclass(frozen=True)
+class Add:
+    """To the mapper: the next keyframe of a run, each once and in order."""
+
+    key: str
+    keyframe: Keyframe
+
+
+@dataclass(frozen=True)
+class Keep:
+    """Make this safe, and answer with `Kept`. Tickets rise."""
+
+    ticket: int
+    changes: tuple[Change, ...]
 
 
 @dataclass(frozen=True)
@@ -72,36 +97,37 @@ class Record:
     fields: dict[str, Any]
 
 
-Effect = Send | Work | Record
+Effect = Send | Join | Add | Keep | Record
 
 
-@dataclass
-class _Peer:
-    """One run of one agent."""
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A run that an earlier life of the edge kept. foot: its last keyframe, None without any."""
 
+    key: str
     hello: wire.Hello
-    key: str  # names this run: the name, and some of the run id
-    heard_ns: int
-    inorder: InOrder
-    state: TrackState = TrackState.INITIALISING
-    counts: Counter[str] = field(default_factory=Counter)
-    revision: int = 0
-    gone: bool = False
-    missed: Finding | None = None  # the newest correction while it was gone
+    foot: Foot | None
 
 
 class Edge:
-    """All agents of one room. `session` names this life of the edge, so that agents notice a new one."""
+    """All agents of one room. `session` names this life of the edge, so that agents notice a new one.
 
-    def __init__(self, config: Config, session: int) -> None:
-        self._config, self._session = config, session
-        self._mapper = Mapper(config)
-        self._peers: dict[bytes, _Peer] = {}
+    keeps: what is applied is acknowledged only once it is `Kept`. known: runs of earlier lives.
+    """
+
+    def __init__(
+        self, config: Config, session: int, keeps: bool = False, known: Sequence[Known] = ()
+    ) -> None:
+        self._config, self._session, self._keeps = config, session, keeps
+        self._peers: dict[bytes, Peer] = {}
         self._by_key: dict[str, bytes] = {}
         self._began_ns: int | None = None
-        self._working = False
         self._strangers: Counter[str] = Counter()
+        self._ticket = 0
+        self._unsafe: deque[tuple[int, Peer, int]] = deque()  # ticket, and what is safe once it is kept
         self._effects: list[Effect] = []
+        for run in known:
+            self._recall(run)
 
     def handle(self, event: Event, now_ns: int) -> list[Effect]:
         """What `event` leads to. `now_ns` is the edge's clock and never goes back."""
@@ -110,12 +136,14 @@ class Edge:
         match event:
             case Received():
                 self._receive(event, now_ns)
-            case Done():
-                self._working = False
-                self._found(self._mapper.done(event.job, event.result, event.ms), now_ns)
+            case Found():
+                self._keep(*event.changes)
+                for finding in event.findings:
+                    self._found(finding, now_ns)
+            case Kept():
+                self._kept(event.ticket)
             case Tick():
                 self._notice_silence(now_ns)
-        self._give_work()
         return self._effects
 
     # ------------------------------------------------------------------ messages
@@ -127,9 +155,7 @@ class Edge:
         try:
             message = decode(event.frames)
         except WireError as error:
-            counts["bad_messages"] += 1
-            if counts["bad_messages"] == 1:
-                self._record(now_ns, "bad message", peer, str(error))
+            self._complain(peer, str(error), now_ns)
             return
         if peer is not None:
             self._heard(peer, now_ns)
@@ -143,41 +169,59 @@ class Edge:
                 peer.gone = True
                 self._record(now_ns, "left", peer, "said bye")
             case Keyframe() if peer:
-                self._keyframe(event.peer, peer, message, now_ns)
+                self._keyframe(peer, message, now_ns)
             case wire.PoseUpdate() if peer:
-                peer.counts["poses"] += 1
+                counts["poses"] += 1
                 peer.state = message.state
             case wire.Evaluation() if peer:
-                peer.counts["evaluations"] += 1
+                counts["evaluations"] += 1
             case _:  # from a stranger, or not an agent's word
                 counts["unexpected"] += 1
 
-    def _heard(self, peer: _Peer, now_ns: int) -> None:
+    def _complain(self, peer: Peer | None, reason: str, now_ns: int) -> None:
+        """Counts a bad message; says the first of each peer."""
+        counts = peer.counts if peer else self._strangers
+        counts["bad_messages"] += 1
+        if counts["bad_messages"] == 1:
+            self._record(now_ns, "bad message", peer, reason)
+
+    def _heard(self, peer: Peer, now_ns: int) -> None:
         peer.heard_ns = now_ns
         if peer.gone:
             peer.gone = False
             self._record(now_ns, "back", peer, "is heard again")
 
+    def _notice_silence(self, now_ns: int) -> None:
+        for peer in self._peers.values():
+            if not peer.gone and now_ns - peer.heard_ns > seconds(self._config.edge.silent_s):
+                peer.gone = True
+                self._record(now_ns, "silent", peer, f"nothing heard for {self._config.edge.silent_s:g} s")
+
+    # ------------------------------------------------------------------ coming in
+
     def _greet(self, peer_id: bytes, hello: wire.Hello, now_ns: int) -> None:
         """Welcome a new run or a known one; refuse a name that somebody else is using."""
+        if (reason := self._objection(peer_id, hello, now_ns)) is not None:
+            self._send(peer_id, wire.Refused(reason))
+            self._record(now_ns, "refused", None, reason)
+            return
         if peer_id not in self._peers:
-            if (reason := self._objection(hello, now_ns)) is not None:
-                self._send(peer_id, wire.Refused(reason))
-                self._record(now_ns, "refused", None, reason)
-                return
             key = f"{hello.name}-{hello.run_id % 0x10000:04x}"
-            self._peers[peer_id] = _Peer(hello, key, now_ns, InOrder())
-            self._by_key[key] = peer_id
+            self._enter(peer_id, Peer(hello, key, now_ns))
+            self._keep(KeepRun(key, hello))
             self._record(now_ns, "joined the edge", self._peers[peer_id], f"{hello.kind} '{hello.name}'")
         peer = self._peers[peer_id]
-        self._send(peer_id, wire.Welcome(self._session, peer.inorder.next_keyframe))
+        self._send(peer_id, wire.Welcome(self._session, peer.safe))
         if peer.missed is not None:
             missed, peer.missed = peer.missed, None
             self._correct(peer_id, peer, missed, now_ns)
 
-    def _objection(self, hello: wire.Hello, now_ns: int) -> str | None:
-        """Why a new run cannot be taken in, if it cannot."""
-        edge = self._config.edge
+    def _objection(self, peer_id: bytes, hello: wire.Hello, now_ns: int) -> str | None:
+        """Why this run cannot be taken in, if it cannot."""
+        edge, known = self._config.edge, self._peers.get(peer_id)
+        if known is not None:
+            same = known.hello.name == hello.name
+            return None if same else f"this run's number is in use by '{known.hello.name}'; start again"
         present = [peer for peer in self._peers.values() if not peer.gone]
         for peer in present:
             if peer.hello.name == hello.name and now_ns - peer.heard_ns < seconds(edge.name_hold_s):
@@ -186,34 +230,77 @@ class Edge:
             return f"the edge serves {len(present)} agents already, as many as it may (edge.max_agents)"
         return None
 
-    def _keyframe(self, peer_id: bytes, peer: _Peer, keyframe: Keyframe, now_ns: int) -> None:
+    def _enter(self, peer_id: bytes, peer: Peer) -> None:
+        self._peers[peer_id] = peer
+        self._by_key[peer.key] = peer_id
+        self._effects.append(Join(peer.key, peer.hello))
+
+    def _recall(self, run: Known) -> None:
+        """A run of an earlier life: it is not here, but may go on where it was."""
+        next_keyframe = 0 if run.foot is None else run.foot.id + 1
+        peer_id = wire.peer_id(run.hello.run_id)
+        self._peers[peer_id] = Peer(
+            run.hello, run.key, 0, InOrder(next_keyframe), next_keyframe, run.foot, gone=True
+        )
+        self._by_key[run.key] = peer_id
+
+    # ------------------------------------------------------------------ keyframes
+
+    def _keyframe(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> None:
         applicable = peer.inorder.push(keyframe)
-        self._send(peer_id, peer.inorder.ack())
         for ready in applicable:
             peer.counts["keyframes"] += 1
-            self._found(self._mapper.add(peer.key, peer.hello, ready), now_ns)
+            self._apply(peer, ready, now_ns)
+            self._unsafe.append((self._ticket, peer, ready.id + 1))
+        if not self._keeps:
+            self._kept(self._ticket)
+        if not applicable:  # the others are acknowledged once they are safe
+            self._acknowledge(peer)
 
-    def _notice_silence(self, now_ns: int) -> None:
-        for peer in self._peers.values():
-            if not peer.gone and now_ns - peer.heard_ns > seconds(self._config.edge.silent_s):
-                peer.gone = True
-                self._record(now_ns, "silent", peer, f"nothing heard for {self._config.edge.silent_s:g} s")
+    def _apply(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> None:
+        try:
+            keyframe, complaint = peer.place(keyframe)
+        except ValueError as error:
+            self._complain(peer, str(error), now_ns)
+            return
+        if complaint:
+            self._record(now_ns, "odometry leapt", peer, complaint)
+        assert peer.foot is not None
+        self._keep(KeepKeyframe(peer.key, keyframe, peer.foot.T_odom_body))
+        self._effects.append(Add(peer.key, keyframe))
+
+    def _keep(self, *changes: Change) -> None:
+        if self._keeps and changes:
+            self._ticket += 1
+            self._effects.append(Keep(self._ticket, changes))
+
+    def _kept(self, ticket: int) -> None:
+        """Acknowledge what is safe now."""
+        told = {}
+        while self._unsafe and self._unsafe[0][0] <= ticket:
+            _, peer, next_keyframe = self._unsafe.popleft()
+            peer.safe = next_keyframe
+            told[peer.key] = peer
+        for peer in told.values():
+            self._acknowledge(peer)
+
+    def _acknowledge(self, peer: Peer) -> None:
+        self._send(self._by_key[peer.key], peer.inorder.ack(peer.safe))
 
     # ------------------------------------------------------------------ the map
 
-    def _found(self, findings: list[Finding], now_ns: int) -> None:
+    def _found(self, finding: Finding, now_ns: int) -> None:
         """Write down what the mapper decided, and send what follows from it."""
-        for finding in findings:
-            peer_id = self._by_key[finding.agent]
-            peer = self._peers[peer_id]
-            if finding.correction is None:
-                self._record(now_ns, finding.what, peer, finding.reason)
-            elif peer.gone:
-                peer.missed = finding
-            else:
-                self._correct(peer_id, peer, finding, now_ns)
+        peer_id = self._by_key[finding.agent]
+        peer = self._peers[peer_id]
+        if finding.correction is None:
+            self._record(now_ns, finding.what, peer, finding.reason)
+        elif peer.gone:
+            peer.missed = finding
+        else:
+            self._correct(peer_id, peer, finding, now_ns)
 
-    def _correct(self, peer_id: bytes, peer: _Peer, finding: Finding, now_ns: int) -> None:
+    def _correct(self, peer_id: bytes, peer: Peer, finding: Finding, now_ns: int) -> None:
         assert finding.correction is not None
         peer.revision += 1
         peer.counts["corrections"] += 1
@@ -221,11 +308,6 @@ class Edge:
         self._send(peer_id, correction)
         fields = {"map_id": correction.map_id, "revision": peer.revision, "answers": correction.answers}
         self._record(now_ns, finding.what, peer, finding.reason, **fields)
-
-    def _give_work(self) -> None:
-        if not self._working and (job := self._mapper.next_job()) is not None:
-            self._working = True
-            self._effects.append(Work(job))
 
     # ------------------------------------------------------------------ going out
 
@@ -236,46 +318,29 @@ class Edge:
         counts["bytes_down"] += sum(len(frame) for frame in frames)
         self._effects.append(Send(peer_id, frames))
 
-    def _record(self, now_ns: int, what: str, peer: _Peer | None, reason: str, **fields: Any) -> None:
+    def _record(self, now_ns: int, what: str, peer: Peer | None, reason: str, **fields: Any) -> None:
         assert self._began_ns is not None
         t_s = round((now_ns - self._began_ns) * 1e-9, 6)
         agent = peer.hello.name if peer else None
         self._effects.append(Record({"t_s": t_s, "event": what, "agent": agent, "reason": reason, **fields}))
 
-    def report(self) -> dict[str, Any]:
-        """edge.json: per agent and in all. An agent's earlier runs stand under their run's own key."""
+    def report(self, mapped: dict[str, Any]) -> dict[str, Any]:
+        """edge.json: per agent and in all. mapped: the mapper's report, whose `agents` are by run.
+
+        An agent's earlier runs stand under their run's own key.
+        """
         newest = {peer.hello.name: peer for peer in self._peers.values()}
+        of_agents = mapped.get("agents", {})
         return {
             "session": self._session,
             "policy": self._config.edge.policy,
+            **mapped,
             "agents": {
-                peer.hello.name if newest[peer.hello.name] is peer else peer.key: self._report_of(peer)
+                peer.hello.name if newest[peer.hello.name] is peer else peer.key: peer.report()
+                | of_agents.get(peer.key, {})
                 for peer in self._peers.values()
             },
             "strangers": dict(self._strangers),
-            **self._mapper.report(),
             "version": __version__,
             "config": to_mapping(self._config),
         }
-
-    def _report_of(self, peer: _Peer) -> dict[str, Any]:
-        return {
-            "kind": str(peer.hello.kind),
-            "run_id": peer.hello.run_id,
-            "state": str(peer.state),
-            "gone": peer.gone,
-            **{name: peer.counts[name] for name in _COUNTS},
-            **self._mapper.report_of(peer.key),
-        }
-
-
-_COUNTS = (
-    "keyframes",
-    "poses",
-    "evaluations",
-    "corrections",
-    "bytes_up",
-    "bytes_down",
-    "bad_messages",
-    "unexpected",
-)

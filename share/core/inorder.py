@@ -39,9 +39,14 @@ class InOrder:
             self.evicted += 1
         return ready
 
-    def ack(self) -> Ack:
-        """What to answer to every keyframe, duplicates too: their acknowledgement may have been lost."""
-        return Ack(self.next_keyframe, tuple(sorted(self._waiting)))
+    def ack(self, safe: int | None = None) -> Ack:
+        """What to answer to every keyframe, duplicates too: their acknowledgement may have been lost.
+
+        safe: applied keyframes from this number on are only held yet (default: all are safe).
+        """
+        safe = self.next_keyframe if safe is None else safe
+        held = (*range(safe, self.next_keyframe), *sorted(self._waiting))
+        return Ack(safe, held[:MAX_HELD])
 
     def _keep(self, keyframe: Keyframe) -> None:
         known = self._waiting.get(keyframe.id)

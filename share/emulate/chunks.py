@@ -38,6 +38,9 @@ def read_chunk(path: Path) -> Iterator[Measurement]:
     except (msgspec.DecodeError, msgspec.ValidationError) as error:
         raise DataError(f"{path}: is damaged ({error}); delete it and run the command again") from None
     for p in pictures:
-        scale = DEPTH_SCALE if p.stream == DEPTH else 0.0
-        image = EncodedImage(p.data, str(path), p.width, p.height, scale)
-        yield Measurement(p.stream, p.stamp_ns, image)
+        yield Measurement(p.stream, p.stamp_ns, encoded(p, str(path)))
+
+
+def encoded(p: Picture, where: str) -> EncodedImage:
+    """As a reader has it. where: what an error names."""
+    return EncodedImage(p.data, where, p.width, p.height, DEPTH_SCALE if p.stream == DEPTH else 0.0)

@@ -24,7 +24,7 @@ from share.emulate.preparation import Prepared, keep_room, prepare
 from share.emulate.progress import Progress, silent
 from share.emulate.recipe import Recipe
 from share.emulate.sensor.exposure import Shots
-from share.emulate.shooting import Look, Take
+from share.emulate.shooting import Take
 from share.emulate.stage import Actor, Stage
 from share.emulate.takes import write_recording, write_truth
 from share.emulate.types import START_NS
@@ -37,7 +37,6 @@ from share.types import F64
 
 PLAN = "plan.png"
 _FRAMES = 24  # of a chunk: what a break costs a process
-_METERED_NS, _METERED = 125_000_000, 50  # light is metered so often, by so many looks a job
 _BYTES = {"jpeg": 130_000, "png": 330_000}  # of an image, about; to see beforehand whether the disk will do
 
 
@@ -99,19 +98,17 @@ def _make(recipe: Recipe, prepared: Prepared, growth: Growth, workers: int, prog
 def _exposures(pool: Pool, stage: Stage, who: int, work: Path, progress: Progress) -> Shots:
     """How each of the actor's frames is exposed, from a quick look at some of them."""
     actor, kept = stage.actors[who], work / f"{stage.actors[who].name}.brightness.npy"
-    true_ns = actor.pictures.true_ns
-    looks = np.append(np.arange(true_ns[0], true_ns[-1], _METERED_NS), true_ns[-1])
+    jobs = shooting.looks(who, actor)
     if kept.exists():
         brightness = np.load(kept)
     else:
-        jobs = [Look(who, looks[k : k + _METERED]) for k in range(0, len(looks), _METERED)]
         values: dict[int, F64] = {}
         for job, seen in pool.run(shooting.meter, jobs):
             values[int(job.true_ns[0])] = seen
             progress(f"metering {actor.name}", len(values), len(jobs))
         brightness = np.concatenate([values[key] for key in sorted(values)])
         atomic_write(kept, _npy(brightness))
-    return actor.device.shots(true_ns, np.interp(true_ns - looks[0], looks - looks[0], brightness))
+    return shooting.exposed(actor, jobs, brightness)
 
 
 def _npy(values: F64) -> bytes:

@@ -6,7 +6,7 @@ frame is exposed; then they are drawn, developed and encoded.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -18,11 +18,12 @@ from share.core.measurement import CAM0, CAM1, DEPTH
 from share.emulate.chunks import Picture, write_chunk
 from share.emulate.room_file import open_renderer
 from share.emulate.sensor.exposure import Shot, Shots
-from share.emulate.stage import Sight, Stage, T_body, smaller
+from share.emulate.stage import Actor, Sight, Stage, T_body, smaller
 from share.emulate.types import Renderer
 from share.types import F64, I64, U8
 
 _METER = 8  # times smaller than the picture
+_METERED_NS, _METERED = 125_000_000, 50  # light is metered so often, by so many looks a job
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95]
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 _DEPTH_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
@@ -64,6 +65,19 @@ def begin(stage: Stage, images: str) -> None:
     _worker = _Worker(stage, images)
 
 
+def looks(who: int, actor: Actor) -> list[Look]:
+    """Where to meter, so that `exposed` can say how each of the actor's frames is taken."""
+    true_ns = actor.pictures.true_ns
+    times = np.append(np.arange(true_ns[0], true_ns[-1], _METERED_NS), true_ns[-1])
+    return [Look(who, times[k : k + _METERED]) for k in range(0, len(times), _METERED)]
+
+
+def exposed(actor: Actor, looked: Sequence[Look], brightness: F64) -> Shots:
+    """How each of the actor's frames is taken; brightness (N,): what `meter` found by all the looks."""
+    true_ns, times = actor.pictures.true_ns, np.concatenate([look.true_ns for look in looked])
+    return actor.device.shots(true_ns, np.interp(true_ns - times[0], times - times[0], brightness))
+
+
 def meter(look: Look) -> F64:
     """Mean radiance of each (N,) image of cam0."""
     w = _ready()
@@ -75,8 +89,14 @@ def meter(look: Look) -> F64:
 
 def shoot(take: Take) -> None:
     """Draw the frames and write the chunk."""
-    pictures = [picture for frame in _frames(_ready(), take) for picture in _developed(_ready(), take, frame)]
-    write_chunk(take.file, pictures)
+    write_chunk(take.file, list(draw(take.who, slice(take.first, take.last), take.shots)))
+
+
+def draw(who: int, here: slice, shots: Shots) -> Iterator[Picture]:
+    """The images of some of an actor's `pictures`, frame by frame; shots: how each frame is exposed."""
+    w = _ready()
+    for frame in _frames(w, who, here, shots):
+        yield from _developed(w, w.stage.actors[who], frame)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,22 +110,21 @@ class _Frame:
     middle: Sight
 
 
-def _frames(w: _Worker, take: Take) -> Iterator[_Frame]:
-    actor, here = w.stage.actors[take.who], slice(take.first, take.last)
+def _frames(w: _Worker, who: int, here: slice, series: Shots) -> Iterator[_Frame]:
+    actor = w.stage.actors[who]
     index, stamps, true = (
         a[here] for a in (actor.pictures.index, actor.pictures.stamp_ns, actor.pictures.true_ns)
     )
-    moved = w.stage.motion_px(take.who, true, take.shots.exposure_ms)
-    shots = [take.shots[k] for k in range(len(true))]
+    moved = w.stage.motion_px(who, true, series.exposure_ms)
+    shots = [series[k] for k in range(len(true))]
     offsets = [actor.device.blur_offsets(shot, px) for shot, px in zip(shots, moved.tolist(), strict=True)]
     times = [t + np.rint(dt * 1e9).astype(np.int64) for t, dt in zip(true, offsets, strict=True)]
-    exposed = iter(w.stage.sights(take.who, np.concatenate(times)))
-    for k, middle in enumerate(w.stage.sights(take.who, true)):
+    exposed = iter(w.stage.sights(who, np.concatenate(times)))
+    for k, middle in enumerate(w.stage.sights(who, true)):
         yield _Frame(int(index[k]), int(stamps[k]), shots[k], list(islice(exposed, len(times[k]))), middle)
 
 
-def _developed(w: _Worker, take: Take, frame: _Frame) -> Iterator[Picture]:
-    actor = w.stage.actors[take.who]
+def _developed(w: _Worker, actor: Actor, frame: _Frame) -> Iterator[Picture]:
     grays: dict[str, U8] = {}
     for number, (stream, camera) in enumerate(((CAM0, actor.rig.cam0), (CAM1, actor.rig.cam1))):
         if camera is not None:

@@ -14,6 +14,7 @@ from share.emulate.stage import Actor
 from share.io.files import atomic_write
 from share.io.mcap.recorder import Recorder
 from share.io.trajectory import Trajectory, format_tum
+from share.types import I64
 
 
 def write_recording(actor: Actor, chunks: list[Path], path: Path) -> None:
@@ -41,9 +42,14 @@ def _counted(
 def write_truth(actor: Actor, path: Path) -> None:
     """Pose of the body in the world when the device's clock, which is the IMU's too, shows the stamp of
     each picture. (With a time offset the picture itself was taken a little before or after.)"""
+    atomic_write(path, format_tum(truth_of(actor)[1]))
+
+
+def truth_of(actor: Actor) -> tuple[I64, Trajectory]:
+    """Which of its pictures (N,) have a truth, and that, N poses; see `write_truth`."""
     times, stamps = actor.device.truth_times(actor.pictures)
     known = (times >= actor.path.start_ns) & (times <= actor.path.end_ns) & ~actor.in_gap(times)
-    atomic_write(path, format_tum(Trajectory(stamps[known], actor.path.poses(times[known]))))
+    return np.flatnonzero(known), Trajectory(stamps[known], actor.path.poses(times[known]))
 
 
 def _inertial(actor: Actor) -> Iterator[Measurement]:

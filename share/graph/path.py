@@ -7,7 +7,7 @@ factorisation. It is what a new loop has to agree with.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -51,7 +51,7 @@ class Roads:
         return None
 
 
-def covariance_between(path: Sequence[Edge], start: int, poses: Sequence[F64]) -> F64:
+def covariance_between(path: Sequence[Edge], start: int, poses: Mapping[int, F64]) -> F64:
     """Covariance (6, 6) of T_start_goal along `path`, each step laid along the current `poses`."""
     cov = np.zeros((6, 6))
     here = start

@@ -2,39 +2,44 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from bisect import bisect_left
+from dataclasses import dataclass, field
 
-import numpy as np
-
-from share.config import MergeConfig
 from share.geometry import se3
-from share.graph.posegraph import Edge
 from share.merge.join import Key
 from share.types import F64, Keyframe
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """A keyframe's place on its stretch. reference: the node that T_ref_body starts from, -1 for odom."""
+    """A keyframe's place on its stretch: T_odom_body (4, 4). ordinal: how many came before it there."""
 
     key: Key
     stretch: int
     ordinal: int
-    reference: int
-    T_ref_body: F64
     T_odom_body: F64
 
 
-class Trails:
-    """Nodes in the order of arrival, the odometry edges between them, and the stretches they make up."""
+@dataclass(eq=False)
+class Stretch:
+    """nodes: their numbers, rising. name: `agent/n`, the n-th of this agent. count: of all it ever had."""
 
-    def __init__(self, config: MergeConfig) -> None:
-        self._config = config
-        self.nodes: list[Node] = []
-        self.edges: list[Edge] = []
-        self.stretches: list[list[int]] = []  # node numbers, in order
+    agent: str
+    name: str
+    nodes: list[int] = field(default_factory=list)
+    count: int = 0
+
+
+class Trails:
+    """Nodes by number, in the order of arrival, and the stretches that they make up, oldest first."""
+
+    def __init__(self) -> None:
+        self.nodes: dict[int, Node] = {}
+        self.stretches: list[Stretch] = []
+        self._next = 0
         self._at: dict[Key, int] = {}
         self._current: dict[str, int] = {}  # agent -> stretch that it is on
+        self._begun: dict[str, int] = {}  # agent -> how many stretches
 
     def add(self, agent: str, keyframe: Keyframe) -> int:
         """The number of the new node. Raises ValueError for a keyframe known already, or one whose
@@ -42,47 +47,61 @@ class Trails:
         key = Key(agent, keyframe.id)
         if key in self._at:
             raise ValueError(f"keyframe {key} was added before")
-        number = len(self.nodes)
         if keyframe.reference < 0:
-            node = Node(key, len(self.stretches), 0, -1, keyframe.T_ref_body, keyframe.T_ref_body)
-            self.stretches.append([])
-            self._current[agent] = node.stretch
+            stretch, T_odom_body = self._begin(agent), keyframe.T_ref_body
         else:
-            reference = self.number(Key(agent, keyframe.reference))
-            before = self.nodes[reference]
+            before = self.nodes[self.number(Key(agent, keyframe.reference))]
+            stretch = before.stretch
             T_odom_body = se3.orthonormal(before.T_odom_body @ keyframe.T_ref_body)
-            ordinal = before.ordinal + 1
-            node = Node(key, before.stretch, ordinal, reference, keyframe.T_ref_body, T_odom_body)
-            self.edges.append(Edge(reference, number, keyframe.T_ref_body, self._believed(keyframe.cov)))
-        self.nodes.append(node)
-        self.stretches[node.stretch].append(number)
+        at = self.stretches[stretch]
+        number, self._next = self._next, self._next + 1
+        self.nodes[number] = Node(key, stretch, at.count, T_odom_body)
+        at.nodes.append(number)
+        at.count += 1
         self._at[key] = number
         return number
 
+    def take_out(self, number: int) -> None:
+        """Forget a node; its stretch goes on without it."""
+        node = self.nodes.pop(number)
+        self.stretches[node.stretch].nodes.remove(number)
+        del self._at[node.key]
+
     def number(self, key: Key) -> int:
-        """Raises ValueError if no such keyframe was added."""
+        """Raises ValueError if no such keyframe is there."""
         if key not in self._at:
             raise ValueError(f"keyframe {key} is not known")
         return self._at[key]
-
-    def name(self, stretch: int) -> str:
-        """`agent/n`: the n-th stretch of this agent."""
-        agent = self.nodes[self.stretches[stretch][0]].key.agent
-        earlier = sum(self.nodes[s[0]].key.agent == agent for s in self.stretches[:stretch])
-        return f"{agent}/{earlier}"
 
     def current(self, agent: str) -> int | None:
         """The stretch that the agent is on now."""
         return self._current.get(agent)
 
-    def is_neighbour(self, a: int, b: int) -> bool:
-        """Near each other on one stretch, so that odometry knows their relative pose best."""
-        first, second = self.nodes[a], self.nodes[b]
-        near = abs(first.ordinal - second.ordinal) < self._config.min_loop_gap
-        return first.stretch == second.stretch and near
+    def before(self, number: int) -> int | None:
+        """The node before this one on its stretch; None for the first."""
+        return self._beside(number, -1)
 
-    def _believed(self, cov: F64) -> F64:
-        """Agents are surer of themselves than they should be; none is surer than the floor."""
-        c = self._config
-        floor = [np.radians(c.odometry_floor_deg) ** 2] * 3 + [c.odometry_floor_m**2] * 3
-        return c.odometry_scale**2 * cov + np.diag(floor)
+    def after(self, number: int) -> int | None:
+        """The node after this one on its stretch; None for the newest."""
+        return self._beside(number, +1)
+
+    def T_between(self, a: int, b: int) -> F64:
+        """Pose (4, 4) of node b in node a of the same stretch, by odometry."""
+        return se3.inverse(self.nodes[a].T_odom_body) @ self.nodes[b].T_odom_body
+
+    def are_neighbours(self, a: int, b: int, gap: int) -> bool:
+        """Fewer than `gap` keyframes apart on one stretch, so that odometry knows their pose best."""
+        first, second = self.nodes[a], self.nodes[b]
+        return first.stretch == second.stretch and abs(first.ordinal - second.ordinal) < gap
+
+    def _begin(self, agent: str) -> int:
+        count = self._begun.get(agent, 0)
+        self._begun[agent] = count + 1
+        self._current[agent] = len(self.stretches)
+        self.stretches.append(Stretch(agent, f"{agent}/{count}"))
+        return len(self.stretches) - 1
+
+    def _beside(self, number: int, step: int) -> int | None:
+        nodes = self.stretches[self.nodes[number].stretch].nodes
+        at = bisect_left(nodes, number) + step
+        return nodes[at] if 0 <= at < len(nodes) else None

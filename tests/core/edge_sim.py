@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,11 @@ from share.config import Config
 from share.core import edge as ed
 from share.core import events as ev
 from share.core.agent import Agent
+from share.core.finding import Finding
+from share.core.mapper import Mapper
+from share.core.steps import Solve, Step
 from share.geometry import se3
+from share.graph.solver import Solver
 from share.types import F64, U8, AgentKind, Candidate, Keyframe, TrackState, View
 from share.wire.codec import decode
 from share.wire.messages import Hello, peer_id
@@ -85,6 +90,18 @@ class Person:
         return self.T_odom_body[-1], look(self.place, T, self.rng)
 
 
+class ModelRun:
+    """One life of the edge: both machines, as `share.run.edge` has them, without processes."""
+
+    def __init__(self, config: Config, session: int) -> None:
+        self.machine = ed.Edge(config, session)
+        self.mapper = Mapper(config)
+        self.solver = Solver(config.graph)
+
+    def report(self) -> dict[str, Any]:
+        return self.machine.report(self.mapper.report())
+
+
 class Town:
     """Everybody, their edge, and 2 ms between them. `job_ms` is how long the worker takes."""
 
@@ -97,7 +114,7 @@ class Town:
         self.agent_effects: dict[bytes, list[ev.AgentEffect]] = {}
         for person in people:
             self.arrive(person)
-        self.edge: ed.Edge | None = ed.Edge(self.config, session)
+        self.edge: ModelRun | None = ModelRun(self.config, session)
         self.records: list[dict[str, object]] = []
         self.now_ns = 0
         self._job_ns = round(job_ms * MS)
@@ -147,18 +164,31 @@ class Town:
 
     def to_edge(self, event: ed.Event) -> None:
         edge = self.edge
-        for effect in edge.handle(event, self.now_ns) if edge else ():
+        for effect in edge.machine.handle(event, self.now_ns) if edge else ():
             match effect:
                 case ed.Send(peer, frames):
                     copy = [bytes(f) for f in frames]
                     self._in(2 * MS, lambda peer=peer, copy=copy: self.to_agent(peer, ev.Received(copy)))
-                case ed.Work(job):
-                    done = ed.Done(job, job.run(), self._job_ns / MS)
-                    self._in(
-                        self._job_ns, lambda done=done: self.to_edge(done) if self.edge is edge else None
-                    )
+                case ed.Join(key, hello):
+                    edge.mapper.join(key, hello)
+                case ed.Add(key, keyframe):
+                    self._mapped(edge, edge.mapper.add(key, keyframe))
                 case ed.Record(fields):
                     self.records.append(fields)
+
+    def _mapped(self, edge: ModelRun, findings: list[Finding]) -> None:
+        """The mapper has decided something, and goes on to its next steps, each in its own time."""
+        if self.edge is not edge:
+            return
+        if found := ed.Found(tuple(findings), edge.mapper.take_changes()):
+            self._in(0, lambda: self.to_edge(found) if self.edge is edge else None)
+        for step in (edge.mapper.next_look(), edge.mapper.next_solve()):
+            if step is not None:
+                result = step.run(edge.solver) if isinstance(step, Solve) else step.run()
+                self._in(self._job_ns, lambda step=step, result=result: self._done(edge, step, result))
+
+    def _done(self, edge: ModelRun, step: Step, result: object) -> None:
+        self._mapped(edge, edge.mapper.done(step, result, self._job_ns / MS))
 
     def to_agent(self, peer: bytes, event: ev.AgentEvent) -> None:
         agent = self.agents.get(peer)

@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_sim import MS, Person, Town, walls
+from edge_sim import MS, ModelRun, Person, Town, walls
 
 from share.config import Config
 from share.core import edge as ed
 from share.core import events as ev
+from share.core.mapper import Mapper
 from share.geometry import se3
 from share.types import AgentKind
 from share.wire import messages as m
@@ -102,7 +103,7 @@ def test_an_edge_without_memory_is_given_the_map_again_and_joins_it_again(joined
     odometry = len(again.event(ev.Localised, "ann"))
     again.walk(4)
     assert len(again.event(ev.Localised, "ann")) == odometry + 4
-    again.edge = ed.Edge(again.config, session=2)
+    again.edge = ModelRun(again.config, session=2)
     again.walk(8)
     again.run(2000)
     report = again.edge.report()
@@ -187,7 +188,7 @@ def test_strangers_get_a_pong_and_nothing_else():
     pong = sent(tell(edge, 5, m.Ping(3, 42), 9), m.Pong)
     assert pong == [m.Pong(3, 42, 9 * MS, 9 * MS, 7)]
     assert not sent(tell(edge, 5, m.Evaluation(0, 1.0, None)), m.Message)
-    assert edge.report()["strangers"]["unexpected"] == 1
+    assert edge.report({})["strangers"]["unexpected"] == 1
 
 
 def test_malformed_messages_are_counted_and_said_once():
@@ -198,7 +199,7 @@ def test_malformed_messages_are_counted_and_said_once():
         effects = edge.handle(ed.Received(m.peer_id(1), [b"\x00" * (k % 50)]), k)
         records += [e for e in effects if isinstance(e, ed.Record)]
     assert len(records) == 1
-    assert edge.report()["agents"]["ann"]["bad_messages"] == 1000
+    assert edge.report({})["agents"]["ann"]["bad_messages"] == 1000
     assert sent(tell(edge, 1, m.Ping(1, 1), 1), m.Pong)
 
 
@@ -210,20 +211,21 @@ def test_a_keyframe_is_applied_once_and_in_order():
     acks = [sent(tell(edge, 11, entries[k]), m.Ack)[0] for k in (1, 0, 1, 3, 2)]
     assert [ack.next_keyframe for ack in acks] == [0, 2, 2, 2, 4]
     assert acks[0].held == (1,)
-    assert edge.report()["agents"]["ann"]["keyframes"] == 4
+    assert edge.report({})["agents"]["ann"]["keyframes"] == 4
 
 
-def test_a_job_that_fails_costs_its_keyframe_only():
+def test_a_step_that_fails_costs_its_keyframe_only():
     both = town()
     both.walk(1)
-    edge = ed.Edge(Config(), 7)
-    tell(edge, 11, hello(run_id=11))
-    work = [e for e in tell(edge, 11, both.keyframes("ann")[0]) if isinstance(e, ed.Work)]
-    effects = edge.handle(ed.Done(work[0].job, MemoryError("no room"), 1.0), 5 * MS)
-    record = next(e.fields for e in effects if isinstance(e, ed.Record))
-    assert (record["event"], record["agent"]) == ("job failed", "ann")
-    assert "no room" in record["reason"]
-    assert edge.report()["failed_jobs"] == 1
+    mapper = Mapper(Config())
+    mapper.join("ann-000b", hello(run_id=11))
+    mapper.add("ann-000b", both.keyframes("ann")[0])
+    look = mapper.next_look()
+    (finding,) = mapper.done(look, MemoryError("no room"), 1.0)
+    assert (finding.what, finding.agent) == ("job failed", "ann-000b")
+    assert "no room" in finding.reason
+    assert mapper.report()["failed_jobs"] == 1
+    assert mapper.next_look() is None
 
 
 def test_under_load_keyframes_are_kept_but_not_looked_up():

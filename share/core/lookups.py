@@ -1,0 +1,52 @@
+"""Whose keyframe is looked up next: fair between agents, headsets before robots, the newest first."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+
+from share.types import AgentKind
+
+_WEIGHT = {AgentKind.AR: 4, AgentKind.ROBOT: 1}  # a robot waits four times as many turns as a headset
+
+
+class Lookups:
+    """Keyframes that wait to be looked up, at most `most`.
+
+    One too many: the oldest of the agent with most of them is left out (policy skip_oldest_query).
+    """
+
+    def __init__(self, most: int) -> None:
+        self.skipped: Counter[str] = Counter()  # by agent
+        self._most = most
+        self._waiting: dict[str, deque[int]] = {}
+        self._weight: dict[str, int] = {}
+        self._served: dict[str, int] = {}  # when, in turns
+        self._turn = 0
+
+    def __len__(self) -> int:
+        return sum(map(len, self._waiting.values()))
+
+    def add(self, agent: str, kind: AgentKind, number: int) -> None:
+        self._weight[agent] = _WEIGHT[kind]
+        self._served.setdefault(agent, self._turn)
+        self._waiting.setdefault(agent, deque()).append(number)
+        if len(self) > self._most:
+            longest = max(self._waiting, key=lambda name: len(self._waiting[name]))
+            self._take(longest, oldest=True)
+            self.skipped[longest] += 1
+
+    def next(self) -> int | None:
+        """The newest keyframe of the agent that has waited longest for its turn; None without any."""
+        if not self._waiting:
+            return None
+        self._turn += 1
+        agent = max(self._waiting, key=lambda name: (self._turn - self._served[name]) * self._weight[name])
+        self._served[agent] = self._turn
+        return self._take(agent, oldest=False)
+
+    def _take(self, agent: str, oldest: bool) -> int:
+        queue = self._waiting[agent]
+        number = queue.popleft() if oldest else queue.pop()
+        if not queue:
+            del self._waiting[agent]
+        return number

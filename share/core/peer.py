@@ -1,0 +1,91 @@
+"""One run of one agent, as the edge knows it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from share.core.finding import Finding
+from share.core.inorder import InOrder
+from share.core.rate import SECOND_NS
+from share.geometry import se3
+from share.types import F64, Keyframe, TrackState
+from share.wire.messages import Hello
+
+_LEAP_M, _LEAP_M_S = 2.0, 10.0  # further than this, and so much more a second, nobody moves between keyframes
+
+
+@dataclass(frozen=True, eq=False)
+class Foot:
+    """Where the newest applied keyframe stands: its id, its stamp, T_odom_body (4, 4)."""
+
+    id: int
+    stamp_ns: int
+    T_odom_body: F64
+
+    def leaps(self, keyframe: Keyframe) -> float:
+        """How far (m) the keyframe is from here, if nobody can have moved so far meanwhile, else 0."""
+        away = float(np.linalg.norm(keyframe.T_ref_body[:3, 3]))
+        passed_s = max(0, keyframe.stamp_ns - self.stamp_ns) / SECOND_NS
+        return away if away > _LEAP_M + _LEAP_M_S * passed_s else 0.0
+
+
+@dataclass
+class Peer:
+    """safe: all its keyframes below this number will be there after a crash, and so are acknowledged."""
+
+    hello: Hello
+    key: str  # names this run: the name, and some of the run id
+    heard_ns: int
+    inorder: InOrder = field(default_factory=InOrder)
+    safe: int = 0
+    foot: Foot | None = None
+    state: TrackState = TrackState.INITIALISING
+    counts: Counter[str] = field(default_factory=Counter)
+    revision: int = 0
+    gone: bool = False
+    missed: Finding | None = None  # the newest correction while it was gone
+
+    def place(self, keyframe: Keyframe) -> tuple[Keyframe, str | None]:
+        """The next keyframe in order as the map may have it, and what was wrong with it.
+
+        One that leaps begins a stretch, in the same odom. Raises ValueError where what it refers to is
+        not the keyframe before it.
+        """
+        complaint = None
+        if keyframe.reference < 0:
+            T_odom_body = keyframe.T_ref_body
+        elif self.foot is None or keyframe.reference != self.foot.id:
+            raise ValueError(f"keyframe {keyframe.id} refers to {keyframe.reference}, which is not the last")
+        else:
+            T_odom_body = se3.orthonormal(self.foot.T_odom_body @ keyframe.T_ref_body)
+            if leap_m := self.foot.leaps(keyframe):
+                complaint = f"keyframe {keyframe.id} is {leap_m:.0f} m from the one before: a new stretch"
+                keyframe = replace(keyframe, reference=-1, T_ref_body=T_odom_body)
+        self.foot = Foot(keyframe.id, keyframe.stamp_ns, T_odom_body)
+        return keyframe, complaint
+
+    def report(self) -> dict[str, Any]:
+        """edge.json's fields of one run, as far as it was heard."""
+        return {
+            "kind": str(self.hello.kind),
+            "run_id": self.hello.run_id,
+            "state": str(self.state),
+            "gone": self.gone,
+            **{name: self.counts[name] for name in _COUNTS},
+        }
+
+
+_COUNTS = (
+    "keyframes",
+    "poses",
+    "evaluations",
+    "corrections",
+    "bytes_up",
+    "bytes_down",
+    "bad_messages",
+    "unexpected",
+)

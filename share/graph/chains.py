@@ -1,0 +1,119 @@
+"""One Gauss-Newton step of a pose graph, by conjugate gradients.
+
+The agents' own odometry makes long chains; the equations along them are block tridiagonal and solved
+in a millisecond. They, with every other edge's information added at both its ends, precondition
+the whole; what the loops couple is left to the iterations: some 40, however many loops there are. A
+factorisation of the whole fills in instead. Source: Dellaert et al., *Subgraph-preconditioned
+Conjugate Gradients for Large Scale SLAM*, IROS 2010.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from share.graph.linear import Edges
+from share.types import F64, I64
+
+MOST_ITERATIONS = 300  # of conjugate gradients; where they end early the step is still downhill
+
+
+def chain_order(n: int, odometry: Edges) -> I64:
+    """Which of n poses comes k-th (n,), so that neighbours by odometry are neighbours, but where it forks."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    a, b = np.concatenate([odometry.a, odometry.b]), np.concatenate([odometry.b, odometry.a])
+    graph = csr_array((np.ones(len(a)), (a, b)), shape=(n, n))
+    return np.asarray(reverse_cuthill_mckee(graph, symmetric_mode=True), np.int64)
+
+
+class Equations:
+    """What stays the same while the edges of n poses, in `chain_order`, are linearised again and
+    again: which block goes where. Pose `held` does not move."""
+
+    def __init__(self, n: int, edges: Edges, held: int) -> None:
+        from scipy.sparse import csr_array
+
+        a, b, e = edges.a, edges.b, len(edges)
+        self._n, self._held = n, held
+        self._free = ((a != held)[:, None, None], (b != held)[:, None, None])
+        ends = np.concatenate([a, b])
+        self._gather = csr_array((np.ones(2 * e), (ends, np.arange(2 * e))), shape=(n, 2 * e))
+        rows, columns = np.concatenate([np.arange(n), ends]), np.concatenate([np.arange(n), b, a])
+        self._order = np.lexsort((columns, rows))
+        self._columns = columns[self._order]
+        self._starts = np.searchsorted(rows[self._order], np.arange(n + 1))
+        self._onward, self._backward = np.flatnonzero(b == a + 1), np.flatnonzero(a == b + 1)
+        upper = np.concatenate([a[self._onward], b[self._backward]])
+        shape = n, len(upper)
+        self._next = csr_array((np.ones(len(upper)), (upper, np.arange(len(upper)))), shape=shape)
+
+    def __len__(self) -> int:
+        return self._n
+
+    def step(self, J: tuple[F64, F64], whitened: F64, damping: float, tolerance: float) -> F64:
+        """The perturbations (n, 6) that solve the equations with their diagonal raised by `damping`.
+
+        J: two (E, 6, 6); whitened (E, 6). tolerance: of the equations' residual, relative. Raises
+        np.linalg.LinAlgError if the chains cannot be solved.
+        """
+        from scipy.sparse.linalg import LinearOperator, cg
+
+        slope, diagonal, coupling = self._blocks(J, whitened)
+        diagonal[:, range(6), range(6)] *= 1 + damping
+        whole = self._whole(diagonal, coupling)
+        chains = _factorised(self._band(diagonal, coupling))
+        easy = LinearOperator(whole.shape, lambda x: _substituted(chains, x), dtype=np.float64)
+        step, _ = cg(whole, -slope.ravel(), rtol=tolerance, maxiter=MOST_ITERATIONS, M=easy)
+        return np.asarray(step.reshape(-1, 6))
+
+    def information(self, J: tuple[F64, F64]) -> Any:
+        """J'J as a sparse matrix (6 n, 6 n), the held pose's part the identity."""
+        _, diagonal, coupling = self._blocks(J, np.zeros((len(J[0]), 6)))
+        whole = self._whole(diagonal, coupling).tocsc()
+        whole.sum_duplicates()
+        return whole
+
+    def _whole(self, diagonal: F64, coupling: F64) -> Any:
+        from scipy.sparse import bsr_array
+
+        blocks = np.concatenate([diagonal, coupling, np.swapaxes(coupling, 1, 2)])[self._order]
+        return bsr_array((blocks, self._columns, self._starts), shape=(6 * self._n,) * 2)
+
+    def _blocks(self, J: tuple[F64, F64], whitened: F64) -> tuple[F64, F64, F64]:
+        """J'r (n, 6), and of J'J the blocks on the diagonal (n, 6, 6) and at every (a, b) (E, 6, 6)."""
+        both = np.concatenate([J[0] * self._free[0], J[1] * self._free[1]])
+        transposed = np.swapaxes(both, 1, 2)
+        e = len(whitened)
+        pull = (transposed.reshape(2, e, 6, 6) @ whitened[:, :, None]).reshape(2 * e, 6)
+        own = (transposed @ both).reshape(2 * e, 36)
+        diagonal = (self._gather @ own).reshape(-1, 6, 6)
+        diagonal[self._held] = np.eye(6)
+        return self._gather @ pull, diagonal, transposed[:e] @ both[e:]
+
+    def _band(self, diagonal: F64, coupling: F64) -> F64:
+        """LAPACK's lower band (12, 6 n) of the blocks on the diagonal and next to it."""
+        onward = np.swapaxes(coupling[self._onward], 1, 2)
+        below = self._next @ np.concatenate([onward, coupling[self._backward]]).reshape(-1, 36)
+        columns = np.concatenate([diagonal, below.reshape(-1, 6, 6)], 1)
+        band = np.zeros((12, 6 * self._n))
+        for j in range(6):
+            band[: 12 - j, j::6] = columns[:, j:, j].T
+        return band
+
+
+def _factorised(band: F64) -> F64:
+    from scipy.linalg.lapack import dpbtrf
+
+    factor, info = dpbtrf(band, lower=1)
+    if info:
+        raise np.linalg.LinAlgError("the chains' equations have no solution")
+    return np.asarray(factor)
+
+
+def _substituted(factor: F64, x: F64) -> F64:
+    from scipy.linalg.lapack import dpbtrs
+
+    return np.asarray(dpbtrs(factor, x, lower=1)[0])

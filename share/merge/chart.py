@@ -1,0 +1,155 @@
+"""Where everything lies: poses by map, the edges between them, and which stretches are one map.
+
+A map is a set of stretches that loops connect; it is named after the first of them to have come,
+its founder, whose oldest keyframe stays where the founder's odometry says: that is the gauge. Maps
+are derived from the loops alone, so taking a loop back takes its join back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from share.geometry import se3
+from share.graph.path import covariance_between
+from share.graph.posegraph import Edge
+from share.merge.join import Key, Known, Loop
+from share.merge.ties import Ties
+from share.merge.trails import Trails
+from share.types import F64, Keyframe
+
+
+class Chart:
+    """poses: T_map_body (4, 4) of every node, by its number. founder: of the map of each stretch."""
+
+    def __init__(self) -> None:
+        self.trails = Trails()
+        self.ties = Ties()
+        self.poses: dict[int, F64] = {}
+        self.founder: list[int] = []
+        self.unsolved: set[int] = set()  # founders of maps with news for the solver
+
+    def add(self, agent: str, keyframe: Keyframe, cov: F64) -> int:
+        """The number of the new node. cov (6, 6): of its step from the one before, as it is believed."""
+        number = self.trails.add(agent, keyframe)
+        node, before = self.trails.nodes[number], self.trails.before(number)
+        if before is None:
+            self.founder.append(node.stretch)
+            self.poses[number] = node.T_odom_body
+        else:
+            T = self.trails.T_between(before, number)
+            self.ties.add(Edge(before, number, T, cov))
+            self.poses[number] = se3.orthonormal(self.poses[before] @ T)
+        self.ties.moved([number])
+        return number
+
+    # ------------------------------------------------------------ changes
+
+    def tie(self, loop: Loop) -> None:
+        """Two maps that it ties are one from now on."""
+        a, b = self.ends(loop)
+        self.ties.add(Edge(a, b, loop.T_a_b, loop.cov), loop)
+        if not self.same_map(a, b):
+            self._find_maps()
+        self.unsolved = {self.founder[f] for f in self.unsolved} | {self.founder_of(loop.a)}
+
+    def drop(self, numbers: Sequence[int]) -> tuple[Loop, ...]:
+        """Take loops, by their edges' numbers, back, and the joins that hung on them."""
+        dropped = tuple(self.ties.loops[n] for n in numbers)
+        touched = {self.founder_of(key) for loop in dropped for key in (loop.a, loop.b)}
+        stretches = [s for founder in touched for s in self.stretches_of(founder)]
+        for number in numbers:
+            self.ties.remove(number)
+        self._find_maps()
+        for founder in sorted({self.founder[s] for s in stretches}):
+            anchor = self.anchor(founder)
+            self.move(founder, self.trails.nodes[anchor].T_odom_body @ se3.inverse(self.poses[anchor]))
+            self.unsolved.add(founder)
+        return dropped
+
+    def lay_beside(self, loop: Loop) -> None:
+        """Move the younger of the two maps that it would tie rigidly to where it says."""
+        if self.founder_of(loop.a) > self.founder_of(loop.b):
+            loop = loop.reverse()
+        a, b = self.ends(loop)
+        self.move(self.founder_of(loop.b), self.poses[a] @ loop.T_a_b @ se3.inverse(self.poses[b]))
+
+    def move(self, founder: int, T: F64) -> None:
+        """The whole map, rigidly, by T (4, 4) from the left."""
+        numbers = self.nodes_of(founder)
+        moved = se3.orthonormal(T @ np.array([self.poses[n] for n in numbers]))
+        self.poses.update(zip(numbers, moved, strict=True))
+        self.ties.moved(numbers)
+
+    def follow(self, numbers: Iterable[int]) -> None:
+        """These go where odometry takes them from the ones before them."""
+        for number in numbers:
+            before = self.trails.before(number)
+            if before is not None:
+                T = self.poses[before] @ self.trails.T_between(before, number)
+                self.poses[number] = se3.orthonormal(T)
+
+    # ------------------------------------------------------------ looking things up
+
+    def ends(self, loop: Loop) -> tuple[int, int]:
+        """The nodes of its keyframes. Raises ValueError if one is unknown."""
+        return self.trails.number(loop.a), self.trails.number(loop.b)
+
+    def stretch_of(self, key: Key) -> int:
+        return self.trails.nodes[self.trails.number(key)].stretch
+
+    def founder_of(self, key: Key) -> int:
+        return self.founder[self.stretch_of(key)]
+
+    def same_map(self, a: int, b: int) -> bool:
+        stretch_a, stretch_b = self.trails.nodes[a].stretch, self.trails.nodes[b].stretch
+        return self.founder[stretch_a] == self.founder[stretch_b]
+
+    def name(self, stretch: int) -> str:
+        """Of the map that this stretch is in."""
+        return self.trails.stretches[self.founder[stretch]].name
+
+    def named(self, map_id: str) -> int:
+        """The founder of a map. Raises ValueError if there is none of that name."""
+        for founder in set(self.founder):
+            if self.trails.stretches[founder].name == map_id:
+                return founder
+        raise ValueError(f"there is no map {map_id}")
+
+    def stretches_of(self, founder: int) -> list[int]:
+        """Those of a map that have keyframes, oldest first."""
+        return [s for s, f in enumerate(self.founder) if f == founder and self.trails.stretches[s].nodes]
+
+    def nodes_of(self, founder: int) -> list[int]:
+        return [n for s in self.stretches_of(founder) for n in self.trails.stretches[s].nodes]
+
+    def anchor(self, founder: int) -> int:
+        """The keyframe that holds the gauge of a map."""
+        return self.trails.stretches[founder].nodes[0]
+
+    def placement(self, number: int) -> F64:
+        """T_map_odom (4, 4) as this node has it."""
+        T_odom_body = self.trails.nodes[number].T_odom_body
+        return se3.orthonormal(self.poses[number] @ se3.inverse(T_odom_body))
+
+    def between(self, a: int, b: int) -> Known:
+        """Pose of node b in node a of the same map, as the map has it now."""
+        path = self.ties.roads.surest(a, b)
+        if path is None:
+            raise ValueError(f"nodes {a} and {b} are not in one map")
+        return Known(se3.inverse(self.poses[a]) @ self.poses[b], covariance_between(path, a, self.poses))
+
+    def _find_maps(self) -> None:
+        """Every stretch's founder, from the loops: the connected parts."""
+        root = list(range(len(self.founder)))
+
+        def find(i: int) -> int:
+            while root[i] != i:
+                i = root[i]
+            return i
+
+        for loop in self.ties.loops.values():
+            low, high = sorted(find(self.stretch_of(key)) for key in (loop.a, loop.b))
+            root[high] = low
+        self.founder = [find(i) for i in range(len(root))]

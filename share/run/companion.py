@@ -1,0 +1,109 @@
+"""A process of our own that does heavy work while this one goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import signal
+import threading
+from collections.abc import Callable
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from typing import Any
+
+from share import process
+
+Inbox = queue.SimpleQueue[Any]
+Work = Callable[..., None]  # (inbox, answer, *arguments); ends when it takes END from the inbox
+END = None
+_PATIENCE_S = 5.0
+
+
+class Companion:
+    """Runs `work(inbox, answer, *arguments)` in a spawned process.
+
+    `send` never waits. Answers go to `heard`, from a thread; `lost` is called once, from that thread, if
+    the process ends without being asked to. It ends with this one, however this one ends.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        work: Work,
+        arguments: tuple[Any, ...],
+        heard: Callable[[Any], None],
+        lost: Callable[[str], None],
+    ) -> None:
+        self.name = name
+        self._heard, self._lost = heard, lost
+        self._closing = False
+        self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        context = get_context("spawn")
+        self._ours, theirs = context.Pipe()
+        self._process = context.Process(target=_begin, args=(theirs, work, arguments), name=name)
+        self._process.start()
+        theirs.close()
+        self._threads = [threading.Thread(target=run, daemon=True) for run in (self._give, self._take)]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def pid(self) -> int | None:
+        return self._process.pid
+
+    def send(self, message: Any) -> None:
+        self._outbox.put(message)
+
+    def close(self) -> None:
+        """Everything sent is worked on first, but not for longer than a few seconds."""
+        self._closing = True
+        self._outbox.put(END)
+        self._process.join(_PATIENCE_S)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+        for thread in self._threads:
+            thread.join(_PATIENCE_S)
+        self._ours.close()
+
+    def _give(self) -> None:
+        while True:
+            message = self._outbox.get()
+            try:
+                self._ours.send(message)
+            except OSError:  # it has died: `_take` says so
+                return
+            if message is END:
+                return
+
+    def _take(self) -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                self._heard(self._ours.recv())
+        if not self._closing:
+            self._process.join(_PATIENCE_S)
+            self._outbox.put(END)
+            self._lost(_how(self._process.exitcode))
+
+
+def _how(code: int | None) -> str:
+    if code is not None and code < 0:
+        return f"was ended by {signal.Signals(-code).name}"
+    return f"ended with exit code {code}"
+
+
+def _begin(line: Connection, work: Work, arguments: tuple[Any, ...]) -> None:
+    """The first thing that the process does."""
+    process.prepare()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    inbox: Inbox = queue.SimpleQueue()
+    threading.Thread(target=_listen, args=(line, inbox), daemon=True).start()
+    with contextlib.suppress(BrokenPipeError):  # the parent is gone
+        work(inbox, line.send, *arguments)
+
+
+def _listen(line: Connection, inbox: Inbox) -> None:
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            inbox.put(line.recv())
+    inbox.put(END)

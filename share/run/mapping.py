@@ -1,0 +1,142 @@
+"""The mapper's process: it looks keyframes up itself, and has a process of its own for the pose graph."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from share.config import Config, GraphConfig
+from share.core.edge import Add, Found, Join
+from share.core.finding import Finding
+from share.core.mapper import Mapper
+from share.core.steps import Solve
+from share.graph.solver import Solver
+from share.run.companion import END, Companion, Inbox
+
+_REPORT_S = 1.0
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """The mapper's report, now and then, and at the end."""
+
+    report: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Lost:
+    """The solver's process has died."""
+
+    how: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    result: object
+    ms: float
+
+
+def map_all(inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
+    """For a `Companion`: takes Join and Add, answers Found and Mapped, until END."""
+    _Mapping(inbox, answer, settings).go()
+
+
+class _Mapping:
+    def __init__(self, inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
+        self._inbox, self._answer, self._settings = inbox, answer, settings
+        self._mapper = Mapper(settings)
+        self._solver = self._new_solver()
+        self._solving: Solve | None = None
+        self._findings: list[Finding] = []
+        self._report_at = 0.0
+        self._ended = False
+
+    def go(self) -> None:
+        look = None
+        while not self._ended:
+            for message in self._arrived(wait=look is None):
+                self._hear(message)
+            self._give_solver()
+            look = self._mapper.next_look()
+            if look is not None:
+                self._findings += self._mapper.done(look, *_timed(look.run))
+            self._tell()
+        self._solver.close()
+        self._answer(Mapped(self._mapper.report()))
+
+    def _arrived(self, wait: bool) -> Iterator[Any]:
+        """What is in the inbox; if `wait`, at least one message, unless none comes for a while."""
+        try:
+            yield self._inbox.get(wait, _REPORT_S if wait else None)
+            while True:
+                yield self._inbox.get_nowait()
+        except queue.Empty:
+            return
+
+    def _hear(self, message: Any) -> None:
+        match message:
+            case Join():
+                self._mapper.join(message.key, message.hello)
+            case Add():
+                self._findings += self._mapper.add(message.key, message.keyframe)
+            case _Solved():
+                self._solved(message.result, message.ms)
+            case _Lost():
+                self._replace_solver(message.how)
+            case _ if message is END:
+                self._ended = True
+
+    def _give_solver(self) -> None:
+        step = self._mapper.next_solve()
+        if step is not None:
+            self._solving = step
+            self._solver.send(step)
+
+    def _solved(self, result: object, ms: float) -> None:
+        step, self._solving = self._solving, None
+        if step is not None:
+            self._findings += self._mapper.done(step, result, ms)
+
+    def _new_solver(self) -> Companion:
+        return Companion("solver", solve_all, (self._settings.graph,), self._inbox.put, self._solver_lost)
+
+    def _solver_lost(self, how: str) -> None:
+        """From another thread."""
+        self._inbox.put(_Lost(how))
+
+    def _replace_solver(self, how: str) -> None:
+        """It costs the solution that it was at, and telling it all again."""
+        self._solver.close()
+        self._solver = self._new_solver()
+        self._mapper.solver_lost()
+        self._solved(RuntimeError(f"the solver {how}"), 0.0)
+
+    def _tell(self) -> None:
+        changes = self._mapper.take_changes()
+        if self._findings or changes:
+            self._answer(Found(tuple(self._findings), changes))
+            self._findings = []
+        if time.monotonic() >= self._report_at:
+            self._report_at = time.monotonic() + _REPORT_S
+            self._answer(Mapped(self._mapper.report()))
+
+
+def solve_all(inbox: Inbox, answer: Callable[[Any], None], settings: GraphConfig) -> None:
+    """For a `Companion`: takes Solve, answers with what came of it, until END."""
+    solver = Solver(settings)
+    while (step := inbox.get()) is not END:
+        answer(_Solved(*_timed(partial(step.run, solver))))
+
+
+def _timed(work: Callable[[], object]) -> tuple[object, float]:
+    began = time.perf_counter()
+    result: object
+    try:
+        result = work()
+    except Exception as error:  # a step that fails costs its keyframe, never the edge
+        result = error
+    return result, 1e3 * (time.perf_counter() - began)

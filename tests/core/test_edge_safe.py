@@ -1,0 +1,118 @@
+"""What the edge acknowledges, and what it makes of odometry that cannot be."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from share.config import Config
+from share.core import edge as ed
+from share.core.keeping import KeepKeyframe, KeepRun
+from share.core.peer import Foot
+from share.geometry import se3
+from share.types import AgentKind, Keyframe, View
+from share.wire import messages as m
+from share.wire.codec import decode, encode
+
+MS = 1_000_000
+EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
+HELLO = m.Hello("ann", AgentKind.AR, 11, 400.0, np.eye(4))
+
+
+def keyframe(id: int, reference: int, forward_m: float = 0.2, stamp_ms: int | None = None) -> Keyframe:
+    T = se3.compose(np.eye(3), np.array([forward_m, 0.0, 0.0]))
+    stamp_ns = (200 * id if stamp_ms is None else stamp_ms) * MS
+    return Keyframe(id, reference, stamp_ns, T, 1e-6 * np.eye(6), np.zeros(3), EMPTY, id - 1)
+
+
+def tell(edge: ed.Edge, message: m.Message) -> list[ed.Effect]:
+    return edge.handle(ed.Received(m.peer_id(11), [bytes(f) for f in encode(message)]), 0)
+
+
+def acks(effects: list[ed.Effect]) -> list[m.Ack]:
+    messages = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.Send)]
+    return [message for message in messages if isinstance(message, m.Ack)]
+
+
+def of(effects: list[ed.Effect], kind: type) -> list:
+    return [effect for effect in effects if isinstance(effect, kind)]
+
+
+def test_nothing_is_acknowledged_before_it_is_kept() -> None:
+    edge = ed.Edge(Config(), 7, keeps=True)
+    (joined,) = of(tell(edge, HELLO), ed.Keep)
+    assert isinstance(joined.changes[0], KeepRun)
+    effects = tell(edge, keyframe(0, -1))
+    (keep,) = of(effects, ed.Keep)
+    assert isinstance(keep.changes[0], KeepKeyframe)
+    assert of(effects, ed.Add)  # the map need not wait for the disk
+    assert not acks(effects)
+    again = acks(tell(edge, keyframe(0, -1)))
+    assert again == [m.Ack(0, (0,))]  # it has arrived, but is not safe
+    assert acks(edge.handle(ed.Kept(keep.ticket), 0)) == [m.Ack(1)]
+    assert acks(edge.handle(ed.Kept(keep.ticket), 0)) == []
+
+
+def test_several_kept_at_once_are_acknowledged_once() -> None:
+    edge = ed.Edge(Config(), 7, keeps=True)
+    tell(edge, HELLO)
+    keeps = [of(tell(edge, keyframe(k, k - 1)), ed.Keep)[0] for k in range(3)]
+    assert acks(edge.handle(ed.Kept(keeps[1].ticket), 0)) == [m.Ack(2, (2,))]
+    assert acks(edge.handle(ed.Kept(keeps[2].ticket), 0)) == [m.Ack(3)]
+
+
+def test_a_known_run_goes_on_where_it_was() -> None:
+    foot = Foot(4, 800 * MS, se3.compose(np.eye(3), np.array([1.0, 0.0, 0.0])))
+    edge = ed.Edge(Config(), 8, keeps=True, known=[ed.Known("ann-000b", HELLO, foot)])
+    effects = tell(edge, HELLO)
+    (welcome,) = [decode([bytes(f) for f in e.frames]) for e in of(effects, ed.Send)]
+    assert welcome == m.Welcome(8, 5)
+    assert not of(effects, ed.Keep)
+    assert not of(effects, ed.Join)  # the mapper has the run from the store
+    effects = tell(edge, keyframe(5, 4))
+    (keep,) = of(effects, ed.Keep)
+    assert np.allclose(keep.changes[0].T_odom_body[:3, 3], (1.2, 0, 0))
+
+
+def test_a_leap_begins_a_stretch_in_the_same_odom() -> None:
+    edge = ed.Edge(Config(), 7)
+    tell(edge, HELLO)
+    tell(edge, keyframe(0, -1))
+    effects = tell(edge, keyframe(1, 0, forward_m=100.0))
+    (add,) = of(effects, ed.Add)
+    assert add.keyframe.reference == -1
+    assert np.allclose(add.keyframe.T_ref_body[:3, 3], (100.2, 0, 0))
+    (record,) = of(effects, ed.Record)
+    assert record.fields["event"] == "odometry leapt"
+    assert "100 m" in record.fields["reason"]
+    (add,) = of(tell(edge, keyframe(2, 1)), ed.Add)
+    assert add.keyframe.reference == 1
+
+
+def test_far_is_no_leap_if_time_enough_has_passed() -> None:
+    edge = ed.Edge(Config(), 7)
+    tell(edge, HELLO)
+    tell(edge, keyframe(0, -1))
+    (add,) = of(tell(edge, keyframe(1, 0, forward_m=20.0, stamp_ms=10_000)), ed.Add)
+    assert add.keyframe.reference == 0
+
+
+def test_a_reference_that_is_not_the_last_is_said_and_left_out() -> None:
+    edge = ed.Edge(Config(), 7)
+    tell(edge, HELLO)
+    tell(edge, keyframe(0, -1))
+    tell(edge, keyframe(1, 0))
+    effects = tell(edge, keyframe(2, 0))
+    assert not of(effects, ed.Add)
+    (record,) = of(effects, ed.Record)
+    assert "refers to 0" in record.fields["reason"]
+    assert acks(effects) == [m.Ack(3)]  # it need not be sent again
+    assert of(tell(edge, keyframe(3, -1)), ed.Add)  # a new stretch goes on
+
+
+def test_a_runs_number_is_not_shared_by_two_names() -> None:
+    edge = ed.Edge(Config(), 7)
+    tell(edge, HELLO)
+    effects = tell(edge, m.Hello("eve", AgentKind.AR, 11, 400.0, np.eye(4)))
+    (refused,) = [decode([bytes(f) for f in e.frames]) for e in of(effects, ed.Send)]
+    assert isinstance(refused, m.Refused)
+    assert "'ann'" in refused.reason

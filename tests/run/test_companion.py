@@ -1,0 +1,75 @@
+"""A process of our own: it answers, it dies, it ends with us."""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+from share.run.companion import END, Companion, Inbox
+
+LINES = """
+import sys, time
+from test_companion import doubles
+from share.run.companion import Companion
+if __name__ == "__main__":
+    c = Companion("doubles", doubles, (), lambda m: None, lambda how: None)
+    print(c.pid, flush=True)
+    time.sleep(60)
+"""
+
+
+def doubles(inbox: Inbox, answer: Callable[[Any], None]) -> None:
+    while (number := inbox.get()) is not END:
+        if number == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        answer(2 * number)
+
+
+def test_it_answers_and_ends() -> None:
+    heard: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    lost: list[str] = []
+    companion = Companion("doubles", doubles, (), heard.put, lost.append)
+    for number in range(100):
+        companion.send(number)
+    companion.close()
+    assert [heard.get_nowait() for _ in range(100)] == [2 * n for n in range(100)]
+    assert not lost
+
+
+def test_its_death_is_told_once() -> None:
+    lost: queue.SimpleQueue[str] = queue.SimpleQueue()
+    companion = Companion("doubles", doubles, (), lambda message: None, lost.put)
+    companion.send("die")
+    assert "SIGKILL" in lost.get(timeout=20)
+    companion.send(1)  # goes nowhere, and waits for nobody
+    companion.close()
+    assert lost.empty()
+
+
+def test_it_ends_with_us_however_we_end() -> None:
+    here = os.path.dirname(__file__)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([here, *sys.path])}
+    parent = subprocess.Popen([sys.executable, "-c", LINES], stdout=subprocess.PIPE, env=environment)
+    assert parent.stdout is not None
+    pid = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    parent.stdout.close()
+    deadline = time.monotonic() + 20
+    while _alive(pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not _alive(pid)
+
+
+def _alive(pid: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] not in "ZX"
+    except FileNotFoundError:
+        return False

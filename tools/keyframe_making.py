@@ -1,0 +1,78 @@
+"""From a recipe to a set of keyframes: the room and its motions as `share emulate` has them, few of the
+frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from keyframe_odometry import Drift, odometry
+from keyframe_types import AgentKeyframes, KeyframeSet, Spacing
+from keyframe_views import views
+
+from share.core.chain import Chain
+from share.emulate.preparation import keep_room, prepare
+from share.emulate.progress import Progress
+from share.emulate.recipe import Recipe
+from share.emulate.stage import Actor
+from share.emulate.takes import truth_of
+from share.geometry import se3
+from share.io.trajectory import Trajectory
+from share.types import F64, I64, Candidate, Keyframe, View
+from share.wire.messages import Hello
+
+_STREAM = 81  # of random numbers; the emulator has others
+
+
+def make(recipe: Recipe, every: Spacing, workers: int, progress: Progress) -> KeyframeSet:
+    """Nothing is kept. Raises UsageError, ConfigError or DataError for what cannot be made, RenderError
+    where nothing can be drawn."""
+    with TemporaryDirectory(prefix="keyframes-") as folder:
+        prepared = prepare(recipe, Path(folder) / "room", progress)
+        keep_room(prepared, progress)
+        actors = prepared.stage.actors
+        chosen = [_chosen(actor, every) for actor in actors]
+        seen = views(prepared.stage, [at for at, _ in chosen], recipe.images, workers, progress)
+    agents = {
+        actor.name: _agent(actor, truth, shown, np.random.default_rng((recipe.seed, _STREAM, k)))
+        for k, (actor, (_, truth), shown) in enumerate(zip(actors, chosen, seen, strict=True))
+    }
+    x, y, z = (float(v) for v in prepared.layout.size)
+    return KeyframeSet(recipe, every, (x, y, z), agents)
+
+
+def spaced(truth: Trajectory, every: Spacing) -> I64:
+    """Which poses (N,) are keyframes: the first, and each that is far enough from the keyframe before."""
+    chosen = [0]
+    for k in range(1, len(truth.stamps_ns)):
+        last = chosen[-1]
+        T = se3.inverse(truth.T[last]) @ truth.T[k]
+        far = np.linalg.norm(T[:3, 3]) >= every.metres or se3.angle(T) >= every.radians
+        if far and truth.stamps_ns[k] - truth.stamps_ns[last] >= every.seconds * 1e9:
+            chosen.append(k)
+    return np.array(chosen, np.int64)
+
+
+def _chosen(actor: Actor, every: Spacing) -> tuple[I64, Trajectory]:
+    """Which of its pictures (N,), and their true poses."""
+    known, truth = truth_of(actor)
+    at = spaced(truth, every)
+    return known[at], Trajectory(truth.stamps_ns[at], truth.T[at])
+
+
+def _agent(actor: Actor, truth: Trajectory, seen: list[View], rng: np.random.Generator) -> AgentKeyframes:
+    run_id = int(rng.integers(2**63))
+    hello = Hello(actor.name, actor.kind, run_id, actor.rig.cam0.focal, actor.rig.T_body_cam0)
+    T_odom_body, cov = odometry(truth.T, truth.stamps_ns, rng, Drift())
+    return AgentKeyframes(hello, _chained(T_odom_body, cov, truth.stamps_ns, seen), truth.T, T_odom_body)
+
+
+def _chained(T_odom_body: F64, cov: F64, stamps_ns: I64, seen: list[View]) -> tuple[Keyframe, ...]:
+    """Candidates that are all sent. As a tracker has it, up is the z of odom."""
+    chain, out = Chain(), []
+    for T, step, stamp_ns, view in zip(T_odom_body, cov, stamps_ns.tolist(), seen, strict=True):
+        candidate = Candidate(T, step, T[2, :3], view)
+        chain.extend(candidate)
+        out.append(chain.keyframe(candidate, stamp_ns))
+    return tuple(out)

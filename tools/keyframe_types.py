@@ -1,0 +1,49 @@
+"""What agents would send to the edge from one emulated room, with the exact truth beside it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from share.emulate.recipe import Recipe
+from share.errors import UsageError
+from share.types import F64, Keyframe
+from share.wire.messages import Hello
+
+
+@dataclass(frozen=True)
+class Spacing:
+    """A keyframe after so many metres or radians since the last one, and not before `seconds` after it.
+    Raises UsageError where one of them is not positive."""
+
+    metres: float = 0.15
+    radians: float = 0.2
+    seconds: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not min(self.metres, self.radians, self.seconds) > 0:
+            raise UsageError(f"spacing {self}: must be positive")
+
+    def __str__(self) -> str:
+        return f"{self.metres:g}m-{self.radians:g}rad-{self.seconds:g}s"
+
+
+@dataclass(frozen=True, eq=False)
+class AgentKeyframes:
+    """keyframes: N of them, in the order in which they are sent. T_world_body (N, 4, 4): the truth.
+    T_odom_body (N, 4, 4): where its odometry believes it to be, which the keyframes chain up to."""
+
+    hello: Hello
+    keyframes: tuple[Keyframe, ...]
+    T_world_body: F64
+    T_odom_body: F64
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeSet:
+    """agents: by name. size: of the room (x, y, z) m, as `share.emulate.world.scenes.corridor.twins` wants
+    it."""
+
+    recipe: Recipe
+    every: Spacing
+    size: tuple[float, float, float]
+    agents: dict[str, AgentKeyframes]
