@@ -5,9 +5,13 @@ differ in d bits share the word with probability (1 - d/256)^bits, so the tables
 vocabulary of words that needs no training. Sources: bit-sampling locality-sensitive hashing, Indyk
 and Motwani, STOC 1998; scoring by tf-idf, Sivic and Zisserman, ICCV 2003.
 
-A word and its keyframe are one int64 (word << 32 | keyframe), so that a sorted array is the whole
-index; new ones are kept in sorted segments that are merged as they come near their neighbour's size
- (a log-structured merge tree: each entry is moved O(log n) times).
+A query reads the entries of rare words first and stops at 64 a stored keyframe, 400,000 in all: what is
+everywhere says little, costs most, and misleads (stop words, Sivic and Zisserman). So the time of a
+query hardly grows with the map.
+
+The newest keyframes are looked through one by one. They are then written on a page, and four pages of
+like size become one (a log-structured merge tree that ends at a page's size, so that no `add` takes
+long).
 """
 
 from __future__ import annotations
@@ -17,11 +21,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from share.types import F64, I64, U8
+from share.place.page import MOST, MOST_WORDS, U32, Page, joined, written
+from share.types import F32, F64, I64, U8
 
-_MAX_BITS = 24
-_SHIFT = 32
-_KEYFRAME = (1 << _SHIFT) - 1
+_FRESH = 64  # keyframes looked through one by one, at most
+_DEAD = 0.25  # share of a page; beyond, it is written anew
+_READ = 64  # entries a stored keyframe, on average
+_READ_AT_LEAST, _READ_AT_MOST = 30_000, 400_000  # entries in all
+_FAN = 4  # pages that become one
 
 
 class Candidate(NamedTuple):
@@ -35,57 +42,102 @@ class PlaceIndex:
     """Keyframes by their descriptors. Ids are any distinct integers."""
 
     def __init__(self, seed: int, tables: int = 8, bits: int = 16) -> None:
-        if not (1 <= bits <= _MAX_BITS and tables >= 1):
-            raise ValueError(f"{tables} tables of {bits} bits: bits must lie in 1 .. {_MAX_BITS}")
+        if not (bits >= 1 and tables >= 1 and tables << bits <= MOST_WORDS):
+            raise ValueError(
+                f"{tables} tables of {bits} bits: at least one of each, and {MOST_WORDS} words in all"
+            )
         rng = np.random.default_rng(seed)
         self._samples = np.stack([rng.choice(256, bits, replace=False) for _ in range(tables)])
-        self._ids: list[int] = []
-        self._sizes: list[int] = []  # descriptors of each keyframe
-        self._segments: list[I64] = []  # each sorted; every one more than twice its successor
+        self._held = np.zeros(tables << bits, np.int32)  # entries of each word
+        self._pages: list[Page] = []
+        self._fresh: dict[int, U32] = {}  # words of the newest keyframes
 
     def __len__(self) -> int:
-        return len(self._ids)
+        return len(self._fresh) + sum(int(page.alive.sum()) for page in self._pages)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the index holds."""
+        arrays = [array for page in self._pages for array in (page.starts, page.slots)]
+        return sum(array.nbytes for array in (*arrays, *self._fresh.values(), self._held))
 
     def add(self, id: int, descriptors: U8) -> None:
         """Store the view (N, 32) of keyframe `id`."""
-        segment = np.sort(self._words(descriptors) << _SHIFT | len(self._ids))
-        self._ids.append(id)
-        self._sizes.append(len(descriptors))
-        while self._segments and len(self._segments[-1]) <= 2 * len(segment):
-            segment = np.sort(np.concatenate([self._segments.pop(), segment]), kind="stable")
-        self._segments.append(segment)
+        words = self._words(descriptors)
+        np.add.at(self._held, words, 1)
+        self._fresh[id] = words
+        if len(self._fresh) == _FRESH:
+            self._pages.append(written(list(self._fresh), list(self._fresh.values()), len(self._held)))
+            self._fresh.clear()
+            self._join(_FAN)
+
+    def remove(self, id: int) -> None:
+        """Forget keyframe `id`. Raises KeyError if it is not stored."""
+        if id in self._fresh:
+            np.add.at(self._held, self._fresh.pop(id), -1)
+            return
+        for number, page in enumerate(self._pages):
+            at = np.flatnonzero((page.ids == id) & page.alive)
+            if len(at):
+                page.alive[at] = False
+                if page.alive.mean() < 1 - _DEAD:
+                    self._rewrite(number)
+                return
+        raise KeyError(f"keyframe {id} is not in the index")
 
     def query(self, descriptors: U8, limit: int, exclude: Collection[int] = ()) -> list[Candidate]:
         """Up to `limit` stored keyframes that share words with descriptors (N, 32), best first.
 
-        A shared word counts log(n / df): what is seen everywhere says nothing about where one is.
+        A shared word counts log(n / df).
         """
-        if not self._ids or not len(descriptors):
+        if not len(self) or not len(descriptors):
             return []
-        votes = self._votes(np.sort(self._words(descriptors)))
-        votes /= np.sqrt(np.maximum(1, self._sizes))
-        left_out = set(exclude)
-        ranked = np.argsort(-votes, kind="stable")[: limit + len(left_out)]
-        found = [Candidate(self._ids[i], float(votes[i])) for i in ranked if votes[i] > 0]
-        return [c for c in found if c.id not in left_out][:limit]
+        words, weights = self._weighted(descriptors)
+        parts = [(page.ids, page.sizes, page.votes(words, weights)) for page in self._pages]
+        parts.append(self._fresh_part(words, weights))
+        ids, sizes, votes = (np.concatenate(column) for column in zip(*parts, strict=True))
+        scores = votes / np.sqrt(np.maximum(1, sizes))
+        scores[np.isin(ids, list(exclude))] = 0.0
+        ranked = np.argsort(-scores, kind="stable")[:limit]
+        return [Candidate(int(ids[i]), float(scores[i])) for i in ranked if scores[i] > 0]
 
-    def _votes(self, words: I64) -> F64:
-        """Sum over the words of idf for every stored keyframe, (n,)."""
-        low = [np.searchsorted(s, words << _SHIFT) for s in self._segments]
-        high = [np.searchsorted(s, (words + 1) << _SHIFT) for s in self._segments]
-        counts = np.array(high) - low
-        idf = np.log((1 + len(self._ids)) / (1 + np.minimum(counts.sum(0), len(self._ids))))
-        votes = np.zeros(len(self._ids))
-        for segment, start, count in zip(self._segments, low, counts, strict=True):
-            at = np.repeat(start - np.cumsum(count) + count, count) + np.arange(count.sum())
-            keyframes = segment[at] & _KEYFRAME
-            votes += np.bincount(keyframes, np.repeat(idf, count), len(votes))
-        return votes
+    def _weighted(self, descriptors: U8) -> tuple[I64, F64]:
+        """The view's distinct words that may be read, and what each counts for."""
+        words, times = np.unique(self._words(descriptors).astype(np.int64), return_counts=True)
+        held = self._held[words]
+        rare_first = np.argsort(held, kind="stable")
+        n = len(self)
+        read = np.cumsum(held[rare_first]) <= np.clip(_READ * n, _READ_AT_LEAST, _READ_AT_MOST)
+        chosen = np.sort(rare_first[read & (held[rare_first] > 0)])
+        return words[chosen], times[chosen] * np.log((1 + n) / (1 + np.minimum(held[chosen], n)))
 
-    def _words(self, descriptors: U8) -> I64:
+    def _fresh_part(self, words: I64, weights: F64) -> tuple[I64, I64, F64]:
+        """Ids, sizes and votes of the newest."""
+        worth: F32 = np.zeros(len(self._held), np.float32)
+        worth[words] = weights
+        held = self._fresh.values()
+        votes = np.array([worth[w].sum() for w in held], np.float64)
+        return np.array(list(self._fresh), np.int64), np.array([len(w) for w in held], np.int64), votes
+
+    def _join(self, fan: int) -> None:
+        """`fan` neighbours become one page, from the newest on, where they fit and none is much larger."""
+        for first in range(len(self._pages) - fan, -1, -1):
+            some = self._pages[first : first + fan]
+            if sum(map(len, some)) <= MOST and len(some[0]) <= 2 * len(some[-1]):
+                self._pages[first : first + fan] = [joined(some)]
+
+    def _rewrite(self, number: int) -> None:
+        """Without the dead of this page."""
+        before = self._pages[number]
+        after = joined([before])
+        self._held -= (before.held() - after.held()).astype(np.int32)
+        self._pages[number : number + 1] = [after] if len(after) else []
+        self._join(2)
+
+    def _words(self, descriptors: U8) -> U32:
         """The words (N * tables,) of descriptors (N, 32): table number and sampled bits in one integer."""
         tables, bits = self._samples.shape
-        sampled = np.unpackbits(descriptors, axis=1)[:, self._samples]
-        values = sampled.astype(np.int64) @ (1 << np.arange(bits))
-        words: I64 = (values + (np.arange(tables) << bits)).ravel()
+        sampled = np.unpackbits(descriptors, axis=1)[:, self._samples].astype(np.float32)
+        values = sampled @ (2.0 ** np.arange(bits)).astype(np.float32)  # exact up to 24 bits
+        words: U32 = (values.astype(np.uint32) + (np.arange(tables, dtype=np.uint32) << np.uint32(bits))).ravel()
         return words

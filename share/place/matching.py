@@ -2,24 +2,55 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from share.types import I64, U8
+from share.types import F64, I64, U8
 
-_BITS = 256
+_ROWS = 50  # at a time, so that what is in between stays in the cache
+
+
+class Pairs(NamedTuple):
+    """Possible matches: rows (M,) of the one view, cols (M,) of the other, and differing bits (M,)."""
+
+    rows: I64
+    cols: I64
+    bits: NDArray[np.uint16]
+
+    def only(self, keep: NDArray[np.bool_]) -> Pairs:
+        return Pairs(self.rows[keep], self.cols[keep], self.bits[keep])
 
 
 def hamming(a: U8, b: U8) -> NDArray[np.uint16]:
-    """Differing bits (N, K) of every descriptor in a (N, 32) with every one in b (K, 32).
-
-    Word by word, so that the intermediate stays in the cache: 500 x 500 in 1.2 ms, as cv2's matcher.
-    """
-    words_a, words_b = (np.ascontiguousarray(x).view(np.uint64) for x in (a, b))
-    out = np.zeros((len(a), len(b)), np.uint16)
-    for word in range(words_a.shape[1]):
-        out += np.bitwise_count(words_a[:, None, word] ^ words_b[None, :, word])
+    """Differing bits (N, K) of every descriptor in a (N, 32) with every one in b (K, 32)."""
+    words_a, words_b = (np.ascontiguousarray(np.ascontiguousarray(x).view(np.uint64).T) for x in (a, b))
+    out = np.empty((len(a), len(b)), np.uint16)
+    for start in range(0, len(a), _ROWS):
+        differ = (x[start : start + _ROWS, None] ^ y for x, y in zip(words_a, words_b, strict=True))
+        first, *others, last = (np.bitwise_count(d) for d in differ)  # 64 at most in a byte
+        for count in others:
+            first += count
+        np.add(first, last, out=out[start : start + _ROWS], dtype=np.uint16)
     return out
+
+
+def near(distance: NDArray[np.uint16], max_bits: int) -> Pairs:
+    """All pairs of a distance matrix (N, K) that differ in at most `max_bits`."""
+    at = np.flatnonzero(distance <= max_bits)
+    rows, cols = np.divmod(at, distance.shape[1])
+    return Pairs(rows, cols, distance.ravel()[at])
+
+
+def mutual(pairs: Pairs) -> Pairs:
+    """Those that are the best of their row and of their column."""
+    order = np.argsort(pairs.bits, kind="stable")
+    rows, cols, bits = (x[order] for x in pairs)
+    best = np.zeros(len(bits), np.int8)
+    for one in (rows, cols):
+        best[np.unique(one, return_index=True)[1]] += 1
+    return Pairs(rows, cols, bits).only(best == 2)
 
 
 def match(query: U8, candidate: U8, max_distance: int, ratio: float) -> I64:
@@ -36,7 +67,7 @@ def match(query: U8, candidate: U8, max_distance: int, ratio: float) -> I64:
     best = distance[rows, to_candidate]
     keep = (to_query[to_candidate] == rows) & (best <= max_distance)
     rows, cols, best = rows[keep], to_candidate[keep], best[keep]
-    distance[rows, cols] = _BITS + 1
+    distance[rows, cols] = 257
     runner_up = np.minimum(distance[rows].min(1), distance[:, cols].min(0))
     keep = best < ratio * runner_up
     return np.stack([rows[keep], cols[keep]], axis=1)

@@ -18,15 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.geometry import se3
-from share.geometry.camera import rays
-from share.types import F64
-
-Mask = NDArray[np.bool_]
+from share.types import F64, I64
 
 _RIDGE = 1e-6 * np.eye(6)  # keeps a hopeless set of matches solvable; its covariance says so
 _NEAREST = 0.1  # m before the camera
 _NOT_SEEN = 1e9  # squared distance of a match that one camera cannot see
 _UNKNOWN = 1e6  # variance that stands for "no depth", 1/m^2
+_SMALL = 1e-3  # rad and m; after a step so small, two plain ones follow
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,25 +49,32 @@ class Refined:
     d2: F64
 
 
-def move(T: F64, y: F64) -> tuple[F64, F64, F64]:
-    """y' = h(T, y) for T (4, 4) and y (N, 3); dh/dxi (N, 3, 6) for T Exp(xi); dh/dy (N, 3, 3).
+def move(T: F64, y: F64) -> F64:
+    """y' = h(T, y) (N, 3) for T (4, 4) and y (N, 3); NaN for a point that is then behind the camera:
+    it has no image, and for one without a depth."""
+    rho = y[:, 2:]
+    scaled = y[:, :2] @ T[:3, :2].T + T[:3, 2] + rho * T[:3, 3]  # the point, times rho
+    z = scaled[:, 2:]
+    z = np.where(z > _NEAREST * rho, z, np.nan)
+    return np.concatenate([scaled[:, :2], rho], axis=1) / z
 
-    NaN for a point that is then behind the camera: it has no image.
-    """
-    rho = y[:, 2]
-    points = rays(y[:, :2]) / rho[:, None]
-    x, yy, z = se3.transform(T, points).T
-    z = np.where(z > _NEAREST, z, np.nan)
-    moved = np.stack([x / z, yy / z, 1 / z], axis=1)
-    project = np.zeros((len(y), 3, 3))
-    project[:, 0, 0] = project[:, 1, 1] = 1 / z
-    project[:, 0, 2], project[:, 1, 2], project[:, 2, 2] = -x / z**2, -yy / z**2, -1 / z**2
-    project = project @ T[:3, :3]
-    by_pose = np.concatenate([-project @ se3.hat(points), project], axis=2)
-    unproject = np.zeros((len(y), 3, 3))
-    unproject[:, 0, 0] = unproject[:, 1, 1] = 1 / rho
-    unproject[:, :, 2] = -points / rho[:, None]
-    return moved, by_pose, project @ unproject
+
+def by_pose(moved: F64) -> F64:
+    """dy'/dxi (N, 3, 6) for Exp(xi) T, at y' = `moved` (N, 3)."""
+    u, v, rho = moved.T
+    zero, one = np.zeros_like(u), np.ones_like(u)
+    rows = (-u * v, one + u * u, -v, rho, zero, -u * rho)
+    rows += (-one - v * v, u * v, u, zero, rho, -v * rho)
+    rows += (-rho * v, rho * u, zero, zero, zero, -rho * rho)
+    return np.stack(rows, axis=1).reshape(-1, 3, 6)
+
+
+def by_keypoint(T: F64, y: F64, moved: F64) -> F64:
+    """dy'/dy (N, 3, 3), y' = `moved` (N, 3)."""
+    into = np.column_stack([T[:3, :2], T[:3, 3]])
+    top = np.stack([into[0], into[1], np.array([0.0, 0.0, 1.0])])
+    z = y[:, 2] / moved[:, 2]  # of the point, times rho
+    return np.asarray((top - moved[:, :, None] * into[2]) / z[:, None, None])
 
 
 def refine(
@@ -81,63 +86,99 @@ def refine(
     within `gate` (squared Mahalanobis). The covariance is that of the second pass, scaled by its
     residual variance; a scale below one is believed down to a quarter.
     """
-    T = T_c_q
+    problem = _Problem(y_q, y_c, noise_q, noise_c)
+    T, information = T_c_q, problem.information(T_c_q)
     for _ in range(iterations):
-        whole = _linearise(T, y_q, y_c, noise_q, noise_c)
-        step = _solve(whole, 1 / (1 + whole.d2 / gate) ** 2)
-        T = T @ se3.exp(step)
-        if np.abs(step).max() < 1e-4:  # rad and m; two plain steps follow
+        linear = problem.linear(T, information)
+        step = linear.step(1 / (1 + linear.d2 / gate) ** 2)
+        T = se3.exp(step) @ T
+        if np.abs(step).max() < _SMALL:
             break
+    information = problem.information(T)
     for _ in range(2):
-        whole = _linearise(T, y_q, y_c, noise_q, noise_c)
-        inside = whole.d2 < gate
-        T = T @ se3.exp(_solve(whole, inside))
-    freedom = max(1, int(whole.rows[inside].sum()) - 6)
-    variance = max(0.25, float(whole.d2[inside].sum()) / freedom)
-    return Refined(se3.orthonormal(T), np.linalg.inv(whole.H[inside].sum(0) + _RIDGE) * variance, whole.d2)
+        linear = problem.linear(T, information)
+        inside = linear.d2 < gate
+        T = se3.exp(linear.step(inside)) @ T
+    freedom = max(1, int(problem.rows[inside].sum()) - 6)
+    variance = max(0.25, float(linear.d2[inside].sum()) / freedom)
+    to_right = se3.adjoint(se3.inverse(T))
+    cov = np.linalg.inv(linear.normal(inside)[:6, :6] + _RIDGE) * variance
+    return Refined(se3.orthonormal(T), to_right @ cov @ to_right.T, linear.d2)
 
 
 @dataclass(frozen=True, eq=False)
 class _Linear:
-    """Per match: information H (N, 6, 6), gradient g (N, 6), d2 (N,), and rows that it measures (N,)."""
+    """Per match: [J r] (N, 3, 7) by Exp(xi) T, the same times its information, and d2 (N,)."""
 
-    H: F64
-    g: F64
+    Jr: F64
+    WJr: F64
     d2: F64
-    rows: F64
+
+    def normal(self, weight: NDArray[Any]) -> F64:
+        """[H g; g' c] (7, 7) of matches weighted by (N,)."""
+        weighted = self.WJr * weight[:, None, None]
+        return np.asarray(self.Jr.reshape(-1, 7).T @ weighted.reshape(-1, 7))
+
+    def step(self, weight: NDArray[Any]) -> F64:
+        normal = self.normal(weight)
+        return np.asarray(np.linalg.solve(normal[:6, :6] + _RIDGE, normal[:6, 6]), np.float64)
 
 
-def _linearise(T_c_q: F64, y_q: F64, y_c: F64, noise_q: Noise, noise_c: Noise) -> _Linear:
+class _Problem:
     """Matches with a depth in q are moved into c, the others from c into q."""
-    forward = np.isfinite(y_q[:, 2])
-    n = len(y_q)
-    out = _Linear(np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros(n), np.zeros(n))
-    _add(out, forward, T_c_q, y_q, y_c, noise_q, noise_c, np.eye(6))
-    # (T Exp(xi))^-1 = T^-1 Exp(-Ad(T) xi)
-    _add(out, ~forward, se3.inverse(T_c_q), y_c, y_q, noise_c, noise_q, -se3.adjoint(T_c_q))
-    return out
+
+    def __init__(self, y_q: F64, y_c: F64, noise_q: Noise, noise_c: Noise) -> None:
+        forward = np.isfinite(y_q[:, 2])
+        there, back = np.flatnonzero(forward), np.flatnonzero(~forward)
+        self.rows = 2.0 + (forward & np.isfinite(y_c[:, 2]))  # that each match measures
+        self._ways = [
+            _Way(there, y_q[there], y_c[there], noise_q.variances, noise_c.variances),
+            _Way(back, y_c[back], y_q[back], noise_c.variances, noise_q.variances),
+        ]
+
+    def information(self, T_c_q: F64) -> F64:
+        """Of every match's residual, (N, 3, 3)."""
+        out = np.zeros((len(self.rows), 3, 3))
+        for way, T in zip(self._ways, (T_c_q, se3.inverse(T_c_q)), strict=True):
+            out[way.at] = way.information(T)
+        return out
+
+    def linear(self, T_c_q: F64, information: F64) -> _Linear:
+        back = se3.inverse(T_c_q)
+        Jr = np.zeros((len(self.rows), 3, 7))
+        Jr[self._ways[0].at] = self._ways[0].linear(T_c_q, np.eye(6))
+        # (Exp(xi) T)^-1 = Exp(-Ad(T^-1) xi) T^-1
+        Jr[self._ways[1].at] = self._ways[1].linear(back, -se3.adjoint(back))
+        WJr = information @ Jr
+        d2 = (Jr[:, :, 6] * WJr[:, :, 6]).sum(1)
+        d2[Jr[:, 0, 3] == 0] = _NOT_SEEN
+        return _Linear(Jr, WJr, d2)
 
 
-def _add(
-    out: _Linear, mask: Mask, T: F64, source: F64, target: F64, noise_s: Noise, noise_t: Noise, by_xi: F64
-) -> None:
-    moved, J, by_source = move(T, source[mask])
-    seen = np.isfinite(moved[:, 2])
-    out.d2[np.flatnonzero(mask)[~seen]] = _NOT_SEEN
-    at = np.flatnonzero(mask)[seen]
-    target, moved, J, by_source = target[at], moved[seen], J[seen] @ by_xi, by_source[seen]
-    known = np.isfinite(target[:, 2])
-    r = np.where(np.isfinite(target), target - moved, 0.0)
-    S = by_source * noise_s.variances @ np.swapaxes(by_source, 1, 2)
-    S[:, [0, 1, 2], [0, 1, 2]] += noise_t.variances
-    S[~known, 2, 2] += _UNKNOWN
-    WJr = np.linalg.solve(S, np.concatenate([J, r[:, :, None]], axis=2))
-    normal = np.swapaxes(J, 1, 2) @ WJr
-    out.H[at], out.g[at] = normal[:, :, :6], normal[:, :, 6]
-    out.d2[at] = (r * WJr[:, :, 6]).sum(1)
-    out.rows[at] = 2 + known
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """Matches `at` (N,) whose source keypoints (N, 3), all with depth, move into the targets' camera."""
 
+    at: I64
+    source: F64
+    target: F64
+    noise_source: F64
+    noise_target: F64
 
-def _solve(linear: _Linear, weight: NDArray[Any]) -> F64:
-    H = np.tensordot(weight.astype(np.float64), linear.H, 1)
-    return np.asarray(np.linalg.solve(H + _RIDGE, weight @ linear.g), np.float64)
+    def information(self, T: F64) -> F64:
+        moved = move(T, self.source)
+        J = by_keypoint(T, self.source, moved)
+        S = J * self.noise_source @ np.swapaxes(J, 1, 2)
+        S[:, [0, 1, 2], [0, 1, 2]] += self.noise_target
+        S[np.isnan(self.target[:, 2]), 2, 2] += _UNKNOWN
+        S[np.isnan(moved[:, 2])] = np.eye(3)
+        return np.asarray(np.linalg.inv(S))
+
+    def linear(self, T: F64, by_xi: F64) -> F64:
+        """[J r] (N, 3, 7); zeros for a point behind the camera, whose rows then count for nothing."""
+        moved = move(T, self.source)
+        r = self.target - moved
+        r[np.isnan(self.target[:, 2]), 2] = 0.0
+        out = np.concatenate([by_pose(moved) @ by_xi, r[:, :, None]], axis=2)
+        out[np.isnan(moved[:, 2])] = 0.0
+        return out

@@ -16,7 +16,8 @@ from share.config import PlaceConfig
 from share.geometry import se3
 from share.geometry.absolute_pose import absolute_pose
 from share.geometry.camera import rays
-from share.place.matching import match
+from share.place.guided import beside
+from share.place.matching import hamming, mutual, near
 from share.place.refine import Noise, refine
 from share.types import F64, View
 
@@ -43,9 +44,9 @@ class Sight:
     @property
     def y(self) -> F64:
         """Keypoints (N, 3): u, v and inverse depth [1/m], NaN where depth is unknown or absurd."""
-        z = self.view.points[:, 2].astype(np.float64)
+        uv, z = self.view.uv.astype(np.float64), self.view.points[:, 2].astype(np.float64)
         z[~((z > _NEAR) & (z < _FAR))] = np.nan
-        return np.column_stack([self.view.uv.astype(np.float64), 1 / z])
+        return np.column_stack([uv, 1 / z])
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,24 +91,27 @@ def verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int = 0) -
 
 
 def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> Verified:
-    pairs = match(query.view.descriptors, candidate.view.descriptors, config.max_distance_bits, config.ratio)
-    _need(len(pairs), config.min_matches, "matches")
-    y_q, y_c = query.y[pairs[:, 0]], candidate.y[pairs[:, 1]]
-    possible = (np.abs(y_q[:, :2]) < _WIDEST).all(1) & (np.abs(y_c[:, :2]) < _WIDEST).all(1)
-    y_q, y_c = y_q[possible], y_c[possible]
-    rough = _both_ways(y_q, y_c, query.focal, candidate.focal, config, seed)
-    with_depth = np.isfinite(y_q[:, 2]) | np.isfinite(y_c[:, 2])
-    y_q, y_c = y_q[with_depth], y_c[with_depth]
+    y_q, y_c = query.y, candidate.y
+    alike = near(hamming(query.view.descriptors, candidate.view.descriptors), config.guided_bits)
+    pairs = mutual(alike.only(alike.bits <= config.max_distance_bits))
+    _need(len(pairs.rows), config.min_matches, "matches")
+    rough = _rough(y_q[pairs.rows], y_c[pairs.cols], query, candidate, config, seed)
+    radius = config.guided_px / query.focal
+    pairs = mutual(beside(alike, rough, y_q, y_c, radius))
+    y_q, y_c = y_q[pairs.rows], y_c[pairs.cols]
     noise_q, noise_c = _noise(query, config), _noise(candidate, config)
     fine = refine(rough, y_q, y_c, noise_q, noise_c, config.inlier_chi2)
     inlier = fine.d2 < config.inlier_chi2
+    upright = bool(query.up.any() and candidate.up.any())
     _need(int(inlier.sum()), config.min_inliers, "inliers")
-    _check_spread(y_q[inlier], "query", config)
-    _check_spread(y_c[inlier], "candidate", config)
-    _check_uncertainty(fine.cov, config)
-    _check_gravity(fine.T, query, candidate, config)
+    for y, whose in ((y_q[inlier], "query"), (y_c[inlier], "candidate")):
+        _need(int(np.isfinite(y[:, 2]).sum()), config.min_direction_inliers, f"inliers with the {whose}'s depth")
+        _check_spread(y, whose, config)
+    _check_uncertainty(fine.cov, config.max_sigma_deg if upright else config.max_sigma_no_up_deg)
+    if upright:
+        _check_gravity(fine.T, query, candidate, config)
     T, cov = _between_bodies(fine.T, fine.cov, query.T_body_cam0, candidate.T_body_cam0)
-    return Verified(T, cov + _floor(config), len(pairs), int(inlier.sum()))
+    return Verified(T, cov + _floor(config), len(pairs.rows), int(inlier.sum()))
 
 
 def _noise(sight: Sight, config: PlaceConfig) -> Noise:
@@ -119,32 +123,23 @@ def _need(have: int, want: int, what: str) -> None:
         raise _RefusedError(f"{have} {what} of {want} needed")
 
 
-def _both_ways(y_q: F64, y_c: F64, focal_q: float, focal_c: float, config: PlaceConfig, seed: int) -> F64:
-    """T_c_q by the query's points in the candidate's image and by the reverse, which must agree."""
-    forward = _absolute_pose(y_q, y_c, focal_c, "query's", config, seed)
-    backward = _absolute_pose(y_c, y_q, focal_q, "candidate's", config, seed)
-    apart = forward @ backward
-    metres, degrees = float(np.linalg.norm(apart[:3, 3])), float(np.degrees(se3.angle(apart)))
-    depth = float(np.nanmedian(1 / np.concatenate([y_q[:, 2], y_c[:, 2]])))
-    allowed = config.agree_depth_ratio * depth
-    if metres > allowed or degrees > config.agree_deg:
-        raise _RefusedError(
-            f"the two directions differ by {metres:.2f} m and {degrees:.1f}°, "
-            f"{allowed:.2f} m and {config.agree_deg:.1f}° allowed"
-        )
-    return forward
+def _rough(y_q: F64, y_c: F64, query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> F64:
+    """T_c_q by the points of the view that knows more depths, in the other's image."""
+    if np.isfinite(y_q[:, 2]).sum() >= np.isfinite(y_c[:, 2]).sum():
+        return _absolute_pose(y_q, y_c, candidate.focal, "query's", config, seed)
+    return se3.inverse(_absolute_pose(y_c, y_q, query.focal, "candidate's", config, seed))
 
 
 def _absolute_pose(source: F64, target: F64, focal: float, whose: str, config: PlaceConfig, seed: int) -> F64:
     """T_target_source from 3D points of the source seen by the target."""
     known = np.isfinite(source[:, 2])
-    _need(int(known.sum()), config.min_direction_inliers, f"matches with the {whose} depth")
+    _need(int(known.sum()), config.min_consensus, f"matches with the {whose} depth")
     y = source[known]
     points, seen = rays(y[:, :2]) / y[:, 2:], target[known, :2]
     T, inliers = absolute_pose(
-        points, seen, focal, config.ransac_px, seed, MIN_ITERATIONS, config.ransac_iterations
+        points, seen, focal, config.ransac_px, seed, MIN_ITERATIONS, config.ransac_iterations, best_first=True
     )
-    _need(int(inliers.sum()), config.min_direction_inliers, f"inliers of the {whose} points")
+    _need(int(inliers.sum()), config.min_consensus, f"inliers of the {whose} points")
     if not np.isfinite(T).all():
         raise _RefusedError(f"no pose from the {whose} points")
     return T
@@ -159,16 +154,14 @@ def _check_spread(y: F64, whose: str, config: PlaceConfig) -> None:
         )
 
 
-def _check_uncertainty(cov: F64, config: PlaceConfig) -> None:
+def _check_uncertainty(cov: F64, allowed: float) -> None:
     """Inliers can be many and yet leave the pose loose; most wrong poses that pass the rest show here."""
     degrees = float(np.degrees(np.sqrt(np.trace(cov[:3, :3]))))
-    if degrees > config.max_sigma_deg:
-        raise _RefusedError(f"pose uncertain by {degrees:.2f}°, {config.max_sigma_deg:.2f}° allowed")
+    if degrees > allowed:
+        raise _RefusedError(f"pose uncertain by {degrees:.2f}°, {allowed:.2f}° allowed")
 
 
 def _check_gravity(T_c_q: F64, query: Sight, candidate: Sight, config: PlaceConfig) -> None:
-    if not (query.up.any() and candidate.up.any()):
-        return
     up_q, up_c = (s.T_body_cam0[:3, :3].T @ s.up for s in (query, candidate))
     cosine = float((T_c_q[:3, :3] @ up_q) @ up_c / (np.linalg.norm(up_q) * np.linalg.norm(up_c)))
     degrees = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

@@ -317,7 +317,7 @@ CONFIGS = {
         "spacing_px: expected a number from 0 to 1e+09, found -1",
     ),
     "huge": ("tracker: {corners: 1" + 400 * "0" + "}", "tracker: corners: expected a number from 0 to 1e+09"),
-    "too many bits": ("place: {hash_bits: 30}", "place: hash_bits: 30 must be at most 24"),
+    "too many bits": ("place: {hash_bits: 30}", "place: hash_bits: 8 tables of 30 bits are too many words"),
     "not a number": ("link: {ping_s: .nan}", "link: ping_s: expected a number from 0 to 1e+09, found nan"),
     "infinite": ("sequencer: {sync_tolerance_ms: .inf}", "from 0 to 1e+09, found inf"),
 }

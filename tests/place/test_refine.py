@@ -3,7 +3,7 @@ import pytest
 from place_sim import FOCAL, SIGMA_PX, SIGMA_RHO
 
 from share.geometry import se3
-from share.place.refine import Noise, move, refine
+from share.place.refine import Noise, by_keypoint, by_pose, move, refine
 from share.types import F64
 
 NOISE = Noise(SIGMA_PX / FOCAL, SIGMA_RHO)
@@ -17,7 +17,7 @@ def numerical(f, at: F64, step: float = 1e-6) -> F64:
 
 def matched(rng: np.random.Generator, T_c_q: F64, n: int, noise: float = 1.0) -> tuple[F64, F64]:
     y_q = np.column_stack([rng.uniform(-0.8, 0.8, n), rng.uniform(-0.5, 0.5, n), 1 / rng.uniform(1.5, 5, n)])
-    y_c = move(T_c_q, y_q)[0]
+    y_c = move(T_c_q, y_q)
     sigma = noise * np.sqrt(NOISE.variances)
     y_q, y_c = (y + rng.normal(size=y.shape) * sigma for y in (y_q, y_c))
     y_q[: n // 4, 2] = NAN
@@ -29,11 +29,12 @@ def test_jacobians_against_differences() -> None:
     rng = np.random.default_rng(0)
     T = se3.exp(rng.normal(0, 0.3, 6))
     y = np.column_stack([rng.uniform(-0.5, 0.5, (20, 2)), rng.uniform(0.2, 0.6, 20)])
-    moved, by_pose, by_y = move(T, y)
+    moved = move(T, y)
     assert np.isfinite(moved).all()
-    assert by_pose == pytest.approx(numerical(lambda xi: move(T @ se3.exp(xi), y)[0], np.zeros(6)), abs=1e-6)
+    assert by_pose(moved) == pytest.approx(numerical(lambda xi: move(se3.exp(xi) @ T, y), np.zeros(6)), abs=1e-6)
+    by_y = by_keypoint(T, y, moved)
     for i in range(20):
-        expected = numerical(lambda v: move(T, v[None])[0][0], y[i])
+        expected = numerical(lambda v: move(T, v[None])[0], y[i])
         assert by_y[i] == pytest.approx(expected, abs=1e-6)
 
 
