@@ -17,7 +17,7 @@ from share.config import Config, to_mapping
 from share.core.finding import Finding
 from share.core.inorder import InOrder
 from share.core.keeping import Change, KeepKeyframe, KeepRun
-from share.core.peer import Foot, Peer
+from share.core.peer import Known, Peer
 from share.core.rate import seconds
 from share.errors import WireError
 from share.types import Keyframe
@@ -98,15 +98,6 @@ class Record:
 
 
 Effect = Send | Join | Add | Keep | Record
-
-
-@dataclass(frozen=True, eq=False)
-class Known:
-    """A run that an earlier life of the edge kept. foot: its last keyframe, None without any."""
-
-    key: str
-    hello: wire.Hello
-    foot: Foot | None
 
 
 class Edge:
@@ -237,11 +228,8 @@ class Edge:
 
     def _recall(self, run: Known) -> None:
         """A run of an earlier life: it is not here, but may go on where it was."""
-        next_keyframe = 0 if run.foot is None else run.foot.id + 1
-        peer_id = wire.peer_id(run.hello.run_id)
-        self._peers[peer_id] = Peer(
-            run.hello, run.key, 0, InOrder(next_keyframe), next_keyframe, run.foot, gone=True
-        )
+        peer_id, asked = wire.peer_id(run.hello.run_id), run.next_keyframe
+        self._peers[peer_id] = Peer(run.hello, run.key, 0, InOrder(asked), asked, run.foot, gone=True)
         self._by_key[run.key] = peer_id
 
     # ------------------------------------------------------------------ keyframes

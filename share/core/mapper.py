@@ -7,7 +7,7 @@ solved together, once.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,17 +15,21 @@ import numpy as np
 
 from share.config import Config
 from share.core.finding import Finding
-from share.core.keeping import Change, DropLoop, KeepLoop
+from share.core.keeping import Change, DropLoop, KeepLink, KeepLoop, KeepPoses, Kept, Retire, edge_to
 from share.core.lookups import Lookups
 from share.core.steps import Look, Query, Solve, Step, Verify
 from share.graph.change import Solution
-from share.merge.atlas import Atlas
-from share.merge.join import Key, Loop
+from share.merge.atlas import Atlas, Placed
+from share.merge.join import Loop
+from share.merge.thinning import TakenOut
 from share.metrics.latency import summary
 from share.place.index import PlaceIndex
 from share.place.verify import Refusal, Sight, Verified
 from share.types import Correction, Keyframe
 from share.wire.messages import Hello
+
+_TIMES = 5000  # of each kind of step that a report is about: the newest
+_SLACK = 1.05  # so much above the bound before keyframes are taken out, many at once
 
 
 @dataclass
@@ -46,14 +50,13 @@ class Mapper:
         self._atlas = Atlas(config.merge)
         self._index = PlaceIndex(place.index_seed, place.tables, place.hash_bits)
         self._hellos: dict[str, Hello] = {}
-        self._keys: list[Key] = []  # by the number that the place index knows a keyframe by
-        self._sights: list[Sight] = []
+        self._sights: dict[int, Sight] = {}  # by the number of a keyframe in atlas and index
         self._lookups = Lookups(config.edge.max_waiting)
         self._verify: Verify | None = None
         self._looking = self._solving = False
         self._changes: list[Change] = []
         self._accounts: dict[str, _Account] = {}
-        self._ms: dict[str, list[float]] = {"place": [], "verify": [], "solve": []}
+        self._ms = {kind: deque[float](maxlen=_TIMES) for kind in ("place", "verify", "solve")}
         self._counts: Counter[str] = Counter()
 
     def join(self, agent: str, hello: Hello) -> None:
@@ -63,18 +66,43 @@ class Mapper:
 
     def add(self, agent: str, keyframe: Keyframe) -> list[Finding]:
         """A keyframe, in order, each once."""
-        hello, number = self._hellos[agent], len(self._keys)
-        map_id = self._atlas.add_keyframe(agent, keyframe)
-        self._keys.append(Key(agent, keyframe.id))
-        self._sights.append(Sight(keyframe.view, hello.focal, hello.T_body_cam0, keyframe.up))
+        number = self._atlas.add_keyframe(agent, keyframe)
+        self._see(number, agent, keyframe)
+        self._lookups.add(agent, self._hellos[agent].kind, number)
+        findings = [] if keyframe.reference >= 0 else [self._founding(agent)]
+        if len(self._atlas) > self._config.edge.max_keyframes * _SLACK:
+            self._thin()
+        return findings
+
+    def restore(self, kept: Kept) -> list[Finding]:
+        """What an earlier life of the edge knew, before anything else comes."""
+        for run in kept.runs:
+            self.join(run.key, run.hello)
+        poses = {} if kept.poses is None else dict(zip(kept.poses.keys, kept.poses.T_map_body, strict=True))
+        agents = [name.rpartition("/")[0] for name in kept.stretches]
+        placed = [
+            Placed(
+                k.at, k.stretch, k.ordinal, k.T_odom_body, edge_to(k, kept.links).cov, k.at not in kept.links
+            )
+            for k in kept.keyframes
+        ]
+        numbers = self._atlas.restore(agents, placed, kept.loops, poses)
+        for number, found in zip(numbers, kept.keyframes, strict=True):
+            self._see(number, found.key, found.keyframe)
+        return [self._founding(agent) for agent in dict.fromkeys(agents) if agent in self._hellos]
+
+    def _see(self, number: int, agent: str, keyframe: Keyframe) -> None:
+        hello = self._hellos[agent]
+        self._sights[number] = Sight(keyframe.view, hello.focal, hello.T_body_cam0, keyframe.up)
         self._index.add(number, keyframe.view.descriptors)
-        self._lookups.add(agent, hello.kind, number)
-        if keyframe.reference >= 0:
-            return []
-        T = self._atlas.T_map_odom(agent)
-        assert T is not None
-        founding = Correction(T, np.zeros((6, 6)), map_id, 0)
-        return [Finding(agent, "correction", f"founds map {map_id}", founding)]
+
+    def _founding(self, agent: str) -> Finding:
+        T, map_id = self._atlas.T_map_odom(agent), self._atlas.current_map(agent)
+        assert T is not None and map_id is not None
+        founded = "founds" if map_id.startswith(f"{agent}/") else "is in"
+        return Finding(
+            agent, "correction", f"{founded} map {map_id}", Correction(T, np.zeros((6, 6)), map_id, 0)
+        )
 
     # ------------------------------------------------------------------ what to work on
 
@@ -84,8 +112,9 @@ class Mapper:
             return None
         step: Look | None = self._verify
         self._verify = None
-        if step is None and (number := self._lookups.next()) is not None:
-            step = self._query(number)
+        while step is None and (number := self._lookups.next()) is not None:
+            if number in self._sights:
+                step = self._query(number)
         self._looking = step is not None
         return step
 
@@ -100,17 +129,14 @@ class Mapper:
     def done(self, step: Step, result: Any, ms: float) -> list[Finding]:
         """What follows from a step's result; an exception as the result costs that step only."""
         self._ms[step.kind].append(ms)
-        match step:
-            case Solve():
-                self._solving = False
-            case _:
-                self._looking = False
+        self._counts[step.kind] += 1
+        if isinstance(step, Solve):
+            self._solving = False
+        else:
+            self._looking = False
         match step:
             case Query() if isinstance(result, list):
-                candidates = {c.id: self._sights[c.id] for c in result}
-                if candidates:
-                    place = self._config.place
-                    self._verify = Verify(step.number, step.sight, candidates, place.enough, place)
+                self._verify = self._verification(step, [c.id for c in result])
                 return []
             case Verify() if isinstance(result, dict):
                 return [f for n, outcome in result.items() for f in self._judge(step.number, n, outcome)]
@@ -119,7 +145,7 @@ class Mapper:
             case Solve():
                 self._atlas.solver_lost()
         self._counts["failed_jobs"] += 1
-        agent = self._keys[0 if isinstance(step, Solve) else step.number].agent
+        agent = next(iter(self._hellos)) if isinstance(step, Solve) else self._atlas.key(step.number).agent
         return [Finding(agent, "job failed", f"{step.kind}: {type(result).__name__}: {result}")]
 
     def solver_lost(self) -> None:
@@ -131,17 +157,26 @@ class Mapper:
         taken, self._changes = tuple(self._changes), []
         return taken
 
+    def poses(self) -> KeepPoses:
+        """Where everything lies now."""
+        keys, T_map_body, maps = self._atlas.everything()
+        return KeepPoses(keys, T_map_body, maps)
+
     # ------------------------------------------------------------------ steps
 
     def _query(self, number: int) -> Query:
-        agent, id = self._keys[number]
-        gap = self._config.merge.min_loop_gap
-        recent = range(max(0, number - 8 * gap), len(self._keys))
-        near = (n for n in recent if self._keys[n].agent == agent and abs(id - self._keys[n].id) < gap)
-        return Query(self._index, number, self._sights[number], self._config.place.candidates, tuple(near))
+        near = self._atlas.neighbours(number)
+        return Query(self._index, number, self._sights[number], self._config.place.candidates, near)
+
+    def _verification(self, query: Query, found: list[int]) -> Verify | None:
+        candidates = {n: self._sights[n] for n in found if n in self._sights}
+        place = self._config.place
+        return Verify(query.number, query.sight, candidates, place.enough, place) if candidates else None
 
     def _judge(self, query: int, candidate: int, outcome: Verified | Refusal) -> list[Finding]:
-        a, b = self._keys[candidate], self._keys[query]
+        if not {query, candidate} <= self._sights.keys():
+            return []  # taken out meanwhile
+        a, b = self._atlas.key(candidate), self._atlas.key(query)
         account = self._accounts[b.agent]
         account.loops_tried += 1
         if isinstance(outcome, Refusal):
@@ -154,7 +189,7 @@ class Mapper:
             return [Finding(b.agent, "loop not taken", reason)]
         account.loops_accepted += 1
         account.merges += 1
-        what = "maps joined" if decision.joined else "loop accepted"
+        what = "merge undone" if decision.dropped else "maps joined" if decision.joined else "loop accepted"
         return [Finding(b.agent, what, reason)]
 
     def _solved(self, step: Solve, solution: Solution) -> list[Finding]:
@@ -165,6 +200,14 @@ class Mapper:
             Finding(agent, "correction", applied.reason, correction)
             for agent, correction in applied.corrections.items()
         ]
+
+    def _thin(self) -> None:
+        taken = self._atlas.thin(self._config.edge.max_keyframes)
+        for out in taken:
+            self._index.remove(out.number)
+            del self._sights[out.number]
+        self._counts["taken_out"] += len(taken)
+        self._changes += _changes_of(taken)
 
     # ------------------------------------------------------------------ report
 
@@ -182,9 +225,10 @@ class Mapper:
             },
             "merges": {"requested": merges, "skipped": 0, "done": merges},
             "maps": self._atlas.sizes(),
+            "taken_out": self._counts["taken_out"],
             "waiting": len(self._lookups),
             "failed_jobs": self._counts["failed_jobs"],
-            **{f"{kind}_ms": summary(ms).report() for kind, ms in self._ms.items()},
+            **{f"{k}_ms": {**summary(list(ms)).report(), "n": self._counts[k]} for k, ms in self._ms.items()},
         }
 
     def _report_of(self, agent: str) -> dict[str, Any]:
@@ -195,3 +239,14 @@ class Mapper:
             "queries_skipped": self._lookups.skipped[agent],
             "map_id": self._atlas.current_map(agent),
         }
+
+
+def _changes_of(taken: list[TakenOut]) -> list[Change]:
+    """In the order in which they happened: a link may lead to one that goes next."""
+    changes: list[Change] = []
+    for out in taken:
+        if (link := out.link) is not None:
+            reference = -1 if link.reference is None else link.reference.id
+            changes.append(KeepLink(link.key, reference, link.T_ref_body, link.cov))
+        changes += [Retire((out.key,)), *(KeepLoop(loop) for loop in out.moved)]
+    return changes

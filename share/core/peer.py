@@ -10,6 +10,7 @@ import numpy as np
 
 from share.core.finding import Finding
 from share.core.inorder import InOrder
+from share.core.keeping import Kept
 from share.core.rate import SECOND_NS
 from share.geometry import se3
 from share.types import F64, Keyframe, TrackState
@@ -31,6 +32,17 @@ class Foot:
         away = float(np.linalg.norm(keyframe.T_ref_body[:3, 3]))
         passed_s = max(0, keyframe.stamp_ns - self.stamp_ns) / SECOND_NS
         return away if away > _LEAP_M + _LEAP_M_S * passed_s else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A run that an earlier life of the edge kept. foot: its last keyframe, None without any.
+    next_keyframe: the number that is asked for."""
+
+    key: str
+    hello: Hello
+    foot: Foot | None
+    next_keyframe: int
 
 
 @dataclass
@@ -89,3 +101,15 @@ _COUNTS = (
     "bad_messages",
     "unexpected",
 )
+
+
+def known_runs(kept: Kept) -> list[Known]:
+    """Of all earlier lives. What comes after a run's last keyframe that is there is asked for."""
+    last = {found.key: found for found in kept.keyframes}
+    out = []
+    for run in kept.runs:
+        foot = None
+        if (found := last.get(run.key)) is not None:
+            foot = Foot(found.keyframe.id, found.keyframe.stamp_ns, found.T_odom_body)
+        out.append(Known(run.key, run.hello, foot, 0 if foot is None else foot.id + 1))
+    return out

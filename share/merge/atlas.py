@@ -6,6 +6,7 @@ new, `apply` takes the solution in.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -87,6 +88,25 @@ class Atlas:
         if stretch is None:
             return None
         return self._chart.placement(self._chart.trails.stretches[stretch].nodes[-1])
+
+    def key(self, number: int) -> Key:
+        """Of the keyframe with this number."""
+        return self._chart.trails.nodes[number].key
+
+    def neighbours(self, number: int) -> tuple[int, ...]:
+        """The keyframe, and those that odometry ties to it too closely for a loop."""
+        trails, gap = self._chart.trails, self._config.min_loop_gap
+        nodes = trails.stretches[trails.nodes[number].stretch].nodes
+        at = bisect_left(nodes, number)
+        beside = nodes[max(0, at - gap) : at + gap]
+        return tuple(n for n in beside if trails.are_neighbours(n, number, gap))
+
+    def everything(self) -> tuple[tuple[Key, ...], F64, tuple[str, ...]]:
+        """Every keyframe, its T_map_body (N, 4, 4), and its map."""
+        nodes, poses = self._chart.trails.nodes, self._chart.poses
+        keys = tuple(node.key for node in nodes.values())
+        maps = tuple(self._chart.name(node.stretch) for node in nodes.values())
+        return keys, np.array([poses[n] for n in nodes]).reshape(-1, 4, 4), maps
 
     @property
     def pending(self) -> tuple[Loop, ...]:

@@ -19,7 +19,6 @@ from share.merge.chart import Chart
 from share.merge.join import Key, Loop
 from share.types import F64
 
-
 Bonds = Counter[frozenset[int]]  # loops by the two stretches that they tie
 
 
@@ -38,6 +37,7 @@ class Link:
 class TakenOut:
     """A keyframe that is gone, what leads to the one after it now, and loops that were moved elsewhere."""
 
+    number: int
     key: Key
     link: Link | None
     moved: tuple[Loop, ...]
@@ -87,14 +87,14 @@ def take_out(chart: Chart, number: int, bonds: Bonds, most_loops: int) -> TakenO
     trails.take_out(number)
     del chart.poses[number]
     if not odometry:
-        return TakenOut(key, None, ())
+        return TakenOut(number, key, None, ())
     left = contract(number, odometry, [edge for _, edge in loops])
     for edge in left.odometry:
         ties.add(edge)
     link = None if after is None else _link(chart, before, after, left.odometry)
     pairs = [(old, edge) for (old, _), edge in zip(loops, left.loops, strict=True) if edge is not None]
     moved = [_move(chart, old, edge, bonds, most_loops) for old, edge in pairs]
-    return TakenOut(key, link, tuple(loop for loop in moved if loop is not None))
+    return TakenOut(number, key, link, tuple(loop for loop in moved if loop is not None))
 
 
 def _unlike(poses: F64, apart_m: float, apart_rad: float) -> F64:
@@ -102,7 +102,8 @@ def _unlike(poses: F64, apart_m: float, apart_rad: float) -> F64:
     square = (p**2).sum(1)
     shift = np.sqrt(np.maximum(square[:, None] + square - 2 * p @ p.T, 0.0))
     angle = np.arccos(np.clip((R @ R.T - 1) / 2, -1, 1))
-    return shift / apart_m + angle / apart_rad
+    gap: F64 = shift / apart_m + angle / apart_rad
+    return gap
 
 
 def _link(chart: Chart, before: int | None, after: int, odometry: tuple[Edge, ...]) -> Link:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from share.types import F64, I64, U8
+from share.types import I64, U8
 
 _ROWS = 50  # at a time, so that what is in between stays in the cache
 

@@ -105,7 +105,9 @@ def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> V
     upright = bool(query.up.any() and candidate.up.any())
     _need(int(inlier.sum()), config.min_inliers, "inliers")
     for y, whose in ((y_q[inlier], "query"), (y_c[inlier], "candidate")):
-        _need(int(np.isfinite(y[:, 2]).sum()), config.min_direction_inliers, f"inliers with the {whose}'s depth")
+        _need(
+            int(np.isfinite(y[:, 2]).sum()), config.min_direction_inliers, f"inliers with the {whose}'s depth"
+        )
         _check_spread(y, whose, config)
     _check_uncertainty(fine.cov, config.max_sigma_deg if upright else config.max_sigma_no_up_deg)
     if upright:

@@ -13,20 +13,41 @@ import secrets
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from share.config import Config
-from share.core.edge import Add, Edge, Effect, Event, Found, Join, Received, Record, Send, Tick
+from share.core.edge import Add, Edge, Effect, Event, Found, Join, Keep, Kept, Received, Record, Send, Tick
+from share.core.peer import known_runs
 from share.io.files import atomic_write, check_writable, claim
 from share.io.line_file import LineFile
+from share.io.map_store import MapStore
 from share.io.transport import EdgeLink
 from share.run.companion import Companion
-from share.run.mapping import Mapped, map_all
+from share.run.keeper import Keeper
+from share.run.mapping import Mapped, Restore, map_all
 
 TICK_MS = 50
+_REPORT_S = 1.0
+_UNWELL_S = 10.0  # how long a death is trouble
 REFUSALS_SAID = 64  # strangers at the door; more are only counted
 _AT_ONCE = 64  # messages, before anything else is looked after
+
+
+@dataclass(frozen=True)
+class _Said:
+    """By another thread, for a person."""
+
+    event: str
+    text: str
+
+
+@dataclass(frozen=True)
+class _Lost:
+    """The mapper's process has died."""
+
+    how: str
 
 
 class EdgeRun:
@@ -38,8 +59,9 @@ class EdgeRun:
         link: EdgeLink,
         out: Path | None,
         tell: Callable[[dict[str, Any]], None],
+        store: MapStore | None = None,
     ) -> None:
-        self._settings, self._link, self._tell = settings, link, tell
+        self._settings, self._link, self._tell, self._store = settings, link, tell, store
         self._inbox: queue.SimpleQueue[object] = queue.SimpleQueue()
         self._out = out
         self._claim: int | None = None
@@ -52,6 +74,9 @@ class EdgeRun:
         self._stopping = False
         self._began_ns = time.monotonic_ns()
         self._refused: Counter[str] = Counter()  # handshakes, by what was said of them
+        self._trouble: dict[str, float] = {}  # what to say until when
+        self._report: dict[str, Any] = {}
+        self._report_at = 0.0
         self._begin()
 
     def stop(self) -> None:
@@ -67,21 +92,45 @@ class EdgeRun:
         finally:
             self._mapping.close()
             self._take_answers()
+            if self._keeper is not None:
+                self._keeper.close()
             self._link.close()
-            report = self.report()
-            self._finish(report)
-        return report
+            self._note()
+            self._finish(self._report)
+        return self._report
 
     def report(self) -> dict[str, Any]:
-        """As edge.json."""
-        report = self._machine.report(self._mapped)
-        return {**report, "refused_handshakes": self._refused.total()}
+        """As edge.json, a second old at most, and `trouble`: what is wrong now. From any thread."""
+        return self._report
+
+    def _note(self) -> None:
+        """A report, and when the next is due."""
+        now = time.monotonic()
+        self._report_at = now + _REPORT_S
+        failing = self._keeper is not None and self._keeper.failing
+        trouble = [text for text, until in self._trouble.items() if now < until]
+        self._report = {
+            **self._machine.report(self._mapped),
+            "refused_handshakes": self._refused.total(),
+            "trouble": [*trouble, *(["the map cannot be written"] if failing else [])],
+            "uptime_s": round((time.monotonic_ns() - self._began_ns) * 1e-9, 3),
+        }
 
     def _begin(self) -> None:
         """A new life: agents notice by its number, and send again what it lacks."""
-        self._machine = Edge(self._settings, secrets.randbits(63))
+        kept = None if self._store is None else self._store.load()
+        writable = self._store is not None and self._store.writable
+        known = () if kept is None else known_runs(kept)
+        self._machine = Edge(self._settings, secrets.randbits(63), writable, known)
         self._mapped: dict[str, Any] = {}
         self._mapping = Companion("mapping", map_all, (self._settings,), self._answered, self._mapping_lost)
+        self._keeper: Keeper | None = None
+        if kept is not None:
+            self._mapping.send(Restore(kept))
+        if self._store is not None and writable:
+            self._keeper = Keeper(
+                self._store, self._answered, lambda text: self._answered(_Said("map", text))
+            )
 
     def _finish(self, report: dict[str, Any]) -> None:
         if self._out is None or self._events is None or self._claim is None:
@@ -104,20 +153,30 @@ class EdgeRun:
             self._refuse(line)
         self._take_answers()
         self._handle(Tick())
+        if time.monotonic() >= self._report_at:
+            self._note()
 
     def _take_answers(self) -> None:
         while not self._inbox.empty():
             match self._inbox.get():
                 case Found() as found:
                     self._handle(found)
+                case Kept() as kept:
+                    self._handle(kept)
                 case Mapped() as mapped:
                     self._mapped = mapped.report
-                case str() as how:
-                    self._begin_anew(how)
+                case _Said() as said:
+                    self._say(said.event, said.text)
+                case _Lost() as lost:
+                    self._begin_anew(lost.how)
 
     def _begin_anew(self, how: str) -> None:
-        self._say("mapper lost", f"its process {how}; agents are asked for their keyframes again")
+        """The mapper has died: as if the whole edge had been restarted, to its agents too."""
+        self._say("mapper lost", f"its process {how}; agents are asked for what is not in the map's file")
+        self._trouble[f"the mapper's process {how}"] = time.monotonic() + _UNWELL_S
         self._mapping.close()
+        if self._keeper is not None:
+            self._keeper.drain()
         self._begin()
 
     def _handle(self, event: Event) -> None:
@@ -130,6 +189,8 @@ class EdgeRun:
                 self._link.send(effect.peer, effect.frames)
             case Join() | Add():
                 self._mapping.send(effect)
+            case Keep() if self._keeper is not None:
+                self._keeper.keep(effect)
             case Record():
                 self._record(effect.fields)
 
@@ -140,7 +201,7 @@ class EdgeRun:
         self._link.wake()
 
     def _mapping_lost(self, how: str) -> None:
-        self._answered(how)
+        self._answered(_Lost(how))
 
     # ------------------------------------------------------------------ what is said
 

@@ -12,12 +12,21 @@ from typing import Any
 from share.config import Config, GraphConfig
 from share.core.edge import Add, Found, Join
 from share.core.finding import Finding
+from share.core.keeping import Kept
 from share.core.mapper import Mapper
 from share.core.steps import Solve
 from share.graph.solver import Solver
 from share.run.companion import END, Companion, Inbox
 
 _REPORT_S = 1.0
+_POSES_S = 5.0  # between two keepings of where everything lies
+
+
+@dataclass(frozen=True, eq=False)
+class Restore:
+    """To the mapper, before anything else: what an earlier life of the edge knew."""
+
+    kept: Kept
 
 
 @dataclass(frozen=True)
@@ -41,7 +50,7 @@ class _Solved:
 
 
 def map_all(inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
-    """For a `Companion`: takes Join and Add, answers Found and Mapped, until END."""
+    """For a `Companion`: takes Restore, Join and Add, answers Found and Mapped, until END."""
     _Mapping(inbox, answer, settings).go()
 
 
@@ -52,7 +61,8 @@ class _Mapping:
         self._solver = self._new_solver()
         self._solving: Solve | None = None
         self._findings: list[Finding] = []
-        self._report_at = 0.0
+        self._report_at = self._poses_at = 0.0
+        self._is_moved = False
         self._ended = False
 
     def go(self) -> None:
@@ -66,6 +76,7 @@ class _Mapping:
                 self._findings += self._mapper.done(look, *_timed(look.run))
             self._tell()
         self._solver.close()
+        self._answer(Found(tuple(self._findings), (*self._mapper.take_changes(), self._mapper.poses())))
         self._answer(Mapped(self._mapper.report()))
 
     def _arrived(self, wait: bool) -> Iterator[Any]:
@@ -79,6 +90,8 @@ class _Mapping:
 
     def _hear(self, message: Any) -> None:
         match message:
+            case Restore():
+                self._findings += self._mapper.restore(message.kept)
             case Join():
                 self._mapper.join(message.key, message.hello)
             case Add():
@@ -98,6 +111,7 @@ class _Mapping:
 
     def _solved(self, result: object, ms: float) -> None:
         step, self._solving = self._solving, None
+        self._is_moved = True
         if step is not None:
             self._findings += self._mapper.done(step, result, ms)
 
@@ -117,6 +131,9 @@ class _Mapping:
 
     def _tell(self) -> None:
         changes = self._mapper.take_changes()
+        if self._is_moved and time.monotonic() >= self._poses_at:
+            self._is_moved, self._poses_at = False, time.monotonic() + _POSES_S
+            changes = (*changes, self._mapper.poses())
         if self._findings or changes:
             self._answer(Found(tuple(self._findings), changes))
             self._findings = []

@@ -7,7 +7,7 @@ import numpy as np
 from share.config import Config
 from share.core import edge as ed
 from share.core.keeping import KeepKeyframe, KeepRun
-from share.core.peer import Foot
+from share.core.peer import Foot, Known
 from share.geometry import se3
 from share.types import AgentKind, Keyframe, View
 from share.wire import messages as m
@@ -62,7 +62,7 @@ def test_several_kept_at_once_are_acknowledged_once() -> None:
 
 def test_a_known_run_goes_on_where_it_was() -> None:
     foot = Foot(4, 800 * MS, se3.compose(np.eye(3), np.array([1.0, 0.0, 0.0])))
-    edge = ed.Edge(Config(), 8, keeps=True, known=[ed.Known("ann-000b", HELLO, foot)])
+    edge = ed.Edge(Config(), 8, keeps=True, known=[Known("ann-000b", HELLO, foot, 5)])
     effects = tell(edge, HELLO)
     (welcome,) = [decode([bytes(f) for f in e.frames]) for e in of(effects, ed.Send)]
     assert welcome == m.Welcome(8, 5)
