@@ -1,6 +1,6 @@
 """How long the pose graph takes, by its size. Prints JSON: CPU time of one thread, in ms.
 
-    python tools/bench_graph.py [--poses 100 300 1000 2000 5000] [--density 1.0] [--gtsam]
+    python tools/bench_graph.py [--poses 100 300 1000 2000 5000] [--density 1.0] [--steps 200] [--gtsam]
 
 The graphs are simulated: agents walk about a room of 9 x 6 m, a keyframe every 0.25 m, every second
 with one to three loops (`--density` is the share of those that have any). `warm` is what comes all the
@@ -49,10 +49,9 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200, help="of the warm graph")
     parser.add_argument("--gtsam", action="store_true", help="solve it once by gtsam too")
     options = parser.parse_args()
+    rest = options.density, options.steps, options.gtsam
     bench(100, 1.0, 3, False)  # imports
-    print(
-        json.dumps({f"{n}_poses": bench(n, options.density, options.gtsam) for n in options.poses}, indent=2)
-    )
+    print(json.dumps({f"{n}_poses": bench(n, *rest) for n in options.poses}, indent=2))
 
 
 def bench(n: int, density: float, steps: int, by_gtsam: bool) -> dict[str, Any]:
