@@ -1,10 +1,10 @@
 """How long the pose graph takes, by its size. Prints JSON: CPU time of one thread, in ms.
 
-    python tools/bench_graph.py [--poses 100 300 1000 2000 5000] [--density 1.0] [--gtsam]
+    python tools/bench_graph.py [--poses 100 300 1000 2000 5000] [--density 1.0] [--steps 200] [--gtsam]
 
 The graphs are simulated: agents walk about a room of 9 x 6 m, a keyframe every 0.25 m, every second
 with one to three loops (`--density` is the share of those that have any). `warm` is what comes all the
-time: three new keyframes and one new loop on a graph that is solved, 200 times.
+time: three new keyframes and one new loop on a graph that is solved.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from share.types import F64  # noqa: E402
 
 CONFIG = GraphConfig()
 EXACT = replace(CONFIG, step_tolerance=1e-8, relative_tolerance=1e-14, inner_tolerance=1e-6)
-STEPS, NEW = 200, 3
+NEW = 3  # keyframes a step
 FIRST_LOOP = 10**6  # ids of odometry edges are those of the keyframes that they lead to
 
 
@@ -46,19 +46,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--poses", type=int, nargs="*", default=[100, 300, 1000, 2000, 5000])
     parser.add_argument("--density", type=float, default=1.0)
+    parser.add_argument("--steps", type=int, default=200, help="of the warm graph")
     parser.add_argument("--gtsam", action="store_true", help="solve it once by gtsam too")
     options = parser.parse_args()
-    bench(100, 1.0, False)  # imports
-    print(
-        json.dumps({f"{n}_poses": bench(n, options.density, options.gtsam) for n in options.poses}, indent=2)
-    )
+    rest = options.density, options.steps, options.gtsam
+    bench(100, 1.0, 3, False)  # imports
+    print(json.dumps({f"{n}_poses": bench(n, *rest) for n in options.poses}, indent=2))
 
 
-def bench(n: int, density: float, by_gtsam: bool) -> dict[str, Any]:
+def bench(n: int, density: float, steps: int, by_gtsam: bool) -> dict[str, Any]:
     agents = min(24, max(3, n // 330))
     room = simulate(n, agents, 0, density)
     report = {"agents": agents, "loops": len(room.closures)} | cold(room, agents) | roads(room)
-    report |= warm(n, agents, density)
+    report |= warm(n, agents, density, steps)
     return report | (gtsam(room, agents) if by_gtsam else {})
 
 
@@ -80,10 +80,10 @@ def cold(room: Room, agents: int) -> dict[str, float]:
     return {"cold": round(np.median(times), 1), "pickle": round(np.median(pickling), 2)}
 
 
-def warm(n: int, agents: int, density: float) -> dict[str, float]:
+def warm(n: int, agents: int, density: float, wanted: int) -> dict[str, float]:
     """The last tenth of each of several graphs is added step by step."""
-    steps = min(STEPS, max(1, n // (10 * NEW)))
-    runs = [one_warm(n, agents, density, seed, steps) for seed in range(1, 1 + -(-STEPS // steps))]
+    steps = min(wanted, max(1, n // (10 * NEW)))
+    runs = [one_warm(n, agents, density, seed, steps) for seed in range(1, 1 + -(-wanted // steps))]
     times, off = (np.concatenate([run[k] for run in runs]) for k in (0, 1))
     return {
         "warm_p50": round(float(np.median(times)), 1),

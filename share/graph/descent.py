@@ -82,8 +82,10 @@ def _step(equations: Equations, at: Residuals, edges: Edges, damping: float, con
 
 def _softened(J: tuple[F64, F64], at: Residuals, weights: F64, edges: Edges) -> tuple[tuple[F64, F64], F64]:
     """Jacobians less stiff along each loop's residual, where the kernel bends away, and by how much (E,):
-    without that the last millimetres take many steps (Triggs et al., section 4.3)."""
-    softness = np.where(edges.is_loop, np.sqrt(np.maximum(2 * weights - 1, _LEAST_CURVATURE)), 1.0)
+    without that the last millimetres take many steps (Triggs et al., section 4.3). Not for loops so
+    far off that the kernel is not convex there: they need it stiff."""
+    near = edges.is_loop & (weights > 0.5)
+    softness = np.where(near, np.sqrt(np.maximum(2 * weights - 1, _LEAST_CURVATURE)), 1.0)
     along = at.whitened / np.sqrt(np.maximum(at.chi2, 1e-300))[:, None]
     cut = ((1 - softness)[:, None] * along)[:, :, None]
     by_a, by_b = (each - cut * (along[:, None, :] @ each) for each in J)
