@@ -13,6 +13,7 @@ from share.config import POLICIES
 
 if TYPE_CHECKING:
     from share.io.keys import EdgeKeys
+    from share.io.map_store import MapStore
 
 
 @click.command()
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     help="How agents are scheduled. By default covins-g: every keyframe is sent, every loop merged.",
 )
 @options.keys
+@click.option("--map", "map_file", metavar="FILE", help="Keep the map here, and go on with what is in it.")
+@click.option("--http", metavar="[H:]P", help="Serve /, /health, /metrics and /snapshot.json here.")
 @click.option("--out", metavar="DIR", help="Write events.jsonl and edge.json here.")
 @options.config
 @options.verbose
@@ -31,6 +34,8 @@ def edge(
     bind: str,
     policy: str | None,
     keys: str | None,
+    map_file: str | None,
+    http: str | None,
     out: str | None,
     config_file: str | None,
     verbose: bool,
@@ -41,27 +46,35 @@ def edge(
     Says when agents come and go and when maps are joined; with -v, every decision and its reason.
     To be reached from other machines it needs keys: see `share keys --help`.
 
+    With --map, what it has acknowledged survives whatever ends it; started again, it goes on there.
+
     \b
-    Example:  share edge --bind tcp://127.0.0.1:5555 --out out/edge
+    Example:  share edge --bind tcp://127.0.0.1:5555 --map room.sqlite --http 8080 --out out/edge
     """
     settings = options.load_config(config_file)
-    from contextlib import closing
+    from contextlib import ExitStack, closing
     from dataclasses import replace
 
     from share.io.transport import bind as bind_link
     from share.io.transport import parse_address
     from share.run.edge import EdgeRun
+    from share.run.status import StatusServer
     from share.run.stop import on_stop
 
     with_keys = _keys(keys, parse_address(bind, bind=True).local)
     if policy is not None:
         settings = replace(settings, edge=replace(settings.edge, policy=policy))
     folder = None if out is None else Path(out)
-    with closing(bind_link(bind, with_keys)) as link:
-        run = EdgeRun(settings, link, folder, lambda e: _tell(e, verbose))
+    with ExitStack() as stack:
+        link = stack.enter_context(closing(bind_link(bind, with_keys)))
+        store = None if map_file is None else stack.enter_context(_open_map(Path(map_file)))
+        run = EdgeRun(settings, link, folder, lambda e: _tell(e, verbose), store)
         with on_stop(run.stop):
             click.echo(f"listening on {link.endpoint}, policy {settings.edge.policy}", err=True)
             _say_keys(with_keys)
+            if http is not None:
+                status = stack.enter_context(closing(StatusServer(http, run.report)))
+                click.echo(f"status at http://{status.endpoint}/", err=True)
             report = run.go()
     click.echo(json.dumps(report) if as_json else _summary(report))
 
@@ -75,6 +88,21 @@ def _keys(folder: str | None, local: bool) -> EdgeKeys | None:
     return edge_keys(None if folder is None else Path(folder))
 
 
+def _open_map(path: Path) -> MapStore:
+    """Says what is in it, and what is wrong with it. Raises UsageError, ShareError."""
+    from share.io.map_store import MapStore
+
+    store = MapStore.open(path)
+    kept = store.peek()
+    for complaint in kept.complaints:
+        click.echo(f"map {path}: {complaint}", err=True)
+    if not store.writable:
+        click.echo(f"map {path}: {store.reason}; what is in it is used, nothing new is kept", err=True)
+    counts = f"{len(kept.keyframes)} keyframes of {len(kept.runs)} runs, {len(kept.loops)} loops"
+    click.echo(f"map {path}: {counts}", err=True)
+    return store
+
+
 def _say_keys(keys: EdgeKeys | None) -> None:
     if keys is not None:
         names = ", ".join(sorted(keys.allowed.names().values()))
@@ -82,7 +110,8 @@ def _say_keys(keys: EdgeKeys | None) -> None:
 
 
 _NEWS = {"joined the edge", "left", "back", "silent", "refused"}
-_NEWS |= {"not let in", "maps joined", "job failed", "not written", "mapper lost", "odometry leapt"}
+_NEWS |= {"not let in", "maps joined", "merge undone", "job failed", "not written", "mapper lost"}
+_NEWS |= {"odometry leapt", "map"}
 
 
 def _tell(event: dict[str, Any], verbose: bool) -> None:

@@ -128,9 +128,7 @@ class EdgeRun:
         if kept is not None:
             self._mapping.send(Restore(kept))
         if self._store is not None and writable:
-            self._keeper = Keeper(
-                self._store, self._answered, lambda text: self._answered(_Said("map", text))
-            )
+            self._keeper = Keeper(self._store, self._answered, self._map_said)
 
     def _finish(self, report: dict[str, Any]) -> None:
         if self._out is None or self._events is None or self._claim is None:
@@ -199,6 +197,9 @@ class EdgeRun:
     def _answered(self, message: object) -> None:
         self._inbox.put(message)
         self._link.wake()
+
+    def _map_said(self, text: str) -> None:
+        self._answered(_Said("map", text))
 
     def _mapping_lost(self, how: str) -> None:
         self._answered(_Lost(how))

@@ -58,7 +58,7 @@ class Keeper:
                 pass
 
     def _take(self) -> bool:
-        """What has come, into `_held`; waits for it, or until it is time to try again. Whether that was all."""
+        """What has come, into `_held`; waits for it, or until it is time to try again. Whether all has."""
         try:
             keep = self._new.get(timeout=_AGAIN_S if self._failing else None)
             while keep is not None:

@@ -82,6 +82,10 @@ class MapStore:
                 raise StoreError(f"{self.path}: the map cannot be written: {error}") from None
             raise
 
+    def peek(self) -> Kept:
+        """What `open` has read, before anything is written or loaded."""
+        return Kept() if self._kept is None else self._kept
+
     def load(self) -> Kept:
         """All that is kept. The first time it is what `open` has read. Raises StoreError."""
         kept, self._kept = self._kept, None
