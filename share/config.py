@@ -125,6 +125,9 @@ class PlaceConfig:
     min_consensus: int = 7  # inliers of a rough pose: one view's 3D points in the other's image
     guided_bits: int = 80  # a match beside where the rough pose moves the point may differ in so many bits
     guided_px: float = 15.0  # what "beside" is
+    agree_depth_ratio: float = 0.05  # poses are the same if positions differ less than this times the depth
+    agree_deg: float = 2.5  # … and rotations less than this
+    rival_share: float = 0.7  # another pose with more than this share of the best one's inliers: refused
     sigma_px: float = 1.5  # standard deviation of a keypoint
     sigma_inverse_depth: float = 0.01  # 1/m, of a keypoint's depth: disparity noise / (focal * baseline)
     inlier_chi2: float = 11.3  # squared Mahalanobis distance of an inlier (99 %, 3 dof)
