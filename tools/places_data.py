@@ -17,7 +17,7 @@ from share.types import F64
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "place"))
 
-from place_real import load  # noqa: E402
+from place_real import load
 
 STEREO, KITCHEN = "euroc_v1_01_keyframes", "redkitchen_0000_0499"
 _THREE = ("ar1=walk:", "ar2=walk:", "robot=robot:")
@@ -70,7 +70,9 @@ def emulated(recipe: Recipe, every: Spacing, step: int) -> Views:
     made = keyframe_set(recipe, every)
     agents = [(a, slice(None, None, step)) for a in made.agents.values()]
     sights = [
-        Sight(k.view, a.hello.focal, a.hello.T_body_cam0, k.up) for a, some in agents for k in a.keyframes[some]
+        Sight(k.view, a.hello.focal, a.hello.T_body_cam0, k.up)
+        for a, some in agents
+        for k in a.keyframes[some]
     ]
     bodies = np.concatenate([a.T_world_body[some] for a, some in agents])
     cameras = bodies @ np.array([s.T_body_cam0 for s in sights])

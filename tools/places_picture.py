@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from places_curves import Point
 from PIL import Image  # comes with matplotlib
+from places_curves import Point
 
 from share.types import F64
 
@@ -36,9 +36,7 @@ def draw(
             for (name, both), colour in zip(curves.items(), _COLOURS, strict=False):
                 _precision(panel, both[over], here[name], colour, name)
         _words(panels)
-        figure.legend(
-            handles=panels[0].lines, loc="outside lower center", ncols=len(recalls), frameon=False
-        )
+        figure.legend(handles=panels[0].lines, loc="outside lower center", ncols=len(recalls), frameon=False)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=90)
         pyplot.close(figure)
@@ -46,7 +44,9 @@ def draw(
 
 
 def _precision(panel: Any, points: list[Point], here: Point, colour: str, name: str) -> None:
-    panel.plot([100 * p.recall for p in points], [100 * p.precision for p in points], color=colour, label=name)
+    panel.plot(
+        [100 * p.recall for p in points], [100 * p.precision for p in points], color=colour, label=name
+    )
     panel.plot(100 * here.recall, 100 * here.precision, "o", color=colour)
 
 
@@ -54,7 +54,9 @@ def _words(panels: Any) -> None:
     panels[0].set(title="query", xlabel="first k answers", ylabel="recall of true pairs [%]", xlim=(1, None))
     panels[0].axvline(8, color="black", linewidth=0.6, linestyle=":")
     for panel, over in ((panels[1], "least inliers"), (panels[2], "largest sigma")):
-        panel.set(title=f"verification, over {over}", xlabel="recall of true pairs [%]", ylabel="precision [%]")
+        panel.set(
+            title=f"verification, over {over}", xlabel="recall of true pairs [%]", ylabel="precision [%]"
+        )
         panel.set_ylim(0, 102)
     for panel in panels:
         panel.grid(alpha=0.3)

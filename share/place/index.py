@@ -139,5 +139,7 @@ class PlaceIndex:
         tables, bits = self._samples.shape
         sampled = np.unpackbits(descriptors, axis=1)[:, self._samples].astype(np.float32)
         values = sampled @ (2.0 ** np.arange(bits)).astype(np.float32)  # exact up to 24 bits
-        words: U32 = (values.astype(np.uint32) + (np.arange(tables, dtype=np.uint32) << np.uint32(bits))).ravel()
+        words: U32 = (
+            values.astype(np.uint32) + (np.arange(tables, dtype=np.uint32) << np.uint32(bits))
+        ).ravel()
         return words

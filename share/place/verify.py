@@ -112,14 +112,15 @@ def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> V
     pairs = mutual(alike.only(alike.bits <= config.max_distance_bits))
     _need(len(pairs.rows), config.min_matches, "matches")
     roughs = _both_ways(y_q[pairs.rows], y_c[pairs.cols], query.focal, candidate.focal, config, seed)
-    noises = tuple(Noise(config.sigma_px / s.focal, config.sigma_inverse_depth) for s in (query, candidate))
-    fit = _best([_fit(rough, alike, y_q, y_c, noises, config) for rough in roughs], config)
+    noises = _noise(query, config), _noise(candidate, config)
+    upright = bool(query.up.any() and candidate.up.any())
+    fits = [_fit(rough, alike, y_q, y_c, noises, config) for rough in roughs]
+    fit = _best(fits, config.rival_share if upright else 0.0, config)
     _need(fit.inliers, config.min_inliers, "inliers")
     for y, whose in ((fit.y_q, "query"), (fit.y_c, "candidate")):
         known = int(np.isfinite(y[:, 2]).sum())
         _need(known, config.min_direction_inliers, f"inliers with the {whose}'s depth")
         _check_spread(y, whose, config)
-    upright = bool(query.up.any() and candidate.up.any())
     _check_uncertainty(fit.cov, config.max_sigma_deg if upright else config.max_sigma_no_up_deg)
     if upright:
         _check_gravity(fit.T, query, candidate, config)
@@ -127,8 +128,12 @@ def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> V
     return Verified(T, cov + _floor(config), fit.matches, fit.inliers)
 
 
+def _noise(sight: Sight, config: PlaceConfig) -> Noise:
+    return Noise(config.sigma_px / sight.focal, config.sigma_inverse_depth)
+
+
 def _fit(
-    rough: F64, alike: Pairs, y_q: F64, y_c: F64, noises: tuple[Noise, ...], config: PlaceConfig
+    rough: F64, alike: Pairs, y_q: F64, y_c: F64, noises: tuple[Noise, Noise], config: PlaceConfig
 ) -> _Fit:
     """Matches again beside where `rough` moves the points, and the pose from them."""
     radius = noises[0].uv / config.sigma_px * config.guided_px
@@ -139,11 +144,11 @@ def _fit(
     return _Fit(fine.T, fine.cov, len(pairs.rows), y_q[inlier], y_c[inlier])
 
 
-def _best(fits: list[_Fit], config: PlaceConfig) -> _Fit:
-    """The one with most inliers; another pose that nearly as many agree with forbids any."""
+def _best(fits: list[_Fit], rival_share: float, config: PlaceConfig) -> _Fit:
+    """The one with most inliers; another pose with more than `rival_share` of them forbids any."""
     best, *others = sorted(fits, key=lambda fit: -fit.inliers)
     for other in others:
-        if other.inliers > config.rival_share * best.inliers and _differ(
+        if other.inliers > rival_share * best.inliers and _differ(
             best.T, other.T, _depth(best.y_q, best.y_c), config
         ):
             raise _RefusedError(f"two poses fit: {best.inliers} and {other.inliers} inliers")
