@@ -54,20 +54,15 @@ def measure(options: argparse.Namespace) -> None:
         recalls[views.name], served = recall_at(views, [v for v in rooms if v is not views], config)
         pairs = tried(views, config, options.far)
         curves[views.name] = over_both(pairs, config)
-        here[views.name] = point(pairs, config.min_inliers, sigma_limit(views, config))
+        here[views.name] = point(pairs, config.min_inliers, config.max_sigma_deg)
         row = report(views, recalls[views.name], served, pairs, here[views.name])
         print(json.dumps(row), flush=True)
     if options.picture:
         draw(options.picture, recalls, curves, here)
 
 
-def sigma_limit(views: Views, config: PlaceConfig) -> float:
-    upright = all(s.up.any() for s in views.sights)
-    return config.max_sigma_deg if upright else config.max_sigma_no_up_deg
-
-
 def over_both(pairs: Tried, config: PlaceConfig) -> tuple[list[Point], list[Point]]:
-    """Over the inliers with the sigma that is allowed where "up" is known; over sigma with the inliers."""
+    """Over the inliers with the sigma that is allowed; over sigma with the inliers."""
     inliers = [point(pairs, n, config.max_sigma_deg) for n in INLIERS]
     return inliers, [point(pairs, config.min_inliers, sigma) for sigma in SIGMAS]
 

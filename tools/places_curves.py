@@ -14,7 +14,7 @@ from share.place.verify import Verified, verify
 from share.types import F64
 
 FALSE_M, FALSE_DEG = 0.25, 5.0
-LOOSE = {"min_inliers": 8, "min_direction_inliers": 4, "max_sigma_deg": 3.0, "max_sigma_no_up_deg": 3.0}
+LOOSE = {"min_inliers": 8, "min_direction_inliers": 4, "max_sigma_deg": 3.0}
 
 
 class Tried(NamedTuple):

@@ -114,14 +114,15 @@ def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> V
     roughs = _both_ways(y_q[pairs.rows], y_c[pairs.cols], query.focal, candidate.focal, config, seed)
     noises = _noise(query, config), _noise(candidate, config)
     upright = bool(query.up.any() and candidate.up.any())
-    fits = [_fit(rough, alike, y_q, y_c, noises, config) for rough in roughs]
-    fit = _best(fits, config.rival_share if upright else 0.0, config)
+    if not upright and len(roughs) > 1:
+        raise _RefusedError("the two directions differ, and no gravity decides")
+    fit = _best([_fit(rough, alike, y_q, y_c, noises, config) for rough in roughs], config)
     _need(fit.inliers, config.min_inliers, "inliers")
     for y, whose in ((fit.y_q, "query"), (fit.y_c, "candidate")):
         known = int(np.isfinite(y[:, 2]).sum())
         _need(known, config.min_direction_inliers, f"inliers with the {whose}'s depth")
         _check_spread(y, whose, config)
-    _check_uncertainty(fit.cov, config.max_sigma_deg if upright else config.max_sigma_no_up_deg)
+    _check_uncertainty(fit.cov, config.max_sigma_deg)
     if upright:
         _check_gravity(fit.T, query, candidate, config)
     T, cov = _between_bodies(fit.T, fit.cov, query.T_body_cam0, candidate.T_body_cam0)
@@ -144,11 +145,11 @@ def _fit(
     return _Fit(fine.T, fine.cov, len(pairs.rows), y_q[inlier], y_c[inlier])
 
 
-def _best(fits: list[_Fit], rival_share: float, config: PlaceConfig) -> _Fit:
-    """The one with most inliers; another pose with more than `rival_share` of them forbids any."""
+def _best(fits: list[_Fit], config: PlaceConfig) -> _Fit:
+    """The one with most inliers; another pose with nearly as many forbids any."""
     best, *others = sorted(fits, key=lambda fit: -fit.inliers)
     for other in others:
-        if other.inliers > rival_share * best.inliers and _differ(
+        if other.inliers > config.rival_share * best.inliers and _differ(
             best.T, other.T, _depth(best.y_q, best.y_c), config
         ):
             raise _RefusedError(f"two poses fit: {best.inliers} and {other.inliers} inliers")
@@ -166,10 +167,12 @@ def _both_ways(
     """T_c_q by the query's points in the candidate's image and by the reverse: one if they agree.
 
     Of a flat scene two poses look nearly alike (Schweighofer and Pinz, PAMI 2006); the two directions
-    seldom fall for the same wrong one.
+    seldom fall for the same wrong one, if only one of them trusts the order of the matches.
     """
-    forward = _absolute_pose(y_q, y_c, focal_c, "query's", config, seed)
-    backward = se3.inverse(_absolute_pose(y_c, y_q, focal_q, "candidate's", config, seed))
+    forward = _absolute_pose(y_q, y_c, focal_c, "query's", config, seed, config.ransac_iterations, True)
+    iterations = config.reverse_iterations
+    backward = _absolute_pose(y_c, y_q, focal_q, "candidate's", config, seed, iterations, False)
+    backward = se3.inverse(backward)
     depth = _depth(y_q, y_c)
     return [forward, backward] if _differ(forward, backward, depth, config) else [forward]
 
@@ -185,14 +188,23 @@ def _differ(a: F64, b: F64, depth: float, config: PlaceConfig) -> bool:
     return metres > config.agree_depth_ratio * depth or degrees > config.agree_deg
 
 
-def _absolute_pose(source: F64, target: F64, focal: float, whose: str, config: PlaceConfig, seed: int) -> F64:
+def _absolute_pose(
+    source: F64,
+    target: F64,
+    focal: float,
+    whose: str,
+    config: PlaceConfig,
+    seed: int,
+    iterations: int,
+    best_first: bool,
+) -> F64:
     """T_target_source from 3D points of the source seen by the target."""
     known = np.isfinite(source[:, 2])
     _need(int(known.sum()), config.min_consensus, f"matches with the {whose} depth")
     y = source[known]
     points, seen = rays(y[:, :2]) / y[:, 2:], target[known, :2]
     T, inliers = absolute_pose(
-        points, seen, focal, config.ransac_px, seed, MIN_ITERATIONS, config.ransac_iterations, best_first=True
+        points, seen, focal, config.ransac_px, seed, MIN_ITERATIONS, iterations, best_first
     )
     _need(int(inliers.sum()), config.min_consensus, f"inliers of the {whose} points")
     if not np.isfinite(T).all():
