@@ -121,17 +121,20 @@ class PlaceConfig:
     max_distance_bits: int = 64  # of 256: a match of two descriptors
     min_matches: int = 20  # mutual nearest neighbours, before any geometry
     ransac_px: float = 6.0  # reprojection error of a rough pose's inlier
-    ransac_iterations: int = 300  # at most
-    min_consensus: int = 7  # inliers of a rough pose: one view's 3D points in the other's image
+    ransac_iterations: int = 300  # at most, best matches first
+    reverse_iterations: int = 900  # the same, of the reverse direction, in no order
+    min_consensus: int = 8  # inliers of a rough pose: one view's 3D points in the other's image
     guided_bits: int = 80  # a match beside where the rough pose moves the point may differ in so many bits
     guided_px: float = 15.0  # what "beside" is
+    agree_depth_ratio: float = 0.05  # poses are the same if positions differ less than this times the depth
+    agree_deg: float = 2.5  # … and rotations less than this
+    rival_share: float = 0.5  # another pose with more than this share of the inliers: refused
     sigma_px: float = 1.5  # standard deviation of a keypoint
     sigma_inverse_depth: float = 0.01  # 1/m, of a keypoint's depth: disparity noise / (focal * baseline)
     inlier_chi2: float = 11.3  # squared Mahalanobis distance of an inlier (99 %, 3 dof)
-    min_inliers: int = 16  # after refinement; fewer: refused
-    min_direction_inliers: int = 8  # of them, those that know the query's depth; and the candidate's
-    max_sigma_deg: float = 0.6  # a pose more uncertain than this is refused: false ones begin at 0.75
-    max_sigma_no_up_deg: float = 0.4  # the same, where a view does not know "up"
+    min_inliers: int = 20  # after refinement; fewer: refused
+    min_direction_inliers: int = 10  # of them, those that know the query's depth; and the candidate's
+    max_sigma_deg: float = 0.5  # a pose more uncertain than this is refused
     min_spread: float = 0.05  # narrow side (1 sigma) of the inliers, normalised coordinates
     gravity_deg: float = 6.0  # rotation must keep "up" within this, where both views know it
     floor_deg: float = 0.1  # added to what the residuals say: what inliers do not average away
@@ -139,9 +142,18 @@ class PlaceConfig:
 
     def __post_init__(self) -> None:
         _require_positive(
-            self, "candidates", "enough", "tables", "hash_bits", "ransac_px", "ransac_iterations"
+            self,
+            "candidates",
+            "enough",
+            "tables",
+            "hash_bits",
+            "ransac_px",
+            "ransac_iterations",
+            "reverse_iterations",
         )
-        _require_positive(self, "sigma_px", "sigma_inverse_depth", "inlier_chi2", "guided_px")
+        _require_positive(
+            self, "sigma_px", "sigma_inverse_depth", "inlier_chi2", "guided_px", "reverse_iterations"
+        )
         if self.tables << self.hash_bits > 1 << 22:
             raise ValueError(f"hash_bits: {self.tables} tables of {self.hash_bits} bits are too many words")
 

@@ -30,6 +30,6 @@ def beside(pairs: Pairs, T_c_q: F64, y_q: F64, y_c: F64, radius: float) -> Pairs
 
 def _apart(moved: F64, source: F64, target: F64, rows: NDArray[np.int64], cols: NDArray[np.int64]) -> F64:
     """Distance (M,) in the image; NaN where the depth is unknown, infinite where it is behind the camera."""
-    off = np.abs(moved[rows, :2] - target[cols, :2]).max(1)
+    off: F64 = np.abs(moved[rows, :2] - target[cols, :2]).max(1)
     off[np.isnan(off) & np.isfinite(source[rows, 2])] = np.inf
     return off

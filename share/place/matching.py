@@ -44,13 +44,13 @@ def near(distance: NDArray[np.uint16], max_bits: int) -> Pairs:
 
 
 def mutual(pairs: Pairs) -> Pairs:
-    """Those that are the best of their row and of their column."""
+    """Those that are the best of their row and of their column, the most alike first."""
     order = np.argsort(pairs.bits, kind="stable")
-    rows, cols, bits = (x[order] for x in pairs)
-    best = np.zeros(len(bits), np.int8)
-    for one in (rows, cols):
+    sorted_pairs = Pairs(pairs.rows[order], pairs.cols[order], pairs.bits[order])
+    best = np.zeros(len(order), np.int8)
+    for one in (sorted_pairs.rows, sorted_pairs.cols):
         best[np.unique(one, return_index=True)[1]] += 1
-    return Pairs(rows, cols, bits).only(best == 2)
+    return sorted_pairs.only(best == 2)
 
 
 def match(query: U8, candidate: U8, max_distance: int, ratio: float) -> I64:

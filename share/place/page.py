@@ -43,13 +43,15 @@ class Page:
 
     def held(self) -> I64:
         """How many entries each word has, (words,)."""
-        return np.diff(self.starts.astype(np.int64))
+        starts = self.starts.astype(np.int64)
+        return starts[1:] - starts[:-1]
 
     def keys(self, first: int) -> U32:
         """Word and slot of every living keyframe's entries in one integer, slots counted from `first`."""
         moved = (first - 1 + np.cumsum(self.alive)).astype(np.uint32)
         words = np.repeat(np.arange(len(self.starts) - 1, dtype=np.uint32), self.held())
-        return (words << _SLOT_BITS | moved[self.slots])[self.alive[self.slots]]
+        keys: U32 = words << np.uint32(_SLOT_BITS) | moved[self.slots]
+        return keys[self.alive[self.slots]]
 
 
 def written(ids: Sequence[int], views: Sequence[U32], vocabulary: int) -> Page:

@@ -63,10 +63,10 @@ def by_pose(moved: F64) -> F64:
     """dy'/dxi (N, 3, 6) for Exp(xi) T, at y' = `moved` (N, 3)."""
     u, v, rho = moved.T
     zero, one = np.zeros_like(u), np.ones_like(u)
-    rows = (-u * v, one + u * u, -v, rho, zero, -u * rho)
-    rows += (-one - v * v, u * v, u, zero, rho, -v * rho)
-    rows += (-rho * v, rho * u, zero, zero, zero, -rho * rho)
-    return np.stack(rows, axis=1).reshape(-1, 3, 6)
+    by_u = [-u * v, one + u * u, -v, rho, zero, -u * rho]
+    by_v = [-one - v * v, u * v, u, zero, rho, -v * rho]
+    by_rho = [-rho * v, rho * u, zero, zero, zero, -rho * rho]
+    return np.stack(by_u + by_v + by_rho, axis=1).reshape(-1, 3, 6)
 
 
 def by_keypoint(T: F64, y: F64, moved: F64) -> F64:

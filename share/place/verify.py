@@ -17,7 +17,7 @@ from share.geometry import se3
 from share.geometry.absolute_pose import absolute_pose
 from share.geometry.camera import rays
 from share.place.guided import beside
-from share.place.matching import hamming, mutual, near
+from share.place.matching import Pairs, hamming, mutual, near
 from share.place.refine import Noise, refine
 from share.types import F64, View
 
@@ -90,34 +90,70 @@ def verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int = 0) -
         return Refusal("degenerate geometry: the matches do not determine a pose")
 
 
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """What a rough pose becomes: T_c_q of the cameras, its covariance, and the matches beside it, of which
+    keypoints y_q, y_c (N, 3) are inliers."""
+
+    T: F64
+    cov: F64
+    matches: int
+    y_q: F64
+    y_c: F64
+
+    @property
+    def inliers(self) -> int:
+        return len(self.y_q)
+
+
 def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> Verified:
     y_q, y_c = query.y, candidate.y
     alike = near(hamming(query.view.descriptors, candidate.view.descriptors), config.guided_bits)
     pairs = mutual(alike.only(alike.bits <= config.max_distance_bits))
     _need(len(pairs.rows), config.min_matches, "matches")
-    rough = _rough(y_q[pairs.rows], y_c[pairs.cols], query, candidate, config, seed)
-    radius = config.guided_px / query.focal
-    pairs = mutual(beside(alike, rough, y_q, y_c, radius))
-    y_q, y_c = y_q[pairs.rows], y_c[pairs.cols]
-    noise_q, noise_c = _noise(query, config), _noise(candidate, config)
-    fine = refine(rough, y_q, y_c, noise_q, noise_c, config.inlier_chi2)
-    inlier = fine.d2 < config.inlier_chi2
+    roughs = _both_ways(y_q[pairs.rows], y_c[pairs.cols], query.focal, candidate.focal, config, seed)
+    noises = _noise(query, config), _noise(candidate, config)
     upright = bool(query.up.any() and candidate.up.any())
-    _need(int(inlier.sum()), config.min_inliers, "inliers")
-    for y, whose in ((y_q[inlier], "query"), (y_c[inlier], "candidate")):
-        _need(
-            int(np.isfinite(y[:, 2]).sum()), config.min_direction_inliers, f"inliers with the {whose}'s depth"
-        )
+    if not upright and len(roughs) > 1:
+        raise _RefusedError("the two directions differ, and no gravity decides")
+    fit = _best([_fit(rough, alike, y_q, y_c, noises, config) for rough in roughs], config)
+    _need(fit.inliers, config.min_inliers, "inliers")
+    for y, whose in ((fit.y_q, "query"), (fit.y_c, "candidate")):
+        known = int(np.isfinite(y[:, 2]).sum())
+        _need(known, config.min_direction_inliers, f"inliers with the {whose}'s depth")
         _check_spread(y, whose, config)
-    _check_uncertainty(fine.cov, config.max_sigma_deg if upright else config.max_sigma_no_up_deg)
+    _check_uncertainty(fit.cov, config.max_sigma_deg)
     if upright:
-        _check_gravity(fine.T, query, candidate, config)
-    T, cov = _between_bodies(fine.T, fine.cov, query.T_body_cam0, candidate.T_body_cam0)
-    return Verified(T, cov + _floor(config), len(pairs.rows), int(inlier.sum()))
+        _check_gravity(fit.T, query, candidate, config)
+    T, cov = _between_bodies(fit.T, fit.cov, query.T_body_cam0, candidate.T_body_cam0)
+    return Verified(T, cov + _floor(config), fit.matches, fit.inliers)
 
 
 def _noise(sight: Sight, config: PlaceConfig) -> Noise:
     return Noise(config.sigma_px / sight.focal, config.sigma_inverse_depth)
+
+
+def _fit(
+    rough: F64, alike: Pairs, y_q: F64, y_c: F64, noises: tuple[Noise, Noise], config: PlaceConfig
+) -> _Fit:
+    """Matches again beside where `rough` moves the points, and the pose from them."""
+    radius = noises[0].uv / config.sigma_px * config.guided_px
+    pairs = mutual(beside(alike, rough, y_q, y_c, radius))
+    y_q, y_c = y_q[pairs.rows], y_c[pairs.cols]
+    fine = refine(rough, y_q, y_c, *noises, config.inlier_chi2)
+    inlier = fine.d2 < config.inlier_chi2
+    return _Fit(fine.T, fine.cov, len(pairs.rows), y_q[inlier], y_c[inlier])
+
+
+def _best(fits: list[_Fit], config: PlaceConfig) -> _Fit:
+    """The one with most inliers; another pose with nearly as many forbids any."""
+    best, *others = sorted(fits, key=lambda fit: -fit.inliers)
+    for other in others:
+        if other.inliers > config.rival_share * best.inliers and _differ(
+            best.T, other.T, _depth(best.y_q, best.y_c), config
+        ):
+            raise _RefusedError(f"two poses fit: {best.inliers} and {other.inliers} inliers")
+    return best
 
 
 def _need(have: int, want: int, what: str) -> None:
@@ -125,21 +161,50 @@ def _need(have: int, want: int, what: str) -> None:
         raise _RefusedError(f"{have} {what} of {want} needed")
 
 
-def _rough(y_q: F64, y_c: F64, query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> F64:
-    """T_c_q by the points of the view that knows more depths, in the other's image."""
-    if np.isfinite(y_q[:, 2]).sum() >= np.isfinite(y_c[:, 2]).sum():
-        return _absolute_pose(y_q, y_c, candidate.focal, "query's", config, seed)
-    return se3.inverse(_absolute_pose(y_c, y_q, query.focal, "candidate's", config, seed))
+def _both_ways(
+    y_q: F64, y_c: F64, focal_q: float, focal_c: float, config: PlaceConfig, seed: int
+) -> list[F64]:
+    """T_c_q by the query's points in the candidate's image and by the reverse: one if they agree.
+
+    Of a flat scene two poses look nearly alike (Schweighofer and Pinz, PAMI 2006); the two directions
+    seldom fall for the same wrong one, if only one of them trusts the order of the matches.
+    """
+    forward = _absolute_pose(y_q, y_c, focal_c, "query's", config, seed, config.ransac_iterations, True)
+    iterations = config.reverse_iterations
+    backward = _absolute_pose(y_c, y_q, focal_q, "candidate's", config, seed, iterations, False)
+    backward = se3.inverse(backward)
+    depth = _depth(y_q, y_c)
+    return [forward, backward] if _differ(forward, backward, depth, config) else [forward]
 
 
-def _absolute_pose(source: F64, target: F64, focal: float, whose: str, config: PlaceConfig, seed: int) -> F64:
+def _depth(y_q: F64, y_c: F64) -> float:
+    """Median, m."""
+    return float(np.nanmedian(1 / np.concatenate([y_q[:, 2], y_c[:, 2]])))
+
+
+def _differ(a: F64, b: F64, depth: float, config: PlaceConfig) -> bool:
+    apart = se3.inverse(a) @ b
+    metres, degrees = float(np.linalg.norm(apart[:3, 3])), float(np.degrees(se3.angle(apart)))
+    return metres > config.agree_depth_ratio * depth or degrees > config.agree_deg
+
+
+def _absolute_pose(
+    source: F64,
+    target: F64,
+    focal: float,
+    whose: str,
+    config: PlaceConfig,
+    seed: int,
+    iterations: int,
+    best_first: bool,
+) -> F64:
     """T_target_source from 3D points of the source seen by the target."""
     known = np.isfinite(source[:, 2])
     _need(int(known.sum()), config.min_consensus, f"matches with the {whose} depth")
     y = source[known]
     points, seen = rays(y[:, :2]) / y[:, 2:], target[known, :2]
     T, inliers = absolute_pose(
-        points, seen, focal, config.ransac_px, seed, MIN_ITERATIONS, config.ransac_iterations, best_first=True
+        points, seen, focal, config.ransac_px, seed, MIN_ITERATIONS, iterations, best_first
     )
     _need(int(inliers.sum()), config.min_consensus, f"inliers of the {whose} points")
     if not np.isfinite(T).all():

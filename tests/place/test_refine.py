@@ -31,7 +31,9 @@ def test_jacobians_against_differences() -> None:
     y = np.column_stack([rng.uniform(-0.5, 0.5, (20, 2)), rng.uniform(0.2, 0.6, 20)])
     moved = move(T, y)
     assert np.isfinite(moved).all()
-    assert by_pose(moved) == pytest.approx(numerical(lambda xi: move(se3.exp(xi) @ T, y), np.zeros(6)), abs=1e-6)
+    assert by_pose(moved) == pytest.approx(
+        numerical(lambda xi: move(se3.exp(xi) @ T, y), np.zeros(6)), abs=1e-6
+    )
     by_y = by_keypoint(T, y, moved)
     for i in range(20):
         expected = numerical(lambda v: move(T, v[None])[0], y[i])

@@ -1,0 +1,135 @@
+"""Fewer keyframes, the same room."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from atlas_sim import Walker, error, loop, near_loops
+
+from share.config import GraphConfig, MergeConfig
+from share.geometry import se3
+from share.graph.solver import Solver
+from share.merge.atlas import Atlas
+from share.merge.chart import Chart
+from share.merge.join import Key
+from share.merge.thinning import bonds, redundant, take_out
+from share.types import F64
+
+CONFIG = MergeConfig()
+
+
+def chart_of(*walkers: Walker) -> Chart:
+    chart = Chart()
+    for walker in walkers:
+        for keyframe in walker.keyframes:
+            chart.add(walker.name, keyframe, keyframe.cov)
+    return chart
+
+
+def at(x: float, yaw: float = 0.0) -> F64:
+    return se3.exp(np.array([0, 0, yaw, 0, 0, 0])) + np.array([[0, 0, 0, x]] + [[0.0] * 4] * 3)
+
+
+def test_of_what_is_alike_one_stays() -> None:
+    poses = np.array([at(0), at(0.05), at(1), at(2), at(2.01), at(3)])
+    assert sorted(redundant(poses, range(6), 2, 0.7, 0.5)) in ([0, 4], [1, 4], [0, 3], [1, 3])
+    assert 4 in redundant(poses, range(6), 1, 0.7, 0.5) or 3 in redundant(poses, range(6), 1, 0.7, 0.5)
+
+
+def test_turned_elsewhere_is_not_alike() -> None:
+    poses = np.array([at(0), at(0.01, yaw=2.0), at(0.3), at(0.6)])
+    assert redundant(poses, range(4), 1, 0.7, 0.5)[0] != 1
+
+
+def test_only_what_may_go_goes() -> None:
+    poses = np.array([at(0.001 * k) for k in range(6)])
+    assert sorted(redundant(poses, [1, 4], 5, 0.7, 0.5)) == [1, 4]
+
+
+def test_a_keyframe_in_the_middle_leaves_its_neighbours_tied() -> None:
+    ann = Walker("ann", 1)
+    chart = chart_of(ann)
+    out = take_out(chart, 30, bonds(chart), most_loops=10)
+    assert out.key == Key("ann", 30)
+    assert out.link is not None
+    assert (out.link.key, out.link.reference) == (Key("ann", 31), Key("ann", 29))
+    assert out.link.T_ref_body == pytest.approx(se3.inverse(ann.T_odom_body[29]) @ ann.T_odom_body[31])
+    assert len(chart.ties.edges) == 58
+    (known,) = chart.between(29, [31])
+    twice = se3.compose_cov(ann.keyframes[31].T_ref_body, ann.keyframes[30].cov, ann.keyframes[31].cov)
+    assert known.cov == pytest.approx(twice)
+
+
+def test_without_its_first_a_stretch_begins_with_the_next() -> None:
+    ann = Walker("ann", 1)
+    chart = chart_of(ann)
+    out = take_out(chart, 0, bonds(chart), most_loops=10)
+    assert out.link is not None
+    assert out.link.reference is None
+    assert out.link.T_ref_body == pytest.approx(ann.T_odom_body[1], abs=1e-9)
+
+
+def test_loops_move_to_the_neighbour() -> None:
+    ann, bob = Walker("ann", 1), Walker("bob", 2, phase=0.7)
+    chart = chart_of(ann, bob)
+    chart.tie(loop(ann, 20, bob, 10, np.random.default_rng(0)))
+    out = take_out(chart, 20, bonds(chart), most_loops=10)
+    (moved,) = out.moved
+    assert moved.a in (Key("ann", 19), Key("ann", 21))
+    assert moved.b == Key("bob", 10)
+    wanted = se3.inverse(ann.truth[moved.a.id]) @ bob.truth[10]
+    assert np.abs(moved.T_a_b - wanted).max() < 0.1
+    assert list(chart.ties.loops.values()) == [moved]
+
+
+def test_the_last_loop_between_two_stretches_stays_whatever_the_limit() -> None:
+    ann, bob = Walker("ann", 1), Walker("bob", 2, phase=0.7)
+    chart = chart_of(ann, bob)
+    chart.tie(loop(ann, 20, bob, 10, np.random.default_rng(0)))
+    out = take_out(chart, 20, bonds(chart), most_loops=0)
+    assert len(out.moved) == 1
+    chart.find_maps()
+    assert chart.founder == [0, 0]
+
+
+def settle(atlas: Atlas, solver: Solver) -> None:
+    while atlas.due():
+        job = atlas.snapshot(atlas.due()[0])
+        if job.anew:
+            solver.clear()
+        solver.update(job.change)
+        atlas.apply(job, solver.solve(job.anchor, job.last))
+
+
+def test_a_thinned_map_is_solved_as_well_and_goes_on() -> None:
+    walkers = Walker("ann", 1, n=200), Walker("bob", 2, n=200, phase=0.4)
+    rng, atlas, solver = np.random.default_rng(0), Atlas(CONFIG), Solver(GraphConfig())
+    for k in range(150):
+        for w in walkers:
+            atlas.add_keyframe(w.name, w.keyframes[k])
+    loops = near_loops(*walkers, rng, every=3)
+    for x in loops:
+        if max(x.a.id, x.b.id) < 150:
+            atlas.propose(x)
+    settle(atlas, solver)
+    assert len(atlas.sizes()) >= 1
+    before = {name: atlas.pose(Key(name, 149)) for name in ("ann", "bob")}
+    gone = {out.key for out in atlas.thin(120)}
+    assert len(atlas) == 120
+    assert {Key("ann", 0), Key("ann", 149), Key("bob", 149)}.isdisjoint(gone)
+    assert atlas.sizes() == {"ann/0": 120}
+    for name, T in before.items():
+        assert np.array_equal(atlas.pose(Key(name, 149)), T)
+    for k in range(150, 200):
+        for w in walkers:
+            atlas.add_keyframe(w.name, w.keyframes[k])
+    for x in loops:
+        if not {x.a, x.b} & gone and max(x.a.id, x.b.id) >= 150:
+            atlas.propose(x)
+    settle(atlas, solver)
+    left = [(w, k) for w in walkers for k in range(200) if Key(w.name, k) not in gone]
+    poses = np.array([atlas.pose(Key(w.name, k)) for w, k in left])
+    assert error(poses, np.array([w.truth[k] for w, k in left])) < 0.08
+    for key in gone:
+        with pytest.raises(ValueError, match="is not known"):
+            atlas.pose(key)
