@@ -219,7 +219,6 @@ class GraphConfig:
     cauchy: float = 3.0  # whitened residual (6 dof: 2.4 is usual) at which a loop begins to lose weight
     max_iterations: int = 30  # of Levenberg-Marquardt; the next solution goes on where one stopped
     relative_tolerance: float = 1e-6  # of the cost, between two iterations
-    anchor_sigma: float = 1e-4  # rad and m; holds the gauge, removed again after solving
     step_tolerance: float = 3e-3  # rad and m; solved once no pose is moved by more
     inner_tolerance: float = 3e-2  # of the residual of a step's equations, relative
     covariance_edges: int = 250  # the surest, by which covariances are told; more: tighter and slower

@@ -27,12 +27,12 @@ import numpy as np  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "graph"))
 
+from gtsam_graph import solve  # noqa: E402
 from rooms import Room, simulate  # noqa: E402
 
 from share.config import GraphConfig  # noqa: E402
 from share.graph.change import Change, Solution  # noqa: E402
 from share.graph.path import Roads  # noqa: E402
-from share.graph.posegraph import solve  # noqa: E402
 from share.graph.solver import Solver  # noqa: E402
 from share.types import F64  # noqa: E402
 

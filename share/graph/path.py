@@ -6,7 +6,7 @@ factorisation. It is what a new loop has to agree with.
 
 from __future__ import annotations
 
-import heapq
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -23,7 +23,7 @@ class Roads:
     """The edges of a pose graph that grows and is thinned, by the poses that they touch."""
 
     def __init__(self) -> None:
-        self._touching: dict[int, list[Edge]] = {}
+        self._touching: Counter[int] = Counter()  # edges, by the number of a pose
         self._places: dict[int, int] = {}  # of the poses in the search, by number
         self._free: list[int] = []
         self._rows: dict[Edge, int] = {}
@@ -36,7 +36,7 @@ class Roads:
         if edge in self._rows:
             raise ValueError(f"edge {edge.a} - {edge.b} is here already")
         for end in (edge.a, edge.b):
-            self._touching.setdefault(end, []).append(edge)
+            self._touching[end] += 1
             if end not in self._places:
                 self._places[end] = self._free.pop() if self._free else len(self._places)
         row = self._rows[edge] = len(self._edges)
@@ -54,7 +54,7 @@ class Roads:
             self._edges[row], self._rows[last] = last, row
             self._table[row] = self._table[len(self._edges)]
         for end in (edge.a, edge.b):
-            self._touching[end].remove(edge)
+            self._touching[end] -= 1
             if not self._touching[end]:
                 del self._touching[end]
                 self._free.append(self._places.pop(end))
@@ -73,26 +73,6 @@ class Roads:
             None if path is None else _seen_from_goal(steps[np.searchsorted(met, path)], start, goal, poses)
             for goal, path in zip(goals, paths, strict=True)
         ]
-
-    def surest(self, start: int, goal: int) -> list[Edge] | None:
-        """The path of least summed trace(cov) as the edges to walk, None if there is none (Dijkstra 1959)."""
-        came: dict[int, tuple[int, Edge]] = {}
-        done: set[int] = set()
-        heap: list[tuple[float, int, int, Edge | None]] = [(0.0, start, start, None)]
-        while heap:
-            cost, here, previous, edge = heapq.heappop(heap)
-            if here in done:
-                continue
-            done.add(here)
-            if edge is not None:
-                came[here] = (previous, edge)
-            if here == goal:
-                return _walk_back(came, start, goal)
-            for road in self._touching.get(here, ()):
-                there = road.b if road.a == here else road.a
-                if there not in done:
-                    heapq.heappush(heap, (cost + road.spread, there, here, road))
-        return None
 
     def _search(self) -> Ways:
         if self._ways is None:
@@ -128,24 +108,3 @@ class Roads:
 def _seen_from_goal(steps: F64, start: int, goal: int, poses: Placed) -> F64:
     """The sum of covariances (K, 6, 6) that perturb `start`, as one that perturbs `goal`."""
     return se3.inverse_cov(se3.inverse(poses[goal]) @ poses[start], steps.sum(0))
-
-
-def covariance_between(path: Sequence[Edge], start: int, poses: Placed) -> F64:
-    """Covariance (6, 6) of T_start_goal along `path`, each step laid along the current `poses`."""
-    cov = np.zeros((6, 6))
-    here = start
-    for edge in path:
-        there, step = (
-            (edge.b, edge.cov) if edge.a == here else (edge.a, se3.inverse_cov(edge.T_a_b, edge.cov))
-        )
-        cov = se3.compose_cov(se3.inverse(poses[here]) @ poses[there], cov, step)
-        here = there
-    return cov
-
-
-def _walk_back(came: dict[int, tuple[int, Edge]], start: int, goal: int) -> list[Edge]:
-    path = []
-    while goal != start:
-        goal, edge = came[goal]
-        path.append(edge)
-    return path[::-1]

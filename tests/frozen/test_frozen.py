@@ -94,7 +94,7 @@ def test_an_edge_listens_and_ends_when_asked(program):
 
 
 def test_the_whole_system_and_the_same_digits_as_from_source(share, tmp_path):
-    """Spawned workers, child processes, MCAP, poselib, gtsam, filterpy and matplotlib all work frozen."""
+    """Spawned workers, child processes, MCAP, poselib, SciPy, filterpy and matplotlib all work frozen."""
     said = share("demo", "--seconds", 20, "--out", tmp_path / "demo").stdout
     assert "3 of 3 agents in one map" in said
     assert (tmp_path / "demo" / "trajectories.png").stat().st_size > 10_000
@@ -108,6 +108,15 @@ def test_the_whole_system_and_the_same_digits_as_from_source(share, tmp_path):
 def test_nothing_is_in_it_that_no_command_needs(program):
     inside = program.parent / "_internal"
     names = {path.name for path in inside.iterdir()}
-    assert not names & {"torch", "tkinter", "_tkinter", "IPython", "pandas", "onnxruntime", "pyrealsense2"}
+    assert not names & {
+        "gtsam",
+        "torch",
+        "tkinter",
+        "_tkinter",
+        "IPython",
+        "pandas",
+        "onnxruntime",
+        "pyrealsense2",
+    }
     sizes = (path.lstat().st_size for path in inside.rglob("*") if not path.is_dir())
     assert sum(sizes) < 530 * MB  # 45 of them to bake the light of rooms

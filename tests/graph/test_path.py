@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 from rooms import LOOP, Room, simulate
+from walking import covariance_between, surest
 
-from share.graph.path import Roads, covariance_between
+from share.graph.path import Roads
 from share.graph.posegraph import Edge
 
 
@@ -16,10 +17,10 @@ def roads_of(room: Room, seed: int) -> tuple[Roads, list[Edge]]:
     return roads, edges
 
 
-def agree(roads: Roads, room: Room, start: int, goals: list[int]) -> None:
+def agree(roads: Roads, edges: list[Edge], room: Room, start: int, goals: list[int]) -> None:
     """`known_from` against the path that is walked edge by edge."""
     for goal, cov in zip(goals, roads.known_from(start, goals, room.guess), strict=True):
-        path = roads.surest(start, goal)
+        path = surest(edges, start, goal)
         assert (path is None) == (cov is None)
         if path is not None and cov is not None:
             walked = covariance_between(path, start, room.guess)
@@ -29,10 +30,10 @@ def agree(roads: Roads, room: Room, start: int, goals: list[int]) -> None:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_one_search_tells_what_walking_each_path_tells(seed: int) -> None:
     room = simulate(300, 3, seed)
-    roads, _ = roads_of(room, seed)
+    roads, edges = roads_of(room, seed)
     rng = np.random.default_rng(seed)
     for start in (0, 7, 299):
-        agree(roads, room, start, [*rng.choice(300, 8).tolist(), start])
+        agree(roads, edges, room, start, [*rng.choice(300, 8).tolist(), start])
 
 
 def test_edges_come_and_go() -> None:
@@ -49,7 +50,7 @@ def test_edges_come_and_go() -> None:
             roads.add(back)
             edges.append(back)
         if k % 5 == 0:
-            agree(roads, room, 199 - k, rng.choice(200, 6).tolist())
+            agree(roads, edges, room, 199 - k, rng.choice(200, 6).tolist())
     with pytest.raises(KeyError):
         roads.remove(out[0])
     with pytest.raises(ValueError, match="is here already"):

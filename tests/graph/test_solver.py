@@ -4,14 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drifting import loops_of_a_room, rms
+from gtsam_graph import solve
 from rooms import LOOP, Room, false_loops, simulate
-from test_posegraph import loops_of_a_room, rms
 
 from share.config import GraphConfig
 from share.geometry import se3
 from share.graph.change import Change
 from share.graph.linear import Edges, jacobians, residuals
-from share.graph.posegraph import Edge, solve
+from share.graph.posegraph import Edge
 from share.graph.solver import Solver
 from share.types import F64
 
@@ -266,3 +267,24 @@ def test_a_change_pickles_quickly() -> None:
         times.append(time.process_time() - start)
     assert np.array_equal(again.covs, whole.covs) and not again.covs.flags.writeable
     assert np.median(times) < 0.003
+
+
+def test_a_straight_chain_with_one_loop_in_closed_form() -> None:
+    """Along x only: n equal odometry steps and one loop over all of them. The gap is shared out in
+    proportion to variance: every step gets gap * s2 / (n s2 + l2)."""
+    n, s2, l2, gap = 10, 0.01**2, 0.02**2, 0.05
+    step = se3.exp(np.array([0, 0, 0, 1.0, 0, 0]))
+    edges = [(i, Edge(i, i + 1, step, s2 * np.eye(6)), False) for i in range(n)]
+    loop = Edge(0, n, se3.exp(np.array([0, 0, 0, n + gap, 0, 0])), l2 * np.eye(6))
+    start = {i: se3.exp(np.array([0, 0, 0, float(i), 0, 0])) for i in range(n + 1)}
+    solver = Solver(replace(EXACT, cauchy=1e6))
+    solver.update(Change.of(start, [*edges, (n, loop, True)]))
+    solved = solver.solve(0, [n])
+    assert solved.poses[:, 0, 3] == pytest.approx(np.arange(n + 1) * (1 + gap * s2 / (n * s2 + l2)), abs=1e-7)
+    assert solved.covariances[0][3, 3] == pytest.approx(1 / (1 / (n * s2) + 1 / l2), rel=1e-3)
+    assert solved.loop_chi2[0] == pytest.approx((gap * l2 / (n * s2 + l2)) ** 2 / l2, rel=1e-4)
+
+
+def test_an_edge_joins_two_poses() -> None:
+    with pytest.raises(ValueError, match="does not join two poses"):
+        Edge(1, 1, np.eye(4), LOOP)
