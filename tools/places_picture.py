@@ -36,7 +36,12 @@ def draw(
             for (name, both), colour in zip(curves.items(), _COLOURS, strict=False):
                 _precision(panel, both[over], here[name], colour, name)
         _words(panels)
-        figure.legend(handles=panels[0].lines, loc="outside lower center", ncols=len(recalls), frameon=False)
+        figure.legend(
+            handles=panels[0].lines[: len(recalls)],
+            loc="outside lower center",
+            ncols=len(recalls),
+            frameon=False,
+        )
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=90)
         pyplot.close(figure)
