@@ -66,6 +66,14 @@ class _Mapping:
         self._ended = False
 
     def go(self) -> None:
+        try:
+            self._work()
+        finally:  # whatever ended us: a process does not end while one of its own goes on
+            self._solver.close()
+        self._answer(Found(tuple(self._findings), (*self._mapper.take_changes(), self._mapper.poses())))
+        self._answer(Mapped(self._mapper.report()))
+
+    def _work(self) -> None:
         look = None
         while not self._ended:
             for message in self._arrived(wait=look is None):
@@ -75,9 +83,6 @@ class _Mapping:
             if look is not None:
                 self._findings += self._mapper.done(look, *_timed(look.run))
             self._tell()
-        self._solver.close()
-        self._answer(Found(tuple(self._findings), (*self._mapper.take_changes(), self._mapper.poses())))
-        self._answer(Mapped(self._mapper.report()))
 
     def _arrived(self, wait: bool) -> Iterator[Any]:
         """What is in the inbox; if `wait`, at least one message, unless none comes for a while."""
