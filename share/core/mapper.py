@@ -89,7 +89,8 @@ class Mapper:
         numbers = self._atlas.restore(agents, placed, kept.loops, poses)
         for number, found in zip(numbers, kept.keyframes, strict=True):
             self._see(number, found.key, found.keyframe)
-        return [self._founding(agent) for agent in dict.fromkeys(agents) if agent in self._hellos]
+        there = [agent for agent in self._hellos if self._atlas.T_map_odom(agent) is not None]
+        return [self._founding(agent) for agent in there]
 
     def _see(self, number: int, agent: str, keyframe: Keyframe) -> None:
         hello = self._hellos[agent]

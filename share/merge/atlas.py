@@ -85,9 +85,8 @@ class Atlas:
     def T_map_odom(self, agent: str) -> F64 | None:
         """Where the agent's present odometry lies in its map; None before its first keyframe."""
         stretch = self._chart.trails.current(agent)
-        if stretch is None:
-            return None
-        return self._chart.placement(self._chart.trails.stretches[stretch].nodes[-1])
+        nodes = [] if stretch is None else self._chart.trails.stretches[stretch].nodes
+        return self._chart.placement(nodes[-1]) if nodes else None
 
     def key(self, number: int) -> Key:
         """Of the keyframe with this number."""

@@ -1,0 +1,105 @@
+"""A mapper that is given what an earlier life kept has the same maps, and goes on in them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from edge_sim import Person, walls
+
+from share.config import Config
+from share.core.keeping import Change, KeepKeyframe, KeepRun
+from share.core.mapper import Mapper
+from share.geometry import se3
+from share.graph.solver import Solver
+from share.io.map_store import MapStore
+from share.types import Keyframe
+
+ROOM = walls(1)
+STEPS = 36
+
+
+class Life:
+    """A mapper, its solver, and what it wanted kept."""
+
+    def __init__(self, config: Config) -> None:
+        self.mapper, self.solver = Mapper(config), Solver(config.graph)
+        self.changes: list[Change] = []
+
+    def join(self, person: Person) -> None:
+        self.mapper.join(person.name, person.hello)
+        self.changes.append(KeepRun(person.name, person.hello))
+
+    def step(self, person: Person) -> None:
+        """One keyframe on, and all that follows from it."""
+        before = person.T_odom_body[-1] if person.T_odom_body else None
+        T, view = person.step()
+        id = len(person.T_odom_body) - 1
+        T_ref_body = T if before is None else se3.inverse(before) @ T
+        keyframe = Keyframe(id, id - 1, id * 10**8, T_ref_body, 4e-6 * np.eye(6), np.zeros(3), view)
+        self.changes.append(KeepKeyframe(person.name, keyframe, T))
+        self.mapper.add(person.name, keyframe)
+        self.work()
+
+    def work(self) -> None:
+        while (look := self.mapper.next_look()) is not None:
+            self.mapper.done(look, look.run(), 1.0)
+        while (solve := self.mapper.next_solve()) is not None:
+            self.mapper.done(solve, solve.run(self.solver), 1.0)
+        self.changes += self.mapper.take_changes()
+
+
+def walked(config: Config) -> tuple[Life, list[Person]]:
+    people = [Person("ann", ROOM, 0.0, 11), Person("bob", ROOM, 0.3, 22)]
+    life = Life(config)
+    for person in people:
+        life.join(person)
+    for _ in range(STEPS):
+        for person in people:
+            life.step(person)
+    return life, people
+
+
+def again(life: Life, path: Path, config: Config) -> Life:
+    with MapStore.open(path) as store:
+        store.write([*life.changes, life.mapper.poses()])
+    with MapStore.open(path) as store:
+        kept = store.load()
+    second = Life(config)
+    findings = second.mapper.restore(kept)
+    assert [finding.agent for finding in findings] == ["ann", "bob"]
+    return second
+
+
+@pytest.mark.parametrize("most", [2000, 60])
+def test_it_has_the_same_maps_and_goes_on(tmp_path: Path, most: int) -> None:
+    config = Config()
+    config = replace(config, edge=replace(config.edge, max_keyframes=most))
+    first, people = walked(config)
+    second = again(first, tmp_path / "room.sqlite", config)
+    report, before = second.mapper.report(), first.mapper.report()
+    assert report["maps"] == before["maps"]
+    assert report["loops"]["in_map"] == before["loops"]["in_map"] > 0
+    assert sum(report["maps"].values()) <= 1.05 * most
+    there, then = second.mapper.poses(), first.mapper.poses()
+    assert (there.keys, there.maps) == (then.keys, then.maps)
+    assert np.array_equal(there.T_map_body, then.T_map_body)
+    second.work()  # everything is solved anew, from where it was
+    assert np.abs(second.mapper.poses().T_map_body - then.T_map_body).max() < 0.02
+    for _ in range(6):
+        for person in people:
+            second.step(person)
+    assert len(second.mapper.report()["maps"]) == len(before["maps"])
+    assert second.mapper.report()["loops"]["accepted"] > 0
+
+
+def test_a_run_of_which_nothing_is_left_is_no_obstacle(tmp_path: Path) -> None:
+    config = Config()
+    life = Life(config)
+    life.join(Person("ann", ROOM, 0.0, 11))
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        store.write(life.changes)
+        kept = store.load()
+    assert Mapper(config).restore(kept) == []
