@@ -152,6 +152,11 @@ class Mapper:
         """The solver knows nothing any more."""
         self._atlas.solver_lost()
 
+    @property
+    def taken_out(self) -> int:
+        """Keyframes, since the beginning."""
+        return self._counts["taken_out"]
+
     def take_changes(self) -> tuple[Change, ...]:
         """What has to be kept since the last call."""
         taken, self._changes = tuple(self._changes), []
