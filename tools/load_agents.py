@@ -1,6 +1,8 @@
 """N agents in one cheap process: what `share.core.agent` would say, when it would say it, in ready bytes.
 
-    python tools/load_agents.py tcp://H:P N SECONDS COUNTED_FROM  (JSON on stdout; COUNTED on stderr at that time)
+    python tools/load_agents.py tcp://H:P N SECONDS COUNTED_FROM
+
+On stderr it says "counted" and "over" when that time has come, waits for a line, and prints JSON.
 
 Of each agent 30 poses, 3 keyframes with their evaluations, and 2 pings a second. It reads all that comes.
 """
@@ -11,7 +13,7 @@ import heapq
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import Any
 
@@ -33,7 +35,6 @@ from share.wire.messages import Bye, Evaluation, Ping, PoseUpdate, peer_id  # no
 
 _POSE_S, _PING_S, _KEYFRAME_S = 1 / 30, 0.5, 1 / RATE_HZ
 _COMING_S = 3.0  # within which they come in, one after the other
-_WELCOME, _REFUSED, _ACK, _CORRECTION, _PONG = 16, 17, 18, 19, 21  # docs/wire.md
 _QUEUE = 128
 
 Frames = list[bytes]
@@ -42,7 +43,9 @@ Frames = list[bytes]
 class _Agent:
     """One of them: what it says, and when what it hears comes."""
 
-    def __init__(self, context: zmq.Context[Any], address: str, made: KeyframeSet, index: int, count: int):
+    def __init__(
+        self, context: zmq.Context[Any], address: str, made: KeyframeSet, index: int, count: int
+    ) -> None:
         walker = Walker(made, index)
         self.hello = _bytes(walker.hello)
         self.keyframes = [_bytes(k) for k in islice(walker.keyframes(), count)]
@@ -85,16 +88,16 @@ class _Agent:
             except zmq.Again:
                 return
             _, code, scalars, _ = msgspec.msgpack.decode(frames[0])
-            match code:
-                case 16:
+            match code:  # docs/wire.md
+                case 16:  # Welcome
                     self.welcome = True
-                case 17:
+                case 17:  # Refused
                     raise SystemExit(f"load_agents: refused: {scalars[0]}")
-                case 18:
+                case 18:  # Ack
                     self.acked_s += [now] * (scalars[0] - len(self.acked_s))
-                case 19:
+                case 19:  # Correction
                     self.corrected_s.append((now, scalars[2]))
-                case 21:
+                case 21:  # Pong
                     self.pongs.append((scalars[1] * 1e-9, now - scalars[1] * 1e-9))
 
 
@@ -104,8 +107,6 @@ def main() -> None:
     made = room()
     count = int(seconds * RATE_HZ) + 2
     everybody = [_Agent(context, address, made, index, count) for index in range(int(agents))]
-    for name in ("ready", "counted"):
-        print(name, file=sys.stderr, flush=True) if name == "ready" else None
     began = time.monotonic()
     cpu = _talk(everybody, began, seconds, counted_from)
     print(json.dumps(_figures(everybody, began + counted_from, began + seconds) | {"generator_cpu": cpu}))
@@ -160,7 +161,10 @@ def _act(agent: _Agent, what: str, now: float) -> list[tuple[float, str]]:
 
 def _figures(everybody: list[_Agent], since: float, until: float) -> dict[str, Any]:
     """Latencies in ms, of keyframes and pings sent in the time that counts; its last second does not."""
-    acks, corrections, halves, pongs = [], [], ([], []), []
+    acks: list[float] = []
+    corrections: list[float] = []
+    pongs: list[float] = []
+    halves: tuple[list[float], list[float]] = ([], [])
     sent = answered = received = 0
     for agent in everybody:
         acks += [1e3 * (b - a) for a, b in zip(agent.sent_s, agent.acked_s, strict=False) if a >= since]
@@ -187,7 +191,7 @@ def _figures(everybody: list[_Agent], since: float, until: float) -> dict[str, A
     }
 
 
-def _until_any(everybody: list[_Agent], since: float, until: float) -> Any:
+def _until_any(everybody: list[_Agent], since: float, until: float) -> Iterator[float]:
     """From a keyframe's sending to the first correction that answers it or a later one."""
     for agent in everybody:
         answers = sorted((at, k) for at, k in agent.corrected_s if k >= 0)
