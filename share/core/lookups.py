@@ -6,6 +6,7 @@ from collections import Counter, deque
 
 from share.types import AgentKind
 
+_FRESH = 4  # so many newest keyframes are looked up before others: who waits too long is answered too late
 _WEIGHT = {AgentKind.AR: 4, AgentKind.ROBOT: 1}  # a robot waits four times as many turns as a headset
 
 
@@ -36,11 +37,12 @@ class Lookups:
             self.skipped[longest] += 1
 
     def next(self) -> int | None:
-        """The newest keyframe of the agent that has waited longest for its turn; None without any."""
+        """Of the newest keyframes, that of the agent that has waited longest for its turn; None without any."""
         if not self._waiting:
             return None
         self._turn += 1
-        agent = max(self._waiting, key=lambda name: (self._turn - self._served[name]) * self._weight[name])
+        newest = sorted(self._waiting, key=lambda name: self._waiting[name][-1])[-_FRESH:]
+        agent = max(newest, key=lambda name: (self._turn - self._served[name]) * self._weight[name])
         self._served[agent] = self._turn
         return self._take(agent, oldest=False)
 

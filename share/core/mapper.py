@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from share.config import Config
+from share.core.concern import Concern
 from share.core.finding import Finding
 from share.core.keeping import Change, DropLoop, KeepLink, KeepLoop, KeepPoses, Kept, Retire, edge_to
 from share.core.lookups import Lookups
@@ -52,6 +53,7 @@ class Mapper:
         self._hellos: dict[str, Hello] = {}
         self._sights: dict[int, Sight] = {}  # by the number of a keyframe in atlas and index
         self._lookups = Lookups(config.edge.max_waiting)
+        self._concern = Concern()
         self._verify: Verify | None = None
         self._looking = self._solving = False
         self._changes: list[Change] = []
@@ -153,6 +155,11 @@ class Mapper:
         """The solver knows nothing any more."""
         self._atlas.solver_lost()
 
+    @property
+    def taken_out(self) -> int:
+        """Keyframes, since the beginning."""
+        return self._counts["taken_out"]
+
     def take_changes(self) -> tuple[Change, ...]:
         """What has to be kept since the last call."""
         taken, self._changes = tuple(self._changes), []
@@ -170,9 +177,13 @@ class Mapper:
         return Query(self._index, number, self._sights[number], self._config.place.candidates, near)
 
     def _verification(self, query: Query, found: list[int]) -> Verify | None:
-        candidates = {n: self._sights[n] for n in found if n in self._sights}
-        place = self._config.place
-        return Verify(query.number, query.sight, candidates, place.enough, place) if candidates else None
+        place, edge = self._config.place, self._config.edge
+        found, enough = [n for n in found if n in self._sights], place.enough
+        if len(self._lookups) >= edge.hurry_waiting:
+            found = self._atlas.promising_first(query.number, found)[: edge.hurry_candidates]
+            enough = 1
+        candidates = {n: self._sights[n] for n in found}
+        return Verify(query.number, query.sight, candidates, enough, place) if candidates else None
 
     def _judge(self, query: int, candidate: int, outcome: Verified | Refusal) -> list[Finding]:
         if not {query, candidate} <= self._sights.keys():
@@ -200,6 +211,7 @@ class Mapper:
         return [
             Finding(agent, "correction", applied.reason, correction)
             for agent, correction in applied.corrections.items()
+            if self._concern.concerns(agent, correction)
         ]
 
     def _thin(self) -> None:

@@ -18,6 +18,7 @@ from share.graph.change import Solution
 from share.merge.chart import Chart
 from share.merge.join import Key, Loop
 from share.merge.judge import Decision, Judge, that_waited
+from share.merge.promising import promising_first
 from share.merge.solving import SolveJob
 from share.merge.thinning import TakenOut, bonds, redundant, take_out
 from share.types import F64, Correction, Keyframe
@@ -99,6 +100,10 @@ class Atlas:
         at = bisect_left(nodes, number)
         beside = nodes[max(0, at - gap) : at + gap]
         return tuple(n for n in beside if trails.are_neighbours(n, number, gap))
+
+    def promising_first(self, number: int, others: Sequence[int]) -> list[int]:
+        """Keyframes that look like this one, those whose loop would tell most first."""
+        return promising_first(self._chart, number, others)
 
     def everything(self) -> tuple[tuple[Key, ...], F64, tuple[str, ...]]:
         """Every keyframe, its T_map_body (N, 4, 4), and its map."""

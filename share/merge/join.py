@@ -8,6 +8,7 @@ Mangelson et al., ICRA 2018.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +42,11 @@ class Loop:
         object.__setattr__(self, "cov", checked("cov", self.cov, (6, 6), np.float64))
 
     def reverse(self) -> Loop:
+        """The same, from the other end; made once, for a loop that waits is asked for it again and again."""
+        return self._reversed
+
+    @cached_property
+    def _reversed(self) -> Loop:
         return Loop(
             self.b, self.a, se3.inverse(self.T_a_b), se3.inverse_cov(self.T_a_b, self.cov), self.inliers
         )

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from share.geometry import se3
 from share.types import F64
 
 
@@ -24,6 +23,7 @@ def near_any(T: F64, poses: Sequence[F64], within_m: float, within_rad: float) -
     """Whether pose T (4, 4) lies as near as this to one of the others."""
     if not len(poses):
         return False
-    step = se3.inverse(np.array(poses)) @ T
-    away = np.linalg.norm(step[:, :3, 3], axis=1)
-    return bool(((away <= within_m) & (se3.angle(step) <= within_rad)).any())
+    others = np.array(poses)
+    away = np.linalg.norm(others[:, :3, 3] - T[:3, 3], axis=1)
+    cosine = (np.einsum("nij,ij->n", others[:, :3, :3], T[:3, :3]) - 1) / 2
+    return bool(((away <= within_m) & (cosine >= np.cos(within_rad))).any())

@@ -237,3 +237,26 @@ def test_under_load_keyframes_are_kept_but_not_looked_up():
     assert skipped > 0
     assert skipped + report["place_ms"]["n"] <= 80
     assert 80 - skipped - report["place_ms"]["n"] <= slow.config.edge.max_waiting + 2
+
+
+def test_in_a_hurry_fewer_candidates_are_tried_and_one_is_enough():
+    both = town()
+    both.walk(40)
+    config = Config()
+    tried = {}
+    for waiting in (0, config.edge.hurry_waiting):
+        mapper = Mapper(config)
+        mapper.join("ann-000b", hello(run_id=11))
+        keyframes = both.keyframes("ann")
+        for keyframe in keyframes[:29]:
+            mapper.add("ann-000b", keyframe)
+        while mapper._lookups.next() is not None:
+            pass
+        for keyframe in keyframes[29 : 30 + waiting]:
+            mapper.add("ann-000b", keyframe)
+        query = mapper.next_look()
+        mapper.done(query, query.run(), 1.0)
+        verify = mapper.next_look()
+        tried[waiting] = len(verify.candidates), verify.enough
+    assert tried[0] == (config.place.candidates, config.place.enough)
+    assert tried[config.edge.hurry_waiting] == (config.edge.hurry_candidates, 1)

@@ -48,3 +48,18 @@ def test_one_too_many_costs_the_longest_queue_its_oldest() -> None:
     assert len(queue) == 4
     assert queue.skipped == {"ann": 1}
     assert {queue.next() for _ in range(4)} == {1, 2, 3, 10}
+
+
+def test_of_many_agents_the_newest_are_answered_and_nobody_starves() -> None:
+    """Twenty agents in turn, half as many look-ups as keyframes: none is looked up that is older than a few
+    others, and everybody has its turn."""
+    queue, served, age = Lookups(12), Counter[int](), []
+    for number in range(2000):
+        queue.add(f"agent{number % 20}", AR, number)
+        if number % 2:
+            found = queue.next()
+            assert found is not None
+            served[found % 20] += 1
+            age.append(number - found)
+    assert max(age[20:]) <= 6
+    assert min(served.values()) >= 30 and len(served) == 20

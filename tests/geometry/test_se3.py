@@ -78,3 +78,9 @@ def test_orthonormal_mends_a_drifted_rotation(rng):
     mended = se3.orthonormal(bent)
     assert np.allclose(mended[:3, :3] @ mended[:3, :3].T, np.eye(3), atol=1e-14)
     assert np.allclose(mended, T, atol=1e-3)
+
+
+def test_angle_is_that_of_the_logarithm_from_nothing_to_half_a_turn() -> None:
+    axis = np.array([0.6, -0.48, 0.64])
+    for radians in (0.0, 1e-9, 1e-4, 0.5, 2.0, 3.0, np.pi - 1e-7, np.pi):
+        assert abs(se3.angle(se3.so3_exp(radians * axis)) - radians) < 1e-8

@@ -1,0 +1,38 @@
+"""Which corrections are sent."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from share.core.concern import Concern
+from share.geometry import se3
+from share.types import Correction
+
+
+def correction(
+    shift_m: float = 0.0, turn_deg: float = 0.0, map_id: str = "a/0", answers: int = -1
+) -> Correction:
+    T = se3.exp(np.array([0, 0, np.radians(turn_deg), shift_m, 0, 0]))
+    return Correction(T, np.eye(6), map_id, 0, answers)
+
+
+def test_what_moves_nobody_is_not_sent() -> None:
+    concern = Concern()
+    assert concern.concerns("ann", correction())
+    assert not concern.concerns("ann", correction(shift_m=0.0009))
+    assert not concern.concerns("ann", correction(turn_deg=0.019))
+    assert concern.concerns("bob", correction())
+
+
+def test_small_steps_add_up() -> None:
+    concern = Concern()
+    sent = [concern.concerns("ann", correction(shift_m=0.0004 * k)) for k in range(7)]
+    assert sent == [True, False, False, True, False, False, True]
+
+
+def test_an_answer_and_another_map_are_always_sent() -> None:
+    concern = Concern()
+    concern.concerns("ann", correction())
+    assert concern.concerns("ann", correction(answers=3))
+    assert concern.concerns("ann", correction(map_id="b/0"))
+    assert concern.concerns("ann", correction(turn_deg=0.021, map_id="b/0"))

@@ -1,0 +1,34 @@
+"""Which look-alikes are tried first in a hurry."""
+
+from __future__ import annotations
+
+import numpy as np
+from atlas_sim import EMPTY, STEP, UP
+
+from share.geometry import se3
+from share.merge.chart import Chart
+from share.merge.promising import promising_first
+from share.types import Keyframe
+
+
+def chart_of(**lengths: int) -> tuple[Chart, dict[str, list[int]]]:
+    """Agents that walk straight on, a metre from keyframe to keyframe, each in its own map."""
+    chart, numbers = Chart(), {}
+    step = se3.exp(np.array([0, 0, 0, 1.0, 0, 0]))
+    for agent, count in lengths.items():
+        keyframes = [Keyframe(i, i - 1, i, step if i else np.eye(4), STEP, UP, EMPTY) for i in range(count)]
+        numbers[agent] = [chart.add(agent, keyframe, STEP) for keyframe in keyframes]
+    return chart, numbers
+
+
+def test_larger_maps_come_first_and_likeness_decides_within_one() -> None:
+    chart, at = chart_of(ann=2, bob=9, eve=5)
+    others = [at["eve"][1], at["bob"][4], at["eve"][0], at["bob"][2]]
+    expected = [at["bob"][4], at["bob"][2], at["eve"][1], at["eve"][0]]
+    assert promising_first(chart, at["ann"][1], others) == expected
+
+
+def test_what_cannot_be_seen_from_here_comes_last() -> None:
+    chart, at = chart_of(ann=20, bob=3)
+    near, far, other = at["ann"][16], at["ann"][2], at["bob"][0]
+    assert promising_first(chart, at["ann"][19], [far, other, near]) == [near, other, far]

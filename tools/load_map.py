@@ -1,0 +1,62 @@
+"""The edge's map in one process, without sockets: keyframes in, every step timed in CPU time."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any
+
+from share.config import Config
+from share.core.finding import Finding
+from share.core.mapper import Mapper
+from share.graph.solver import Solver
+from share.types import Keyframe
+from share.wire.messages import Hello
+
+
+class TimedMap:
+    """A mapper and a solver that take turns. ms: CPU times of each kind of step."""
+
+    def __init__(self, config: Config) -> None:
+        self.mapper, self.solver = Mapper(config), Solver(config.graph)
+        self.ms: dict[str, list[float]] = defaultdict(list)
+        self.findings: list[Finding] = []
+
+    def join(self, agent: str, hello: Hello) -> None:
+        self.mapper.join(agent, hello)
+
+    def add(self, agent: str, keyframe: Keyframe) -> None:
+        before = self.mapper.taken_out
+        found, ms = _timed(lambda: self.mapper.add(agent, keyframe))
+        self.ms["add" if self.mapper.taken_out == before else "thin"].append(ms)
+        self.findings += found
+
+    def look(self) -> None:
+        """All that waits to be looked up."""
+        while (step := self.mapper.next_look()) is not None:
+            result, ms = _timed(step.run)
+            self.ms["query" if step.kind == "place" else step.kind].append(ms)
+            found, ms = _timed(lambda: self.mapper.done(step, result, ms))
+            if step.kind == "verify":
+                self.ms["judge"].append(ms)
+            self.findings += found
+
+    def solve(self) -> None:
+        """All that is due."""
+        while True:
+            step, tell_ms = _timed(self.mapper.next_solve)
+            if step is None:
+                return
+            result, ms = _timed(lambda: step.run(self.solver))
+            self.ms["solve"].append(ms)
+            found, ms = _timed(lambda: self.mapper.done(step, result, ms))
+            self.ms["apply"].append(ms + tell_ms)
+            self.findings += found
+
+
+def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
+    """What it says, and its CPU time in ms."""
+    began = time.process_time()
+    result = work()
+    return result, 1e3 * (time.process_time() - began)
