@@ -111,7 +111,7 @@ def _say_keys(keys: EdgeKeys | None) -> None:
 
 _NEWS = {"joined the edge", "left", "back", "silent", "refused"}
 _NEWS |= {"not let in", "maps joined", "merge undone", "job failed", "not written", "mapper lost"}
-_NEWS |= {"odometry leapt", "map"}
+_NEWS |= {"odometry doubted", "map"}
 
 
 def _tell(event: dict[str, Any], verbose: bool) -> None:
