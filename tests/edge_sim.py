@@ -246,7 +246,11 @@ class Town:
         """Of all keyframes of these agents, one alignment: root of the mean square in m; inf unless in one map."""
         assert self.edge is not None
         kept = self.edge.mapper.poses()
-        truth = {f"{p.name}-{p.run_id % 0x10000:04x}": p.T_world_body for p in self.people.values() if p.name in names}
+        truth = {
+            f"{p.name}-{p.run_id % 0x10000:04x}": p.T_world_body
+            for p in self.people.values()
+            if p.name in names
+        }
         which = [i for i, key in enumerate(kept.keys) if key.agent in truth]
         if len({kept.maps[i] for i in which}) > 1:
             return float("inf")

@@ -165,7 +165,7 @@ class EdgeRun:
                     self._mapped = mapped.report
                 case _Said() as said:
                     self._say(said.event, said.text)
-                case _Lost() as lost:
+                case _Lost() as lost if not self._stopping:
                     self._begin_anew(lost.how)
 
     def _begin_anew(self, how: str) -> None:

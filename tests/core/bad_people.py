@@ -36,7 +36,9 @@ class Miscalibrated(Person):
             self._told.append(self._told[-1] @ moved)
         scale = np.array(self.scale)
         points = view.points * scale.astype(np.float32)
-        return self._told[-1], View(view.uv * (scale[:2] / scale[2]).astype(np.float32), points, view.descriptors)
+        return self._told[-1], View(
+            view.uv * (scale[:2] / scale[2]).astype(np.float32), points, view.descriptors
+        )
 
 
 @dataclass

@@ -48,9 +48,13 @@ def test_the_others_map_stays_right(bad):
     maps = town.edge.report()["agents"]
     joins = maps["eve"]["map_id"] == maps["ann"]["map_id"]
     loops = maps["eve"]["loops"]
-    print(f"{bad}: eve {'joins' if joins else 'stays alone'}, {loops}, "
-          f"others {1e3 * town.map_error(GOOD):.2f} mm, {ratio:.3f} of {1e3 * clean.map_error(GOOD):.2f}; "
-          f"eve {100 * town.map_error(('eve',)):.2f} cm")
-    print({r["reason"] for r in town.records if r["event"] in ("job failed", "bad message", "odometry doubted")})
+    print(
+        f"{bad}: eve {'joins' if joins else 'stays alone'}, {loops}, "
+        f"others {1e3 * town.map_error(GOOD):.2f} mm, {ratio:.3f} of {1e3 * clean.map_error(GOOD):.2f}; "
+        f"eve {100 * town.map_error(('eve',)):.2f} cm"
+    )
+    print(
+        {r["reason"] for r in town.records if r["event"] in ("job failed", "bad message", "odometry doubted")}
+    )
     assert town.edge.report()["failed_jobs"] == 0
     assert ratio <= SLACK

@@ -51,8 +51,10 @@ def check_loss(seeds: range, losses: tuple[float, ...]) -> list[float]:
             check_nothing_lost(town)
             ratio = town.map_error(NAMES) / clean.map_error(NAMES)
             resent = sum(agent.report()["resent"] for agent in town.agents.values())
-            print(f"seed {seed}, loss {loss:.0%}: {1e3 * town.map_error(NAMES):.2f} mm, {ratio:.3f} of the clean run's "
-                  f"{1e3 * clean.map_error(NAMES):.2f}; {resent} sent again, took {town.now_ns / 1e9:.0f} s")
+            print(
+                f"seed {seed}, loss {loss:.0%}: {1e3 * town.map_error(NAMES):.2f} mm, {ratio:.3f} of the clean run's "
+                f"{1e3 * clean.map_error(NAMES):.2f}; {resent} sent again, took {town.now_ns / 1e9:.0f} s"
+            )
         ratios.append(ratio)
     return ratios
 
