@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +17,7 @@ from share.core.finding import Finding
 from share.core.mapper import Mapper
 from share.core.steps import Solve, Step
 from share.geometry import se3
+from share.geometry.align import umeyama
 from share.graph.solver import Solver
 from share.types import F64, U8, AgentKind, Candidate, Keyframe, TrackState, View
 from share.wire.codec import decode
@@ -58,6 +59,30 @@ def look(place: Walls, T_world_cam: F64, rng: np.random.Generator) -> View:
 
 
 @dataclass
+class Weather:
+    """What a network does to messages: lost, doubled, late by up to `delay_ms`, and of those some not late at all."""
+
+    seed: int
+    loss: float = 0.0
+    twice: float = 0.0
+    at_once: float = 0.0
+    delay_ms: tuple[float, float] = (2.0, 2.0)
+
+    def __post_init__(self) -> None:
+        self._rng = np.random.default_rng(self.seed)
+
+    def delays_ns(self) -> list[int]:
+        """Of each copy that arrives."""
+        rng, (least, most) = self._rng, self.delay_ms
+        out = []
+        for _ in range(1 + int(self.twice > 0 and rng.random() < self.twice)):
+            if rng.random() >= self.loss:
+                late = most > least and rng.random() >= self.at_once
+                out.append(round((rng.uniform(least, most) if late else least) * MS))
+        return out
+
+
+@dataclass
 class Person:
     """Walks round the room; body = camera. Odometry starts where it stands, and drifts a little."""
 
@@ -66,6 +91,7 @@ class Person:
     start: float
     run_id: int
     kind: AgentKind = AgentKind.AR
+    cov: F64 = field(default_factory=lambda: 4e-6 * np.eye(6))
     T_world_body: list[F64] = field(default_factory=list)
     T_odom_body: list[F64] = field(default_factory=list)
 
@@ -75,6 +101,9 @@ class Person:
     @property
     def hello(self) -> Hello:
         return Hello(self.name, self.kind, self.run_id, FOCAL, np.eye(4))
+
+    def stamp_ns(self, now_ns: int) -> int:
+        return now_ns
 
     def step(self) -> tuple[F64, View]:
         """0.2 m on along a ring, looking at the wall outside. Returns T_odom_body and the view."""
@@ -106,9 +135,15 @@ class Town:
     """Everybody, their edge, and 2 ms between them. `job_ms` is how long the worker takes."""
 
     def __init__(
-        self, people: list[Person], session: int = 1, job_ms: float = 5, config: Config | None = None
+        self,
+        people: list[Person],
+        session: int = 1,
+        job_ms: float = 5,
+        config: Config | None = None,
+        weather: Weather | None = None,
     ):
         self.config = config or Config()
+        self.weather = weather or Weather(0)
         self.people: dict[bytes, Person] = {}
         self.agents: dict[bytes, Agent] = {}
         self.agent_effects: dict[bytes, list[ev.AgentEffect]] = {}
@@ -168,7 +203,8 @@ class Town:
             match effect:
                 case ed.Send(peer, frames):
                     copy = [bytes(f) for f in frames]
-                    self._in(2 * MS, lambda peer=peer, copy=copy: self.to_agent(peer, ev.Received(copy)))
+                    for late in self.weather.delays_ns():
+                        self._in(late, lambda peer=peer, copy=copy: self.to_agent(peer, ev.Received(copy)))
                 case ed.Join(key, hello):
                     edge.mapper.join(key, hello)
                 case ed.Add(key, keyframe):
@@ -196,7 +232,8 @@ class Town:
             self.agent_effects[peer].append(effect)
             if isinstance(effect, ev.Send):
                 frames = [bytes(f) for f in effect.frames]
-                self._in(2 * MS, lambda frames=frames: self.to_edge(ed.Received(peer, frames)))
+                for late in self.weather.delays_ns():
+                    self._in(late, lambda frames=frames: self.to_edge(ed.Received(peer, frames)))
 
     def map_error_m(self, name: str, T_world_map: F64) -> float:
         """How far the agent's last pose in the map lies from the truth."""
@@ -205,13 +242,30 @@ class Town:
         found = T_world_map @ last.T_map_odom @ last.T_odom_body
         return float(np.linalg.norm(found[:3, 3] - self.people[self.peer(name)].T_world_body[-1][:3, 3]))
 
+    def map_error(self, names: Collection[str]) -> float:
+        """Of all keyframes of these agents, one alignment: root of the mean square in m; inf unless in one map."""
+        assert self.edge is not None
+        kept = self.edge.mapper.poses()
+        truth = {
+            f"{p.name}-{p.run_id % 0x10000:04x}": p.T_world_body
+            for p in self.people.values()
+            if p.name in names
+        }
+        which = [i for i, key in enumerate(kept.keys) if key.agent in truth]
+        if len({kept.maps[i] for i in which}) > 1:
+            return float("inf")
+        found = kept.T_map_body[which, :3, 3]
+        true = np.array([truth[kept.keys[i].agent][kept.keys[i].id][:3, 3] for i in which])
+        gap = se3.transform(umeyama(found, true), found) - true
+        return float(np.sqrt((gap**2).sum(axis=1).mean()))
+
     def _frame(self, peer: bytes, person: Person) -> None:
         T, view = person.step()
         k = len(person.T_world_body) - 1
         at = self.now_ns
-        tracked = ev.FrameTracked(k, at, at, at + 4 * MS, TrackState.OK, T, True, k == 0)
+        tracked = ev.FrameTracked(k, person.stamp_ns(at), at, at + 4 * MS, TrackState.OK, T, True, k == 0)
         self.to_agent(peer, tracked)
-        candidate = Candidate(T, 4e-6 * np.eye(6), np.zeros(3), view, k == 0)
+        candidate = Candidate(T, person.cov, np.zeros(3), view, k == 0)
         self.to_agent(peer, ev.KeyframeMade(tracked, candidate))
 
     def _in(self, ns: int, act: Callable[[], None]) -> None:

@@ -111,7 +111,7 @@ def _say_keys(keys: EdgeKeys | None) -> None:
 
 _NEWS = {"joined the edge", "left", "back", "silent", "refused"}
 _NEWS |= {"not let in", "maps joined", "merge undone", "job failed", "not written", "mapper lost"}
-_NEWS |= {"odometry leapt", "map"}
+_NEWS |= {"odometry doubted", "map"}
 
 
 def _tell(event: dict[str, Any], verbose: bool) -> None:
@@ -123,11 +123,10 @@ def _tell(event: dict[str, Any], verbose: bool) -> None:
 def _summary(report: dict[str, Any]) -> str:
     lines = [
         f"{name}: {a['keyframes']} keyframes, {a['corrections']} corrections, "
-        f"{a['bytes_up'] / 1e6:.2f} MB up, in map {a['map_id']}"
+        f"{a['bytes_up'] / 1e6:.2f} MB up, in map {a.get('map_id') or 'none yet'}"
         for name, a in report["agents"].items()
     ]
-    loops = report["loops"]
-    lines.append(
-        f"loops: {loops['tried']} tried, {loops['accepted']} accepted; {report['merges']['done']} merges"
-    )
+    if loops := report.get("loops"):  # the mapper has reported
+        done = report["merges"]["done"]
+        lines.append(f"loops: {loops['tried']} tried, {loops['accepted']} accepted; {done} merges")
     return "\n".join(lines)

@@ -75,6 +75,8 @@ class Agent:
                 self._received(event, now_ns)
             case ev.Finished():
                 self._finished(now_ns)
+            case ev.Connected():  # whether it knows us, its welcome says sooner than a ping's answer
+                self._send_hello(now_ns)
             case ev.Tick():
                 pass
         if not self._ended:
@@ -270,9 +272,13 @@ class Agent:
             self._ping(now_ns)
             self._send_keyframes(now_ns)
         elif self._hello_timer.due(now_ns):
-            self._send_frames(self._hello)
+            self._send_hello(now_ns)
         if self._finish_by_ns is not None and (not self._ledger.open or now_ns >= self._finish_by_ns):
             self._end()
+
+    def _send_hello(self, now_ns: int) -> None:
+        self._hello_timer.postpone(now_ns + seconds(self._config.link.hello_s))
+        self._send_frames(self._hello)
 
     def _watch_silence(self, now_ns: int) -> None:
         assert self._heard_ns is not None

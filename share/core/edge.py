@@ -104,15 +104,21 @@ class Edge:
     """All agents of one room. `session` names this life of the edge, so that agents notice a new one.
 
     keeps: what is applied is acknowledged only once it is `Kept`. known: runs of earlier lives.
+    began_ns: times in records count from here (default: the first event).
     """
 
     def __init__(
-        self, config: Config, session: int, keeps: bool = False, known: Sequence[Known] = ()
+        self,
+        config: Config,
+        session: int,
+        keeps: bool = False,
+        known: Sequence[Known] = (),
+        began_ns: int | None = None,
     ) -> None:
         self._config, self._session, self._keeps = config, session, keeps
         self._peers: dict[bytes, Peer] = {}
         self._by_key: dict[str, bytes] = {}
-        self._began_ns: int | None = None
+        self._began_ns = began_ns
         self._strangers: Counter[str] = Counter()
         self._ticket = 0
         self._unsafe: deque[tuple[int, Peer, int]] = deque()  # ticket, and what is safe once it is kept
@@ -197,11 +203,12 @@ class Edge:
             self._record(now_ns, "refused", None, reason)
             return
         if peer_id not in self._peers:
-            key = f"{hello.name}-{hello.run_id % 0x10000:04x}"
+            key = self._key(hello)
             self._enter(peer_id, Peer(hello, key, now_ns))
             self._keep(KeepRun(key, hello))
             self._record(now_ns, "joined the edge", self._peers[peer_id], f"{hello.kind} '{hello.name}'")
         peer = self._peers[peer_id]
+        peer.greeted = True
         self._send(peer_id, wire.Welcome(self._session, peer.safe))
         if peer.missed is not None:
             missed, peer.missed = peer.missed, None
@@ -221,6 +228,13 @@ class Edge:
             return f"the edge serves {len(present)} agents already, as many as it may (edge.max_agents)"
         return None
 
+    def _key(self, hello: wire.Hello) -> str:
+        """Names the run: as much of its number as sets it apart from earlier runs of that name."""
+        digits = 4
+        while (key := f"{hello.name}-{hello.run_id % 16**digits:0{digits}x}") in self._by_key:
+            digits += 1
+        return key
+
     def _enter(self, peer_id: bytes, peer: Peer) -> None:
         self._peers[peer_id] = peer
         self._by_key[peer.key] = peer_id
@@ -229,7 +243,8 @@ class Edge:
     def _recall(self, run: Known) -> None:
         """A run of an earlier life: it is not here, but may go on where it was."""
         peer_id, asked = wire.peer_id(run.hello.run_id), run.next_keyframe
-        self._peers[peer_id] = Peer(run.hello, run.key, 0, InOrder(asked), asked, run.foot, gone=True)
+        peer = Peer(run.hello, run.key, 0, InOrder(asked), asked, run.foot, gone=True, greeted=False)
+        self._peers[peer_id] = peer
         self._by_key[run.key] = peer_id
 
     # ------------------------------------------------------------------ keyframes
@@ -252,7 +267,7 @@ class Edge:
             self._complain(peer, str(error), now_ns)
             return
         if complaint:
-            self._record(now_ns, "odometry leapt", peer, complaint)
+            self._record(now_ns, "odometry doubted", peer, complaint)
         assert peer.foot is not None
         self._keep(KeepKeyframe(peer.key, keyframe, peer.foot.T_odom_body))
         self._effects.append(Add(peer.key, keyframe))
@@ -283,7 +298,7 @@ class Edge:
         peer = self._peers[peer_id]
         if finding.correction is None:
             self._record(now_ns, finding.what, peer, finding.reason)
-        elif peer.gone:
+        elif peer.gone or not peer.greeted:  # who has not been greeted takes us for our predecessor
             peer.missed = finding
         else:
             self._correct(peer_id, peer, finding, now_ns)

@@ -53,6 +53,11 @@ class Received:
 
 
 @dataclass(frozen=True)
+class Connected:
+    """The link has reached an edge, perhaps another life of it."""
+
+
+@dataclass(frozen=True)
 class Tick:
     """Time has passed; every 50 ms is often enough."""
 
@@ -62,7 +67,7 @@ class Finished:
     """No frame will follow."""
 
 
-AgentEvent = FrameTracked | KeyframeMade | Received | Tick | Finished
+AgentEvent = Connected | FrameTracked | KeyframeMade | Received | Tick | Finished
 
 # ---------------------------------------------------------------- effects
 

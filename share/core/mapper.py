@@ -137,6 +137,13 @@ class Mapper:
             self._solving = False
         else:
             self._looking = False
+        try:
+            return self._follow(step, result)
+        except Exception as error:
+            return self._failed(step, error)
+
+    def _follow(self, step: Step, result: Any) -> list[Finding]:
+        """What the result leads to. Raises what the step raised."""
         match step:
             case Query() if isinstance(result, list):
                 self._verify = self._verification(step, [c.id for c in result])
@@ -147,9 +154,13 @@ class Mapper:
                 return self._solved(step, result)
             case Solve():
                 self._atlas.solver_lost()
+        raise result
+
+    def _failed(self, step: Step, error: Exception) -> list[Finding]:
+        """It is said; the map goes on without what the step was for."""
         self._counts["failed_jobs"] += 1
         agent = next(iter(self._hellos)) if isinstance(step, Solve) else self._atlas.key(step.number).agent
-        return [Finding(agent, "job failed", f"{step.kind}: {type(result).__name__}: {result}")]
+        return [Finding(agent, "job failed", f"{step.kind}: {type(error).__name__}: {error}")]
 
     def solver_lost(self) -> None:
         """The solver knows nothing any more."""

@@ -17,6 +17,7 @@ from share.types import F64, Keyframe, TrackState
 from share.wire.messages import Hello
 
 _LEAP_M, _LEAP_M_S = 2.0, 10.0  # further than this, and so much more a second, nobody moves between keyframes
+_MOST_VARIANCE = 100.0  # rad^2, m^2: says nothing; more would only upset the solver
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +61,12 @@ class Peer:
     revision: int = 0
     gone: bool = False
     missed: Finding | None = None  # the newest correction while it was gone
+    greeted: bool = True  # in this life of the edge
 
     def place(self, keyframe: Keyframe) -> tuple[Keyframe, str | None]:
         """The next keyframe in order as the map may have it, and what was wrong with it.
 
-        One that leaps begins a stretch, in the same odom. Raises ValueError where what it refers to is
+        One that leaps begins a stretch, in the same odom; a covariance beyond all measure is bounded. Raises ValueError where what it refers to is
         not the keyframe before it.
         """
         complaint = None
@@ -78,6 +80,9 @@ class Peer:
                 complaint = f"keyframe {keyframe.id} is {leap_m:.0f} m from the one before: a new stretch"
                 keyframe = replace(keyframe, reference=-1, T_ref_body=T_odom_body)
         self.foot = Foot(keyframe.id, keyframe.stamp_ns, T_odom_body)
+        if (most := float(keyframe.cov.diagonal().max())) > _MOST_VARIANCE:
+            complaint = complaint or f"keyframe {keyframe.id} has a variance of {most:.0e}; taken as unknown"
+            keyframe = replace(keyframe, cov=keyframe.cov * (_MOST_VARIANCE / most))
         return keyframe, complaint
 
     def report(self) -> dict[str, Any]:

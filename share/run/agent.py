@@ -205,6 +205,8 @@ class AgentRun:
         while not self._ended:
             frames = self._link.receive(TICK_MS)
             self._say_trouble()
+            if self._link.connected():
+                self._handle(ev.Connected())
             if frames is not None:
                 self._handle(ev.Received(frames))
             while not self._shared.inbox.empty():

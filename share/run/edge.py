@@ -121,7 +121,7 @@ class EdgeRun:
         kept = None if self._store is None else self._store.load()
         writable = self._store is not None and self._store.writable
         known = () if kept is None else known_runs(kept)
-        self._machine = Edge(self._settings, secrets.randbits(63), writable, known)
+        self._machine = Edge(self._settings, secrets.randbits(63), writable, known, self._began_ns)
         self._mapped: dict[str, Any] = {}
         self._mapping = Companion("mapping", map_all, (self._settings,), self._answered, self._mapping_lost)
         self._keeper: Keeper | None = None
@@ -165,7 +165,7 @@ class EdgeRun:
                     self._mapped = mapped.report
                 case _Said() as said:
                     self._say(said.event, said.text)
-                case _Lost() as lost:
+                case _Lost() as lost if not self._stopping:
                     self._begin_anew(lost.how)
 
     def _begin_anew(self, how: str) -> None:

@@ -68,14 +68,18 @@ class Keeper:
             return False
         return True
 
-    def _write(self) -> bool:
-        """A batch; whether it is safe now."""
-        batch = [self._held[i] for i in range(min(_AT_ONCE, len(self._held)))]
+    def _write(self, most: int = _AT_ONCE) -> bool:
+        """A batch; whether it is done with now."""
+        batch = [self._held[i] for i in range(min(most, len(self._held)))]
         try:
             self._store.write([change for keep in batch for change in keep.changes])
         except StoreError as error:
             self._fail(str(error))
             return False
+        except ValueError as error:  # what it hangs on was lost while the disk was full
+            if len(batch) > 1:
+                return self._write(most=1)
+            self._said(f"not kept: {error}")
         for _ in batch:
             self._held.popleft()
         if self._failing:

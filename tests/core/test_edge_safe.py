@@ -82,7 +82,7 @@ def test_a_leap_begins_a_stretch_in_the_same_odom() -> None:
     assert add.keyframe.reference == -1
     assert np.allclose(add.keyframe.T_ref_body[:3, 3], (100.2, 0, 0))
     (record,) = of(effects, ed.Record)
-    assert record.fields["event"] == "odometry leapt"
+    assert record.fields["event"] == "odometry doubted"
     assert "100 m" in record.fields["reason"]
     (add,) = of(tell(edge, keyframe(2, 1)), ed.Add)
     assert add.keyframe.reference == 1

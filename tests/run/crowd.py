@@ -82,6 +82,8 @@ class Walker(threading.Thread):
             wait = min(0.05, max(0.0, due - time.monotonic()))
             if (frames := link.receive(round(1e3 * wait))) is not None:
                 self._handle(link, ev.Received(frames))
+            if link.connected():
+                self._handle(link, ev.Connected())
             if not told and time.monotonic() >= due:
                 if self._finish.is_set() or k == len(self.script.T_odom_body):
                     self._handle(link, ev.Finished())

@@ -29,13 +29,10 @@ def start(folder: Path, bind: str) -> tuple[Child, str]:
     """`share edge --map` on the same file as before, and its address."""
     settings = folder / "share.yaml"
     settings.write_text("edge:\n  max_keyframes: 100000\n")  # none is taken out for want of room
-    log = folder / "edge.log"
-    already = log.read_text().count("listening on") if log.exists() else 0
-    edge = Child(
-        log, "edge", "--bind", bind, "--map", str(folder / "room.sqlite"), "--config", str(settings)
-    )
-    edge.wait_for(rf"(?s)(listening on .*){{{already + 1}}}")
-    return edge, edge.said.rpartition("listening on ")[2].split(",")[0]
+    log = folder / f"edge{len(list(folder.glob('edge*.log')))}.log"
+    file, config = str(folder / "room.sqlite"), str(settings)
+    edge = Child(log, "edge", "--bind", bind, "--map", file, "--config", config)
+    return edge, edge.wait_for(r"listening on (tcp://\S+?),")[1]
 
 
 def family(pid: int) -> dict[str, int]:
@@ -137,7 +134,9 @@ def test_killed_at_random_instants_under_load(tmp_path, rounds):
     late = [s for w in walkers for s in w.late_s]
     print(f"killed {dict(run.killed)} in {took_s:.0f} s")
     for what, seconds in run.seconds.items():
-        print(f"{what}: median {np.median(seconds):.2f} s, 95 % {np.quantile(seconds, 0.95):.2f}, most {max(seconds):.2f}")
+        print(
+            f"{what}: median {np.median(seconds):.2f} s, 95 % {np.quantile(seconds, 0.95):.2f}, most {max(seconds):.2f}"
+        )
     print(f"frames late: median {1e3 * np.median(late):.1f} ms, 99 % {1e3 * np.quantile(late, 0.99):.1f} ms")
     print("maps:", json.dumps({w.name: sorted({m for _, m in w.maps}) for w in walkers}))
 

@@ -21,7 +21,7 @@ def obstacle(path: Path) -> str:
         with tempfile.TemporaryFile(dir=path.parent):  # SQLite puts files beside it
             return ""
     except OSError as error:
-        return error.strerror or str(error)
+        return f"its folder cannot be written: {error.strerror or error}"
 
 
 def take(path: Path) -> int:

@@ -38,6 +38,10 @@ class AgentLink(Protocol):
         """Why the edge did not let us in when last tried, and what to do; None if it did or is silent."""
         ...
 
+    def connected(self) -> bool:
+        """Whether it has reached an edge, once for each time."""
+        ...
+
     def wake(self) -> None:
         """Makes the current or next `receive` return early. Safe from any thread, also after close."""
         ...

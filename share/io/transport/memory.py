@@ -88,6 +88,7 @@ class MemoryAgentLink:
         self.inbox: _Mailbox[list[bytes]] = _Mailbox()
         self._network = network
         self._name = name
+        self._reached: MemoryEdgeLink | None = None
 
     def send(self, frames: Sequence[Bytes]) -> bool:
         edge = self._network.edge(self._name)
@@ -98,6 +99,10 @@ class MemoryAgentLink:
 
     def trouble(self) -> str | None:
         return None
+
+    def connected(self) -> bool:
+        edge, self._reached = self._reached, self._network.edge(self._name)
+        return self._reached is not None and self._reached is not edge
 
     def wake(self) -> None:
         self.inbox.wake()

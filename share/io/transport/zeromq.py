@@ -37,7 +37,7 @@ _SEALED: dict[int, int] = {zmq.MAXMSGSIZE: MAX_FRAME_BYTES + 33}
 _DEALER: dict[int, int] = {
     zmq.IMMEDIATE: 1,  # nothing queues for an edge that is not there
     zmq.RECONNECT_IVL: 100,
-    zmq.RECONNECT_IVL_MAX: 1000,
+    zmq.RECONNECT_IVL_MAX: 400,
     zmq.CONNECT_TIMEOUT: 2000,
     zmq.SNDBUF: 256 * 1024,  # on a slow network poses must not grow old in the kernel
 }
@@ -125,6 +125,7 @@ class ZmqAgentLink:
         self._keys = keys
         self._trouble: str | None = None
         self._redial_s: float | None = None  # when
+        self._joined = False  # since last asked
         self._link = _Socket(zmq.DEALER, _DEALER | (_SEALED if keys else {}), self._target)
         self._link.socket.setsockopt(zmq.ROUTING_ID, peer_id(run_id))
         if keys is not None:
@@ -148,6 +149,10 @@ class ZmqAgentLink:
     def trouble(self) -> str | None:
         return self._trouble
 
+    def connected(self) -> bool:
+        joined, self._joined = self._joined, False
+        return joined
+
     def wake(self) -> None:
         self._link.wake()
 
@@ -157,6 +162,7 @@ class ZmqAgentLink:
     def _keep_connected(self) -> None:
         for outcome in self._link.handshakes():
             joined = outcome is Outcome.JOINED
+            self._joined = self._joined or joined
             self._trouble = None if joined else self._reason(outcome)
             self._redial_s = None if joined else time.monotonic() + _REDIAL_S
         if self._redial_s is not None and time.monotonic() >= self._redial_s:

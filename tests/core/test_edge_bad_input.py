@@ -1,0 +1,171 @@
+"""What cannot be, or should not: said once, and the map is as before."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from edge_sim import Person, Town, walls
+
+from share.config import Config, EdgeConfig
+from share.core import edge as ed
+from share.core import events as ev
+from share.core.agent import Agent
+from share.core.mapper import Mapper
+from share.core.peer import Known
+from share.core.steps import Query
+from share.errors import WireError
+from share.geometry import se3
+from share.types import AgentKind, Keyframe, View
+from share.wire import messages as m
+from share.wire.codec import decode, encode
+
+EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
+AHEAD = se3.compose(np.eye(3), np.array([0.1, 0.0, 0.0]))
+HELLO = m.Hello("ann", AgentKind.AR, 0xA000B, 400.0, np.eye(4))
+
+
+def keyframe(id: int, cov: np.ndarray | None = None, view: View = EMPTY) -> Keyframe:
+    cov = 1e-6 * np.eye(6) if cov is None else cov
+    return Keyframe(id, id - 1, 10**8 * id, np.eye(4), cov, np.zeros(3), view, id - 1)
+
+
+def tell(edge: ed.Edge, message: m.Message, peer: int = HELLO.run_id) -> list[ed.Effect]:
+    return edge.handle(ed.Received(m.peer_id(peer), [bytes(f) for f in encode(message)]), 0)
+
+
+def of(effects: list[ed.Effect], kind: type) -> list:
+    return [effect for effect in effects if isinstance(effect, kind)]
+
+
+def sent(effects: list, kind: type) -> list:
+    messages = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, (ed.Send, ev.Send))]
+    return [message for message in messages if isinstance(message, kind)]
+
+
+@pytest.mark.parametrize(
+    ("frame", "value"),
+    [(1, np.nan), (2, -1.0), (2, np.inf), (3, np.nan), (4, np.inf)],
+    ids=["pose", "covariance not positive", "covariance not finite", "up", "uv"],
+)
+def test_numbers_that_are_none_stop_at_the_door(frame, value):
+    edge = ed.Edge(Config(), 7)
+    tell(edge, HELLO)
+    view = View(np.zeros((2, 2)), np.ones((2, 3)), np.zeros((2, 32), np.uint8))
+    frames = [bytearray(f) for f in encode(keyframe(0, view=view))]
+    dtype = np.float64 if frame <= 3 else np.float32
+    frames[frame][:] = np.full(len(frames[frame]) // np.dtype(dtype).itemsize, value, dtype).tobytes()
+    with pytest.raises(WireError):
+        decode([bytes(f) for f in frames])
+    for again in range(3):
+        effects = edge.handle(ed.Received(m.peer_id(HELLO.run_id), [bytes(f) for f in frames]), 0)
+        assert not of(effects, ed.Add)
+        assert len(of(effects, ed.Record)) == (again == 0)  # said once
+    assert edge.report({})["agents"]["ann"]["bad_messages"] == 3
+
+
+def test_a_number_that_is_used_again_changes_nothing():
+    edge = ed.Edge(Config(), 7)
+    tell(edge, HELLO)
+    assert of(tell(edge, keyframe(0)), ed.Add)
+    effects = tell(edge, replace(keyframe(0), stamp_ns=5, up=np.ones(3)))
+    assert not of(effects, ed.Add)
+    assert sent(effects, m.Ack) == [m.Ack(1)]
+
+
+def test_two_runs_of_one_name_whose_numbers_end_alike():
+    edge = ed.Edge(Config(), 8, known=[Known("ann-000b", HELLO, None, 0)])
+    (join,) = of(tell(edge, replace(HELLO, run_id=0xB000B), 0xB000B), ed.Join)
+    assert join.key == "ann-b000b"
+    assert of(tell(edge, keyframe(0), 0xB000B), ed.Add)[0].key == "ann-b000b"
+
+
+def test_a_covariance_beyond_measure_is_bounded_and_said():
+    edge = ed.Edge(Config(), 7)
+    tell(edge, HELLO)
+    effects = tell(edge, keyframe(0, 1e11 * np.eye(6)))
+    assert np.allclose(of(effects, ed.Add)[0].keyframe.cov, 100 * np.eye(6))
+    (record,) = of(effects, ed.Record)
+    assert "1e+11" in record.fields["reason"]
+
+
+def test_huge_covariances_do_not_end_the_mapper():
+    place = walls(1)
+    eve = Person("eve", place, 0.3, 133, cov=1e11 * np.eye(6))
+    town = Town([Person("ann", place, 0.0, 111), eve])
+    town.walk(24)
+    town.run(500)
+    report = town.edge.report()
+    assert report["failed_jobs"] == 0
+    assert report["maps"] == {"ann-006f/0": 48}  # theirs, and she in it
+    assert report["solve_ms"]["n"] > 0
+
+
+def test_a_result_that_cannot_be_used_costs_its_step(monkeypatch):
+    mapper = Mapper(Config())
+    mapper.join("ann", HELLO)
+    mapper.add("ann", keyframe(0))
+    step = mapper.next_look()
+    assert isinstance(step, Query)
+
+    def bad(*_):
+        raise ValueError("no such thing")
+
+    monkeypatch.setattr(mapper, "_verification", bad)
+    (finding,) = mapper.done(step, step.run(), 1.0)
+    assert (finding.what, finding.reason) == ("job failed", "place: ValueError: no such thing")
+    monkeypatch.undo()
+    mapper.add("ann", keyframe(1))
+    step = mapper.next_look()
+    assert isinstance(step, Query)
+    assert not mapper.done(step, step.run(), 1.0)
+    assert mapper.report()["failed_jobs"] == 1
+
+
+@pytest.mark.slow
+def test_ten_thousand_keyframes_at_once_stay_bounded():
+    rng = np.random.default_rng(1)
+    config = Config(edge=EdgeConfig(max_keyframes=500, max_waiting=12))
+    mapper = Mapper(config)
+    mapper.join("ann", HELLO)
+    mapper.join("eve", replace(HELLO, name="eve"))
+    for k in range(20):
+        mapper.add("ann", keyframe(k))
+    few = [
+        View(rng.normal(size=(5, 2)), np.ones((5, 3)), rng.integers(0, 256, (5, 32), np.uint8)) for _ in "ab"
+    ]
+    for k in range(10_000):
+        mapper.add("eve", replace(keyframe(k, view=few[k % 2]), T_ref_body=AHEAD))
+        if k % 100 == 0:
+            mapper.take_changes()
+    report = mapper.report()
+    assert sum(report["maps"].values()) <= 525
+    assert report["waiting"] <= 12
+    assert report["agents"]["eve"]["queries_skipped"] > 9000
+    assert report["maps"]["ann/0"] == 20  # it cost the others nothing
+
+
+def test_hello_at_once_when_the_link_is_back():
+    """A new life of the edge is known by its welcome, not only by the answer to the next ping."""
+    agent, edge = Agent(HELLO, Config()), ed.Edge(Config(), 7)
+    hello = agent.handle(ev.Connected(), 0)
+    assert sent(hello, m.Hello)
+    (welcome,) = sent(tell(edge, HELLO), m.Welcome)
+    agent.handle(ev.Received(encode(welcome)), 1)
+    assert not sent(agent.handle(ev.Tick(), 2), m.Hello)
+    assert sent(agent.handle(ev.Connected(), 3), m.Hello)
+    effects = agent.handle(ev.Received(encode(m.Welcome(8, 0))), 4)
+    assert any("restarted" in e.text for e in effects if isinstance(e, ev.Say))
+
+
+def test_who_is_not_greeted_yet_is_told_the_newest_correction_with_the_welcome():
+    """Until then it counts revisions of our predecessor, and would not take it."""
+    known = Known("ann-000b", HELLO, None, 0)
+    edge, mapper = ed.Edge(Config(), 8, known=[known]), Mapper(Config())
+    mapper.join("ann-000b", HELLO)
+    tell(edge, m.Ping(1, 0))
+    effects = edge.handle(ed.Found(tuple(mapper.add("ann-000b", keyframe(0)))), 0)
+    assert not of(effects, ed.Send)
+    (correction,) = sent(tell(edge, HELLO), m.Correction)
+    assert (correction.map_id, correction.revision) == ("ann-000b/0", 1)
