@@ -107,7 +107,9 @@ class Replay:
     def _look(self, t: float, name: str) -> None:
         """How all pairs are now; what was wrong stays so until the next keyframe."""
         found = self._mapper.poses()
-        at = {key: (T, map_id) for key, T, map_id in zip(found.keys, found.T_map_body, found.maps, strict=True)}
+        at = {
+            key: (T, map_id) for key, T, map_id in zip(found.keys, found.T_map_body, found.maps, strict=True)
+        }
         for pair_name, pair in self.run.pairs.items():
             x, y = pair_name.split(" ")
             if not {x, y} <= self._seen.keys():

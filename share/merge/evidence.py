@@ -22,12 +22,16 @@ from share.types import F64
 
 @dataclass(frozen=True)
 class Evidence:
-    """Places at which a story was seen from near, and what they weigh together. keyframes: of that, on
-    either side, the lesser: one view can fool us many times."""
+    """Of a story, as seen from near: at how many places, the mean share that was found, and how many
+    keyframes there are on either side, the lesser (one view can fool us many times)."""
 
     places: int = 0
-    weight: float = 0.0
+    found: float = 0.0
     keyframes: int = 0
+
+    @property
+    def weight(self) -> float:
+        return self.places * self.found**2
 
     def __str__(self) -> str:
         return f"{self.places} places (weight {self.weight:.2f})"
@@ -51,7 +55,7 @@ def weigh(loops: Sequence[Loop], chart: Chart, config: MergeConfig) -> Evidence:
     count = min(places(poses, config) for poses in sides.values())
     found = float(np.mean([loop.found for loop in seen]))
     keyframes = min(len({loop.a for loop in seen}), len({loop.b for loop in seen}))
-    return Evidence(count, count * found**2, keyframes)
+    return Evidence(count, found, keyframes)
 
 
 def places(poses: Sequence[F64], config: MergeConfig, enough: int | None = None) -> int:

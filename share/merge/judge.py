@@ -130,21 +130,27 @@ class Judge:
         story = [*self._same_story(loop, self.waiting), loop]
         have, need = self._unique(story), self._places_needed(loop)
         why = f"loop {loop}: would join two maps, {have.places} of {need} places that say so"
-        if have.places < need or have.keyframes < 2:
+        lacks = "" if have.places >= need and have.keyframes >= 2 else ": waits"
+        lacks = lacks or self._doubt(loop, story, have)
+        if lacks:
             self._wait(loop)
-            return Decision(False, f"{why}: waits")
-        rival = self._rival(loop, story)
-        if rival.weight > self._config.rival_weight * have.weight:
-            self._wait(loop)
-            return Decision(False, f"{why}; another story has {rival}: waits")
+            return Decision(False, why + lacks)
         return self._accept(story, why)
 
+    def _doubt(self, loop: Loop, story: Sequence[Loop], have: Evidence) -> str:
+        """Why a story that is told at enough places may yet be of a copy; empty if nothing says so."""
+        c = self._config
+        if have.found < c.join_found:
+            return f", but only {have.found:.0%} of what both should show is found: waits"
+        rival = self._rival(loop, story)
+        return f"; another story has {rival}: waits" if rival.weight > c.rival_weight * have.weight else ""
+
     def _places_needed(self, loop: Loop) -> int:
-        """Of maps that know few places, half of those of the smaller one."""
+        """Of a map that knows few places, all but one."""
         chart, c = self._chart, self._config
         maps = [chart.nodes_of(chart.founder_of(key)) for key in (loop.a, loop.b)]
-        known = min(places([chart.poses[n] for n in nodes], c, 2 * c.join_places) for nodes in maps)
-        return min(c.join_places, max(1, known // 2))
+        known = min(places([chart.poses[n] for n in nodes], c, c.join_places + 1) for nodes in maps)
+        return max(1, known - 1)
 
     def _rival(self, loop: Loop, story: Sequence[Loop]) -> Evidence:
         """The best of the stories between the same two maps that contradict this one."""
