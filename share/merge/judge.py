@@ -131,19 +131,20 @@ class Judge:
         have, need = self._unique(story), self._places_needed(loop)
         why = f"loop {loop}: would join two maps, {have.places} of {need} places that say so"
         lacks = "" if have.places >= need and have.keyframes >= 2 else ": waits"
-        lacks = lacks or self._doubt(loop, story, have)
+        lacks = lacks or self._doubt(loop, have)
         if lacks:
             self._wait(loop)
             return Decision(False, why + lacks)
         return self._accept(story, why)
 
-    def _doubt(self, loop: Loop, story: Sequence[Loop], have: Evidence) -> str:
+    def _doubt(self, loop: Loop, have: Evidence) -> str:
         """Why a story that is told at enough places may yet be of a copy; empty if nothing says so."""
         c = self._config
         if have.found < c.join_found:
             return f", but only {have.found:.0%} of what both should show is found: waits"
-        rival = self._rival(loop, story)
-        return f"; another story has {rival}: waits" if rival.weight > c.rival_weight * have.weight else ""
+        allowed = c.rival_weight * have.weight
+        rival = self._rival(loop, allowed)
+        return f"; another story has {rival}: waits" if rival.weight > allowed else ""
 
     def _places_needed(self, loop: Loop) -> int:
         """Of a map that knows few places, all but one."""
@@ -152,11 +153,13 @@ class Judge:
         known = min(places([chart.poses[n] for n in nodes], c, c.join_places + 1) for nodes in maps)
         return max(1, known - 1)
 
-    def _rival(self, loop: Loop, story: Sequence[Loop]) -> Evidence:
-        """The best of the stories between the same two maps that contradict this one."""
-        left = [other for other in self.waiting if other not in story and self._facing(loop, other)]
+    def _rival(self, loop: Loop, allowed: float) -> Evidence:
+        """Of the stories between the same two maps that contradict this one, the first that weighs more
+        than allowed, or else the best."""
+        compared = self._compared(loop, self.waiting)
+        left = [other for other, chi2 in compared if chi2 > self._config.surprise_chi2]
         best = Evidence()
-        while left:
+        while left and best.weight <= allowed:
             told = [*self._same_story(left[-1], left[:-1]), left[-1]]
             best = max(best, self._weigh(told), key=lambda evidence: evidence.weight)
             ends = {frozenset((x.a, x.b)) for x in told}
@@ -167,6 +170,10 @@ class Judge:
 
     def _same_story(self, loop: Loop, others: Sequence[Loop]) -> list[Loop]:
         """Of others between the same two maps (in one map: the same stretches), those that agree."""
+        return [x for x, chi2 in self._compared(loop, others) if chi2 <= self._config.agree_chi2]
+
+    def _compared(self, loop: Loop, others: Sequence[Loop]) -> list[tuple[Loop, float]]:
+        """Others between the same two maps, and by how much each disagrees."""
         facing = [turned for other in others if (turned := self._facing(loop, other)) is not None]
         if not facing:
             return []
@@ -174,9 +181,8 @@ class Judge:
         from_a = self._chart.between(a, [x for x, _ in ends])
         to_b = [opposite(known) for known in self._chart.between(b, [y for _, y in ends])]
         return [
-            other
+            (other, witness_disagreement(loop, a_a, other, b_b).chi2)
             for other, a_a, b_b in zip(facing, from_a, to_b, strict=True)
-            if witness_disagreement(loop, a_a, other, b_b).chi2 <= self._config.agree_chi2
         ]
 
     def _facing(self, loop: Loop, other: Loop) -> Loop | None:
