@@ -204,7 +204,8 @@ class Mapper:
         account.loops_tried += 1
         if isinstance(outcome, Refusal):
             return [Finding(b.agent, "loop refused", f"{a} - {b}: {outcome.reason}")]
-        decision = self._atlas.propose(Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers))
+        loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers, outcome.found)
+        decision = self._atlas.propose(loop)
         reason = f"{decision.reason} ({outcome.reason})"
         self._changes += [DropLoop(loop.a, loop.b) for loop in decision.dropped]
         self._changes += [KeepLoop(loop) for loop in decision.tied]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from share.config import PlaceConfig
 from share.graph.change import Solution
 from share.graph.solver import Solver
 from share.merge.solving import SolveJob
 from share.place.index import Candidate, PlaceIndex
+from share.place.missing import missing
 from share.place.verify import Refusal, Sight, Verified, verify
 
 
@@ -42,8 +43,11 @@ class Verify:
     def run(self) -> dict[int, Verified | Refusal]:
         outcomes: dict[int, Verified | Refusal] = {}
         for number, sight in self.candidates.items():
-            outcomes[number] = verify(self.sight, sight, self.config)
-            if sum(isinstance(outcome, Verified) for outcome in outcomes.values()) >= self.enough:
+            outcome = verify(self.sight, sight, self.config)
+            if isinstance(outcome, Verified):
+                outcome = replace(outcome, found=1 - missing(self.sight, sight, outcome.T_c_q).share)
+            outcomes[number] = outcome
+            if sum(isinstance(found, Verified) for found in outcomes.values()) >= self.enough:
                 break
         return outcomes
 

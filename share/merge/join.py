@@ -29,13 +29,18 @@ class Key(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """Body of keyframe b as seen from that of a: T_a_b (4, 4), cov (6, 6), and the inliers behind it."""
+    """Body of keyframe b as seen from that of a: T_a_b (4, 4), cov (6, 6), and the inliers behind it.
+
+    found: of the points that both views should then show, the share that they do (`share.place.missing`);
+    half where nobody knows, which is what most true loops have.
+    """
 
     a: Key
     b: Key
     T_a_b: F64
     cov: F64
     inliers: int
+    found: float = 0.5
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_a_b", checked_pose("T_a_b", self.T_a_b))
@@ -47,9 +52,8 @@ class Loop:
 
     @cached_property
     def _reversed(self) -> Loop:
-        return Loop(
-            self.b, self.a, se3.inverse(self.T_a_b), se3.inverse_cov(self.T_a_b, self.cov), self.inliers
-        )
+        T_b_a, cov = se3.inverse(self.T_a_b), se3.inverse_cov(self.T_a_b, self.cov)
+        return Loop(self.b, self.a, T_b_a, cov, self.inliers, self.found)
 
     def __str__(self) -> str:
         return f"{self.a} - {self.b}"

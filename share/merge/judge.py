@@ -1,8 +1,8 @@
 """Which loops are believed: those that fit the map, or that others, elsewhere, bear witness to.
 
 A verified loop may still be false: two places can look alike. Within a map it has to agree with what the
-map knows. Between two maps, or against the map, loops at several places have to tell the same story; and
-places of which a look-alike is known bear no witness.
+map knows. Between two maps, or against the map, loops at several places have to tell the same story, and no
+other story may be nearly as good (`share.merge.evidence`).
 """
 
 from __future__ import annotations
@@ -10,15 +10,12 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from share.config import MergeConfig
-from share.geometry import se3
 from share.merge.chart import Chart
 from share.merge.cut import fewest
+from share.merge.evidence import Evidence, near, places, weigh
 from share.merge.join import Disagreement, Key, Known, Loop, disagreement, opposite, witness_disagreement
-from share.merge.places import distinct, near_any
-from share.types import F64
+from share.merge.places import near_any
 
 
 @dataclass(frozen=True)
@@ -94,7 +91,7 @@ class Judge:
 
     def _contradiction(self, loop: Loop, why: str) -> Decision:
         """Odometry does not lie so much: the places look alike. Between stretches the map may be wrong:
-        it is, if more places contradict it than tie the two."""
+        it is, if what contradicts it is better evidence than what ties the two."""
         a, b = (self._chart.stretch_of(key) for key in (loop.a, loop.b))
         if a == b:
             self._alike.update(self._chart.ends(loop))
@@ -102,11 +99,12 @@ class Judge:
         story = [*self._same_story(loop, self.rebels), loop]
         self.rebels = [*self.rebels, loop][-self._config.max_pending :]
         against = self._ties_between(a, b)
-        standing = self._witnesses([self._chart.ties.loops[n] for n in against])
-        have, need = self._witnesses(story), max(standing + 1, self._config.rebel_places)
-        if have < need:
-            return Decision(False, f"{why}; {have} places say so, {need} needed")
-        return self._overthrow(story, against, f"{why}; {have} places say so")
+        standing = self._weigh([self._chart.ties.loops[n] for n in against])
+        have, need = self._weigh(story), self._config.rebel_places
+        why = f"{why}; {have} say so, {standing} do not"
+        if have.places < need or have.weight <= standing.weight:
+            return Decision(False, f"{why}, {need} places and more weight needed")
+        return self._overthrow(story, against, why)
 
     def _ties_between(self, a: int, b: int) -> list[int]:
         """The fewest loops without which stretches a and b are not of one map."""
@@ -130,17 +128,52 @@ class Judge:
 
     def _join(self, loop: Loop) -> Decision:
         story = [*self._same_story(loop, self.waiting), loop]
-        have, need = self._witnesses(story), self._config.join_places
-        why = f"loop {loop}: would join two maps, {have} of {need} places that say so"
-        if have < need:
+        have, need = self._unique(story), self._places_needed(loop)
+        why = f"loop {loop}: would join two maps, {have.places} of {need} places that say so"
+        lacks = "" if have.places >= need and have.keyframes >= 2 else ": waits"
+        lacks = lacks or self._doubt(loop, have)
+        if lacks:
             self._wait(loop)
-            return Decision(False, f"{why}: waits")
+            return Decision(False, why + lacks)
         return self._accept(story, why)
+
+    def _doubt(self, loop: Loop, have: Evidence) -> str:
+        """Why a story that is told at enough places may yet be of a copy; empty if nothing says so."""
+        c = self._config
+        if have.found < c.join_found:
+            return f", but only {have.found:.0%} of what both should show is found: waits"
+        allowed = c.rival_weight * have.weight
+        rival = self._rival(loop, allowed)
+        return f"; another story has {rival}: waits" if rival.weight > allowed else ""
+
+    def _places_needed(self, loop: Loop) -> int:
+        """Of a map that knows few places, all but one."""
+        chart, c = self._chart, self._config
+        maps = [chart.nodes_of(chart.founder_of(key)) for key in (loop.a, loop.b)]
+        known = min(places([chart.poses[n] for n in nodes], c, c.join_places + 1) for nodes in maps)
+        return max(1, known - 1)
+
+    def _rival(self, loop: Loop, allowed: float) -> Evidence:
+        """Of the stories between the same two maps that contradict this one, the first that weighs more
+        than allowed, or else the best."""
+        compared = self._compared(loop, self.waiting)
+        left = [other for other, chi2 in compared if chi2 > self._config.surprise_chi2]
+        best = Evidence()
+        while left and best.weight <= allowed:
+            told = [*self._same_story(left[-1], left[:-1]), left[-1]]
+            best = max(best, self._weigh(told), key=lambda evidence: evidence.weight)
+            ends = {frozenset((x.a, x.b)) for x in told}
+            left = [x for x in left if frozenset((x.a, x.b)) not in ends]
+        return best
 
     # ------------------------------------------------------------ witnesses
 
     def _same_story(self, loop: Loop, others: Sequence[Loop]) -> list[Loop]:
         """Of others between the same two maps (in one map: the same stretches), those that agree."""
+        return [x for x, chi2 in self._compared(loop, others) if chi2 <= self._config.agree_chi2]
+
+    def _compared(self, loop: Loop, others: Sequence[Loop]) -> list[tuple[Loop, float]]:
+        """Others between the same two maps, and by how much each disagrees."""
         facing = [turned for other in others if (turned := self._facing(loop, other)) is not None]
         if not facing:
             return []
@@ -148,9 +181,8 @@ class Judge:
         from_a = self._chart.between(a, [x for x, _ in ends])
         to_b = [opposite(known) for known in self._chart.between(b, [y for _, y in ends])]
         return [
-            other
+            (other, witness_disagreement(loop, a_a, other, b_b).chi2)
             for other, a_a, b_b in zip(facing, from_a, to_b, strict=True)
-            if witness_disagreement(loop, a_a, other, b_b).chi2 <= self._config.agree_chi2
         ]
 
     def _facing(self, loop: Loop, other: Loop) -> Loop | None:
@@ -166,15 +198,13 @@ class Judge:
                 return turned
         return None
 
-    def _witnesses(self, loops: Sequence[Loop]) -> int:
-        """At how many places they were seen from near, where nothing else is known to look the same."""
-        c = self._config
-        near = [
-            loop
-            for loop in loops
-            if np.linalg.norm(loop.T_a_b[:3, 3]) <= c.near_m and se3.angle(loop.T_a_b) <= c.near_rad
-        ]
-        return self._places([loop for loop in near if not self._looks_alike(loop)])
+    def _weigh(self, loops: Sequence[Loop]) -> Evidence:
+        return weigh(loops, self._chart, self._config)
+
+    def _unique(self, loops: Sequence[Loop]) -> Evidence:
+        """Where nothing else is known to look the same."""
+        seen = [loop for loop in loops if near(loop, self._config)]
+        return self._weigh([loop for loop in seen if not self._looks_alike(loop)])
 
     def _looks_alike(self, loop: Loop) -> bool:
         chart, c = self._chart, self._config
@@ -184,16 +214,6 @@ class Judge:
             if near_any(chart.poses[number], [chart.poses[n] for n in known], c.place_m, c.place_rad):
                 return True
         return False
-
-    def _places(self, loops: Sequence[Loop]) -> int:
-        """How many places they tie: counted on either side, the lesser."""
-        apart = self._config.place_m, self._config.place_rad
-        sides: dict[int, list[F64]] = {}
-        for loop in loops:
-            for number in self._chart.ends(loop):
-                founder = self._chart.trails.nodes[number].stretch
-                sides.setdefault(founder, []).append(self._chart.poses[number])
-        return min((distinct(np.array(poses), *apart) for poses in sides.values()), default=0)
 
     # ------------------------------------------------------------ believing
 

@@ -9,11 +9,13 @@ import numpy as np
 from share.types import F64
 
 
-def distinct(poses: F64, apart_m: float, apart_rad: float) -> int:
+def distinct(poses: F64, apart_m: float, apart_rad: float, enough: int | None = None) -> int:
     """Of poses (N, 4, 4), as many as lie further than this, or are turned by more, from each one that
-    was counted before it."""
+    was counted before it. With `enough` counting ends there."""
     counted: list[F64] = []
     for T in poses:
+        if enough is not None and len(counted) >= enough:
+            break
         if not near_any(T, counted, apart_m, apart_rad):
             counted.append(T)
     return len(counted)

@@ -121,7 +121,7 @@ def _move(chart: Chart, old: Loop, edge: Edge, bonds: Bonds, most_loops: int) ->
     at_a, at_b = ({n for n in ties.touching(end) if n in ties.loops} for end in (edge.a, edge.b))
     if at_a & at_b or (max(len(at_a), len(at_b)) >= most_loops and bonds[_pair(chart, edge)] > 0):
         return None
-    loop = Loop(nodes[edge.a].key, nodes[edge.b].key, edge.T_a_b, edge.cov, old.inliers)
+    loop = Loop(nodes[edge.a].key, nodes[edge.b].key, edge.T_a_b, edge.cov, old.inliers, old.found)
     ties.add(edge, loop)
     bonds[_pair(chart, edge)] += 1
     return loop

@@ -53,13 +53,15 @@ class Sight:
 class Verified:
     """T_c_q (4, 4): body of the query in the body frame of the candidate; cov (6, 6) of it.
 
-    matches: descriptor pairs; inliers: those that agree with the pose.
+    matches: descriptor pairs; inliers: those that agree with the pose. found: of the points that both
+    views should then show, the share that they do (`share.place.missing`); `verify` leaves it at a half.
     """
 
     T_c_q: F64
     cov: F64
     matches: int
     inliers: int
+    found: float = 0.5
 
     @property
     def reason(self) -> str:

@@ -135,14 +135,14 @@ def test_a_restarted_agent_is_a_new_run_and_finds_its_old_map():
 def test_who_was_away_is_told_what_was_missed():
     both = town()
     both.walk(12)
-    peer, before = both.peer("ann"), len(both.event(ev.CorrectionApplied, "ann"))
+    peer, before = both.peer("bob"), len(both.event(ev.CorrectionApplied, "bob"))
     agent = both.agents.pop(peer)  # its network is down
     both.run(3500)
-    both.walk(12, ["bob"])
+    both.walk(12, ["ann"])  # who follows bob and sees what bob saw
     both.agents[peer] = agent
     both.run(4000)
-    assert any(r["event"] == "back" and r["agent"] == "ann" for r in both.records)
-    assert len(both.event(ev.CorrectionApplied, "ann")) == before + 1
+    assert any(r["event"] == "back" and r["agent"] == "bob" for r in both.records)
+    assert len(both.event(ev.CorrectionApplied, "bob")) == before + 1
 
 
 # ---------------------------------------------------------------- the protocol, message by message

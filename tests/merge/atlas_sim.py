@@ -18,11 +18,17 @@ class Walker:
     """truth (n, 4, 4) in the room; keyframes whose odometry starts anywhere and drifts."""
 
     def __init__(
-        self, name: str, seed: int, n: int = 60, phase: float = 0.0, breaks: tuple[int, ...] = ()
+        self,
+        name: str,
+        seed: int,
+        n: int = 60,
+        phase: float = 0.0,
+        breaks: tuple[int, ...] = (),
+        turn: float = 3.5 * np.pi,
     ) -> None:
         self.name = name
         rng = np.random.default_rng(seed)
-        s = phase + np.linspace(0, 3.5 * np.pi, n)
+        s = phase + np.linspace(0, turn, n)
         zero = np.zeros(n)
         t = np.column_stack([2.5 * np.cos(s), 2.0 * np.sin(s), 1.3 + 0.2 * np.sin(2 * s)])
         self.truth = se3.compose(se3.so3_exp(np.column_stack([zero, zero, s])), t)

@@ -1,0 +1,63 @@
+"""What loops that tell one story are worth together.
+
+Neighbouring views of one spot are one witness, not many, so places are counted. And copies match worse than
+the place itself: of what two views should share if they stand as the loop says, they share less. A story
+weighs its places times the square of that share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.config import MergeConfig
+from share.geometry import se3
+from share.merge.chart import Chart
+from share.merge.join import Loop
+from share.merge.places import distinct
+from share.types import F64
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Of a story, as seen from near: at how many places, the mean share that was found, and how many
+    keyframes there are on either side, the lesser (one view can fool us many times)."""
+
+    places: int = 0
+    found: float = 0.0
+    keyframes: int = 0
+
+    @property
+    def weight(self) -> float:
+        return self.places * self.found**2
+
+    def __str__(self) -> str:
+        return f"{self.places} places (weight {self.weight:.2f})"
+
+
+def near(loop: Loop, config: MergeConfig) -> bool:
+    """Whether both views were from about the same spot: copies are told apart from near, if at all."""
+    away, turned = np.linalg.norm(loop.T_a_b[:3, 3]), se3.angle(loop.T_a_b)
+    return bool(away <= config.near_m and turned <= config.near_rad)
+
+
+def weigh(loops: Sequence[Loop], chart: Chart, config: MergeConfig) -> Evidence:
+    """Places are counted on either side, the lesser; loops that were not seen from near say nothing."""
+    seen = [loop for loop in loops if near(loop, config)]
+    if not seen:
+        return Evidence()
+    sides: dict[int, list[F64]] = {}
+    for loop in seen:
+        for number in chart.ends(loop):
+            sides.setdefault(chart.trails.nodes[number].stretch, []).append(chart.poses[number])
+    count = min(places(poses, config) for poses in sides.values())
+    found = float(np.mean([loop.found for loop in seen]))
+    keyframes = min(len({loop.a for loop in seen}), len({loop.b for loop in seen}))
+    return Evidence(count, found, keyframes)
+
+
+def places(poses: Sequence[F64], config: MergeConfig, enough: int | None = None) -> int:
+    """How many places these poses (4, 4) are; counted no further than `enough`."""
+    return distinct(np.array(poses), config.place_m, config.place_rad, enough)
