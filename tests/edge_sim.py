@@ -60,7 +60,7 @@ def look(place: Walls, T_world_cam: F64, rng: np.random.Generator) -> View:
 
 @dataclass
 class Weather:
-    """What a network does to messages: lost, doubled, late by up to `delay_ms`, and of those some not late at all."""
+    """What a network does to messages: lost, doubled, late by `delay_ms` (from, to), but some `at_once`."""
 
     seed: int
     loss: float = 0.0
@@ -243,7 +243,7 @@ class Town:
         return float(np.linalg.norm(found[:3, 3] - self.people[self.peer(name)].T_world_body[-1][:3, 3]))
 
     def map_error(self, names: Collection[str]) -> float:
-        """Of all keyframes of these agents, one alignment: root of the mean square in m; inf unless in one map."""
+        """Of all keyframes of these agents, one alignment: RMSE in m; inf unless they are in one map."""
         assert self.edge is not None
         kept = self.edge.mapper.poses()
         truth = {

@@ -16,7 +16,17 @@ import numpy as np
 from share.config import Config
 from share.core.concern import Concern
 from share.core.finding import Finding
-from share.core.keeping import Change, DropLoop, KeepLink, KeepLoop, KeepPoses, Kept, Retire, edge_to
+from share.core.keeping import (
+    Change,
+    DropLoop,
+    KeepLink,
+    KeepLoop,
+    KeepPoses,
+    Kept,
+    KeptKeyframe,
+    Retire,
+    edge_to,
+)
 from share.core.lookups import Lookups
 from share.core.steps import Look, Query, Solve, Step, Verify
 from share.graph.change import Solution
@@ -52,6 +62,7 @@ class Mapper:
         self._index = PlaceIndex(place.index_seed, place.tables, place.hash_bits)
         self._hellos: dict[str, Hello] = {}
         self._sights: dict[int, Sight] = {}  # by the number of a keyframe in atlas and index
+        self._unseen: list[tuple[int, KeptKeyframe]] = []  # restored
         self._lookups = Lookups(config.edge.max_waiting)
         self._concern = Concern()
         self._verify: Verify | None = None
@@ -77,7 +88,10 @@ class Mapper:
         return findings
 
     def restore(self, kept: Kept) -> list[Finding]:
-        """What an earlier life of the edge knew, before anything else comes."""
+        """What an earlier life of the edge knew, before anything else comes.
+
+        Agents can be told at once where they are; the views are gone through when one is first looked up.
+        """
         for run in kept.runs:
             self.join(run.key, run.hello)
         poses = {} if kept.poses is None else dict(zip(kept.poses.keys, kept.poses.T_map_body, strict=True))
@@ -89,10 +103,14 @@ class Mapper:
             for k in kept.keyframes
         ]
         numbers = self._atlas.restore(agents, placed, kept.loops, poses)
-        for number, found in zip(numbers, kept.keyframes, strict=True):
-            self._see(number, found.key, found.keyframe)
+        self._unseen = list(zip(numbers, kept.keyframes, strict=True))
         there = [agent for agent in self._hellos if self._atlas.T_map_odom(agent) is not None]
         return [self._founding(agent) for agent in there]
+
+    def _see_restored(self) -> None:
+        for number, found in self._unseen:
+            self._see(number, found.key, found.keyframe)
+        self._unseen = []
 
     def _see(self, number: int, agent: str, keyframe: Keyframe) -> None:
         hello = self._hellos[agent]
@@ -113,6 +131,7 @@ class Mapper:
         """The next step of looking a keyframe up; None if there is none, or one is under way."""
         if self._looking:
             return None
+        self._see_restored()
         step: Look | None = self._verify
         self._verify = None
         while step is None and (number := self._lookups.next()) is not None:
@@ -227,6 +246,7 @@ class Mapper:
         ]
 
     def _thin(self) -> None:
+        self._see_restored()
         taken = self._atlas.thin(self._config.edge.max_keyframes)
         for out in taken:
             self._index.remove(out.number)

@@ -66,8 +66,8 @@ class Peer:
     def place(self, keyframe: Keyframe) -> tuple[Keyframe, str | None]:
         """The next keyframe in order as the map may have it, and what was wrong with it.
 
-        One that leaps begins a stretch, in the same odom; a covariance beyond all measure is bounded. Raises ValueError where what it refers to is
-        not the keyframe before it.
+        One that leaps begins a stretch, in the same odom; a covariance beyond all measure is bounded.
+        Raises ValueError where what it refers to is not the keyframe before it.
         """
         complaint = None
         if keyframe.reference < 0:

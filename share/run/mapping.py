@@ -79,10 +79,10 @@ class _Mapping:
             for message in self._arrived(wait=look is None):
                 self._hear(message)
             self._give_solver()
+            self._tell()
             look = self._mapper.next_look()
             if look is not None:
                 self._findings += self._mapper.done(look, *_timed(look.run))
-            self._tell()
 
     def _arrived(self, wait: bool) -> Iterator[Any]:
         """What is in the inbox; if `wait`, at least one message, unless none comes for a while."""

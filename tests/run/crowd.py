@@ -1,4 +1,4 @@
-"""Cheap agents for an edge that is a real process: real `Agent`, real link, keyframes from a room of points."""
+"""Cheap agents for an edge that is a real process: `Agent`, link, and keyframes from a room of points."""
 
 from __future__ import annotations
 

@@ -134,9 +134,8 @@ def test_killed_at_random_instants_under_load(tmp_path, rounds):
     late = [s for w in walkers for s in w.late_s]
     print(f"killed {dict(run.killed)} in {took_s:.0f} s")
     for what, seconds in run.seconds.items():
-        print(
-            f"{what}: median {np.median(seconds):.2f} s, 95 % {np.quantile(seconds, 0.95):.2f}, most {max(seconds):.2f}"
-        )
+        median, most = np.median(seconds), max(seconds)
+        print(f"{what}: median {median:.2f} s, 95 % {np.quantile(seconds, 0.95):.2f}, most {most:.2f}")
     print(f"frames late: median {1e3 * np.median(late):.1f} ms, 99 % {1e3 * np.quantile(late, 0.99):.1f} ms")
     print("maps:", json.dumps({w.name: sorted({m for _, m in w.maps}) for w in walkers}))
 
