@@ -3,8 +3,9 @@
     python tools/measure_load_curve.py grow [--keyframes 20000] [--every 12] [--out out/load]
     python tools/measure_load_curve.py hour [--every 1] [--most 2000] [--limit_s 480] [--out out/load]
 
-One process, without sockets; CPU ms. `grow`: nothing is taken out, 24 agents; of `--every` keyframes one is
-looked up. `hour`: three agents at 3 keyframes/s, `--most` keyframes kept, and a map file; it ends after an hour of theirs, or `--limit_s` of ours. Writes grow.json or hour.json.
+One process, without sockets; CPU ms. `grow`: nothing is taken out, 24 agents. `hour`: three agents at 3
+keyframes/s, at most `--most` of them kept, and a map file; it ends after an hour of theirs, or `--limit_s` of
+ours. One of `--every` keyframes is looked up. Writes grow.json or hour.json.
 """
 
 from __future__ import annotations
