@@ -28,7 +28,7 @@ class TimedMap:
 
     def add(self, agent: str, keyframe: Keyframe) -> None:
         before = self.mapper.taken_out
-        found, ms = _timed(lambda: self.mapper.add(agent, keyframe))
+        found, ms = _timed(self.mapper.add, agent, keyframe)
         self.ms["add" if self.mapper.taken_out == before else "thin"].append(ms)
         self.findings += found
 
@@ -37,7 +37,7 @@ class TimedMap:
         while (step := self.mapper.next_look()) is not None:
             result, ms = _timed(step.run)
             self.ms["query" if step.kind == "place" else step.kind].append(ms)
-            found, ms = _timed(lambda: self.mapper.done(step, result, ms))
+            found, ms = _timed(self.mapper.done, step, result, ms)
             if step.kind == "verify":
                 self.ms["judge"].append(ms)
             self.findings += found
@@ -48,15 +48,15 @@ class TimedMap:
             step, tell_ms = _timed(self.mapper.next_solve)
             if step is None:
                 return
-            result, ms = _timed(lambda: step.run(self.solver))
+            result, ms = _timed(step.run, self.solver)
             self.ms["solve"].append(ms)
-            found, ms = _timed(lambda: self.mapper.done(step, result, ms))
+            found, ms = _timed(self.mapper.done, step, result, ms)
             self.ms["apply"].append(ms + tell_ms)
             self.findings += found
 
 
-def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
+def _timed(work: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
     """What it says, and its CPU time in ms."""
     began = time.process_time()
-    result = work()
+    result = work(*arguments)
     return result, 1e3 * (time.process_time() - began)

@@ -42,8 +42,7 @@ class Walker:
         number, first = 0, int(self._rng.integers(len(self._track.keyframes)))
         while True:
             at = np.arange(first, len(self._track.keyframes))
-            for keyframe in self._lap(number, at):
-                yield keyframe
+            yield from self._lap(number, at)
             number, first = number + len(at), 0
 
     def _lap(self, number: int, at: I64) -> Iterator[Keyframe]:

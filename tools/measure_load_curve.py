@@ -1,11 +1,11 @@
 """What a keyframe costs the edge as its map grows, and an hour in one room, quicker than real time.
 
-    python tools/measure_load_curve.py grow [--keyframes 20000] [--every 8] [--out out/load]
-    python tools/measure_load_curve.py hour [--limit_s 480] [--out out/load]
+    python tools/measure_load_curve.py grow [--keyframes 20000] [--every 12] [--out out/load]
+    python tools/measure_load_curve.py hour [--every 1] [--most 2000] [--limit_s 480] [--out out/load]
 
-One process, without sockets; CPU ms. `grow`: nothing is taken out, 24 agents; of `--every` keyframes one is
-looked up, and solved after. `hour`: three agents at 3 keyframes/s, all looked up, the default bound, and a
-map file; it ends after an hour of theirs, or `--limit_s` of ours. Writes grow.json or hour.json.
+One process, without sockets; CPU ms. `grow`: nothing is taken out, 24 agents. `hour`: three agents at 3
+keyframes/s, at most `--most` of them kept, and a map file; it ends after an hour of theirs, or `--limit_s` of
+ours. One of `--every` keyframes is looked up. Writes grow.json or hour.json.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("what", choices=("grow", "hour"))
     parser.add_argument("--keyframes", type=int, default=MARKS[-1])
-    parser.add_argument("--every", type=int, default=8)
+    parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--most", type=int, default=Config().edge.max_keyframes)
     parser.add_argument("--limit_s", type=float, default=480.0)
     parser.add_argument("--out", type=Path, default=Path("out/load"))
     options = parser.parse_args()
@@ -62,7 +63,12 @@ def measure(options: argparse.Namespace) -> None:
     """Rows as they are made; the file holds what is there so far."""
     writable_dir(options.out)
     rows = []
-    for row in grow(options.keyframes, options.every) if options.what == "grow" else hour(options.limit_s):
+    made = (
+        grow(options.keyframes, options.every)
+        if options.what == "grow"
+        else hour(options.limit_s, options.every, options.most)
+    )
+    for row in made:
         rows.append(row)
         print(json.dumps(row), flush=True)
         atomic_write(options.out / f"{options.what}.json", json.dumps(rows, indent=2) + "\n")
@@ -116,9 +122,11 @@ def _maps(report: Row) -> int:
     return sum(size > 0 for size in report["maps"].values())
 
 
-def hour(limit_s: float) -> Iterator[Row]:
-    """A row every so many keyframes."""
-    began, timed, count = time.monotonic(), TimedMap(Config()), 0
+def hour(limit_s: float, every: int, most: int) -> Iterator[Row]:
+    """A row every so many keyframes; one of `every` is looked up, `most` are kept."""
+    config = Config()
+    timed = TimedMap(replace(config, edge=replace(config.edge, max_keyframes=most, max_waiting=1)))
+    began, count = time.monotonic(), 0
     feet: dict[str, F64] = defaultdict(lambda: np.eye(4))
     with tempfile.TemporaryDirectory(prefix="load-") as folder:
         store = MapStore.open(Path(folder) / "map.sqlite")
@@ -131,8 +139,9 @@ def hour(limit_s: float) -> Iterator[Row]:
             before = feet[name] if keyframe.reference >= 0 else np.eye(4)
             feet[name] = se3.orthonormal(before @ keyframe.T_ref_body)
             timed.add(name, keyframe)
-            timed.look()
-            if count % 3 == 0:
+            if count % every == 0:
+                timed.look()
+            if count % (3 * every) == 0:
                 timed.solve()
             store.write([KeepKeyframe(name, keyframe, feet[name]), *timed.mapper.take_changes()])
             count += 1

@@ -17,8 +17,8 @@ class Concern:
         self._told: dict[str, Correction] = {}
 
     def concerns(self, agent: str, correction: Correction) -> bool:
-        """Whether it has to be sent; if so, it counts as told. It answers a keyframe, names another map, or moves
-        odom by more than a millimetre or 0.02 degrees."""
+        """Whether it has to be sent; if so, it counts as told. It answers a keyframe, names another map, or
+        moves odom by more than a millimetre or 0.02 degrees."""
         told = self._told.get(agent)
         if told is not None and not _is_news(told, correction):
             return False

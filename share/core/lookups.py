@@ -37,7 +37,7 @@ class Lookups:
             self.skipped[longest] += 1
 
     def next(self) -> int | None:
-        """Of the newest keyframes, that of the agent that has waited longest for its turn; None without any."""
+        """Of the newest keyframes, that of the agent that has waited longest for its turn; None without."""
         if not self._waiting:
             return None
         self._turn += 1

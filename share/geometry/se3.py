@@ -153,7 +153,7 @@ def transform(T: F64, points: F64) -> F64:
 
 
 def angle(R: F64) -> F64:
-    """Rotation angle [rad], 0 .. pi, of (..., 3, 3) or (..., 4, 4): sine and cosine are in R - R' and the trace."""
+    """Rotation angle [rad], 0 .. pi, of (..., 3, 3) or (..., 4, 4), by R - R' and the trace."""
     skew = R[..., [2, 0, 1], [1, 2, 0]] - R[..., [1, 2, 0], [2, 0, 1]]
     cosine2 = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1
     out: F64 = np.arctan2(np.sqrt((skew**2).sum(-1)), cosine2)

@@ -11,10 +11,7 @@ from share.geometry import se3
 from share.merge.chart import Chart
 from share.types import F64
 
-_FAR_M, _FAR_RAD = (
-    4.0,
-    1.0,
-)  # views of one map further apart than this, or turned by more, seldom share enough
+_FAR_M, _FAR_RAD = 4.0, 1.0  # views of one map further apart than this, or turned more, seldom share enough
 
 
 def promising_first(chart: Chart, number: int, others: Sequence[int]) -> list[int]:
