@@ -104,10 +104,10 @@ def test_an_edge_without_memory_is_given_the_map_again_and_joins_it_again(joined
     again.walk(4)
     assert len(again.event(ev.Localised, "ann")) == odometry + 4
     again.edge = ModelRun(again.config, session=2)
-    again.walk(8)
+    again.walk(24)
     again.run(2000)
     report = again.edge.report()
-    assert [a["keyframes"] for a in report["agents"].values()] == [28, 28]
+    assert [a["keyframes"] for a in report["agents"].values()] == [44, 44]
     assert len(report["maps"]) == 1
     assert {again.event(ev.Localised, n)[-1].map_id for n in ("ann", "bob")} == set(report["maps"])
     said = [e.text for e in again.event(ev.Say, "ann")]
