@@ -242,10 +242,10 @@ class MergeConfig:
     max_pending: int = 200  # loops that wait for a witness; the oldest is dropped
     place_m: float = 0.7  # views further apart than this,
     place_rad: float = 0.5  # or turned by more, are of different places
-    near_m: float = 1.0  # two views further apart than this,
-    near_rad: float = 0.52  # or turned by more, are no witnesses for a join
-    join_places: int = 5  # at so many places maps must fit to be joined; of a smaller map, at all but one
-    join_found: float = 0.45  # of the points that two views should share, so many must be found, on average
+    near_m: float = 2.5  # two views further apart than this,
+    near_rad: float = 0.8  # or turned by more, are no witnesses for a join
+    join_places: int = 2  # at so many places maps must fit to be joined; of a smaller map, at all but one
+    join_found: float = 0.3  # of the points that two views should share, so many must be found, on average
     rival_weight: float = 0.5  # no contradicting story may weigh more than this part of the one that joins
     rebel_places: int = 4  # so many places at least, that weigh more than what stands, take a map apart
     drop_chi2: float = 1000.0  # a solved graph at odds with a loop by more than this drops it
