@@ -240,8 +240,8 @@ class MergeConfig:
     odometry_floor_m: float = 0.002  # the same, for the position
     most_loops: int = 10  # of a keyframe, when those of others that are taken out are moved to it
     max_pending: int = 200  # loops that wait for a witness; the oldest is dropped
-    place_m: float = 0.7  # views further apart than this,
-    place_rad: float = 0.5  # or turned by more, are of different places
+    place_m: float = 0.5  # views further apart than this,
+    place_rad: float = 0.35  # or turned by more, are of different places
     near_m: float = 2.5  # two views further apart than this,
     near_rad: float = 0.8  # or turned by more, are no witnesses for a join
     join_places: int = 2  # at so many places maps must fit to be joined; of a smaller map, at all but one

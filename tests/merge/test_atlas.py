@@ -14,7 +14,7 @@ from share.merge.solving import SolveJob
 from share.types import F64
 
 # as careful as where copies of whole corridors are to be expected
-CONFIG = MergeConfig(join_places=5, near_m=1.0, near_rad=0.52, join_found=0.45)
+CONFIG = MergeConfig(join_places=5, near_m=1.0, near_rad=0.52, join_found=0.45, place_m=0.7, place_rad=0.5)
 GRAPH = GraphConfig()
 WRONG = se3.exp(np.array([0.0, 0.0, 0.5, 1.0, -0.7, 0.1]))
 
