@@ -147,7 +147,7 @@ class Edge:
 
     def _receive(self, event: Received, now_ns: int) -> None:
         peer = self._peers.get(event.peer)
-        counts = peer.counts if peer else self._strangers
+        counts = self._counts(peer)
         counts["bytes_up"] += sum(len(frame) for frame in event.frames)
         try:
             message = decode(event.frames)
@@ -177,7 +177,7 @@ class Edge:
 
     def _complain(self, peer: Peer | None, reason: str, now_ns: int) -> None:
         """Counts a bad message; says the first of each peer."""
-        counts = peer.counts if peer else self._strangers
+        counts = self._counts(peer)
         counts["bad_messages"] += 1
         if counts["bad_messages"] == 1:
             self._record(now_ns, "bad message", peer, reason)
@@ -316,10 +316,11 @@ class Edge:
 
     def _send(self, peer_id: bytes, message: wire.Down) -> None:
         frames = encode(message)
-        peer = self._peers.get(peer_id)
-        counts = peer.counts if peer else self._strangers
-        counts["bytes_down"] += sum(len(frame) for frame in frames)
+        self._counts(self._peers.get(peer_id))["bytes_down"] += sum(len(frame) for frame in frames)
         self._effects.append(Send(peer_id, frames))
+
+    def _counts(self, peer: Peer | None) -> Counter[str]:
+        return peer.counts if peer else self._strangers
 
     def _record(self, now_ns: int, what: str, peer: Peer | None, reason: str, **fields: Any) -> None:
         assert self._began_ns is not None

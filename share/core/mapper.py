@@ -30,8 +30,9 @@ from share.core.keeping import (
 from share.core.lookups import Lookups
 from share.core.steps import Look, Query, Solve, Step, Verify
 from share.graph.change import Solution
-from share.merge.atlas import Atlas, Placed
+from share.merge.atlas import Applied, Atlas, Placed
 from share.merge.join import Loop
+from share.merge.judge import Decision
 from share.merge.thinning import TakenOut
 from share.metrics.latency import summary
 from share.place.index import PlaceIndex
@@ -226,8 +227,7 @@ class Mapper:
         loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers, outcome.found)
         decision = self._atlas.propose(loop)
         reason = f"{decision.reason} ({outcome.reason})"
-        self._changes += [DropLoop(loop.a, loop.b) for loop in decision.dropped]
-        self._changes += [KeepLoop(loop) for loop in decision.tied]
+        self._note(decision)
         if not decision.accepted:
             return [Finding(b.agent, "loop not taken", reason)]
         account.loops_accepted += 1
@@ -237,13 +237,17 @@ class Mapper:
 
     def _solved(self, step: Solve, solution: Solution) -> list[Finding]:
         applied = self._atlas.apply(step.job, solution)
-        self._changes += [DropLoop(loop.a, loop.b) for loop in applied.dropped]
-        self._changes += [KeepLoop(loop) for loop in applied.tied]
+        self._note(applied)
         return [
             Finding(agent, "correction", applied.reason, correction)
             for agent, correction in applied.corrections.items()
             if self._concern.concerns(agent, correction)
         ]
+
+    def _note(self, made: Decision | Applied) -> None:
+        """The loops that are believed since, and those that are no longer, are to be kept so."""
+        self._changes += [DropLoop(loop.a, loop.b) for loop in made.dropped]
+        self._changes += [KeepLoop(loop) for loop in made.tied]
 
     def _thin(self) -> None:
         self._see_restored()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
@@ -13,7 +11,7 @@ from share.core.measurement import CAM0, CAM1, IMU, LazyImage, Measurement
 from share.errors import UsageError
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise
-from share.io.files import atomic_write, check_writable, writable_dir, writing
+from share.io.files import atomic_write, check_writable, new_folder
 from share.io.images import EncodedImage, encode_png, image_format
 from share.io.mcap import rig as ros_rig
 from share.io.mcap.recorder import Recorder
@@ -48,17 +46,8 @@ def to_euroc(source: Source, out: Path, progress: Progress) -> None:
         raise UsageError("--format euroc: an ASL folder has no place for depth images; use mcap")
     if source.rig.timeshift_s:
         raise UsageError("--format euroc: an ASL folder has no place for the cameras' timeshift; use mcap")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UsageError(f"{out}: exists and is not an empty folder; give a new name")
-    writable_dir(out.parent)
-    work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
-    try:
-        with writing(out):
-            _write_asl(source, work / "mav0", progress)
-            work.chmod(0o755)
-            work.replace(out)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+    with new_folder(out) as work:
+        _write_asl(source, work / "mav0", progress)
 
 
 def _counted(source: Source, progress: Progress) -> Iterator[Measurement]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -111,3 +112,22 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+@contextlib.contextmanager
+def new_folder(out: Path) -> Iterator[Path]:
+    """A folder beside `out` to write into; it becomes `out` when the block is done. On error: nothing.
+
+    Raises UsageError if there is something in `out`; ShareError if the disk is full or fails.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UsageError(f"{out}: exists and is not an empty folder; give a new name")
+    writable_dir(out.parent)
+    work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    try:
+        with writing(out):
+            yield work
+            work.chmod(0o755)
+            work.replace(out)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)

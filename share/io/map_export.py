@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -14,7 +12,7 @@ import numpy as np
 from share.core.keeping import Kept, KeptKeyframe, placed
 from share.errors import UsageError
 from share.geometry import se3
-from share.io.files import atomic_write, writable_dir, writing
+from share.io.files import atomic_write, new_folder
 from share.io.ply import Colour, write_ply
 from share.io.trajectory import Trajectory, format_tum
 from share.merge.join import Key, Loop
@@ -45,17 +43,8 @@ def export(kept: Kept, out: Path, progress: Callable[[int], None]) -> dict[str, 
     """
     if not kept.keyframes:
         raise UsageError("the map is empty: there is nothing to export")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UsageError(f"{out}: exists and is not an empty folder; give a new name")
-    writable_dir(out.parent)
-    work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
-    try:
-        with writing(out):
-            done = _write_all(kept, work, progress)
-            work.chmod(0o755)
-            work.replace(out)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+    with new_folder(out) as work:
+        done = _write_all(kept, work, progress)
     return {name: _moved(e, work, out) for name, e in done.items()}
 
 

@@ -46,6 +46,11 @@ class Loop:
         object.__setattr__(self, "T_a_b", checked_pose("T_a_b", self.T_a_b))
         object.__setattr__(self, "cov", checked("cov", self.cov, (6, 6), np.float64))
 
+    @property
+    def pair(self) -> frozenset[Key]:
+        """The two keyframes, whichever way round."""
+        return frozenset((self.a, self.b))
+
     def reverse(self) -> Loop:
         """The same, from the other end; made once, for a loop that waits is asked for it again and again."""
         return self._reversed

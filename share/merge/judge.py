@@ -62,8 +62,8 @@ class Judge:
 
     def forget(self, gone: Collection[Key]) -> None:
         """Loops of these keyframes are waited with no longer."""
-        self.waiting = [loop for loop in self.waiting if not {loop.a, loop.b} & set(gone)]
-        self.rebels = [loop for loop in self.rebels if not {loop.a, loop.b} & set(gone)]
+        self.waiting = [loop for loop in self.waiting if loop.pair.isdisjoint(gone)]
+        self.rebels = [loop for loop in self.rebels if loop.pair.isdisjoint(gone)]
 
     # ------------------------------------------------------------ within a map
 
@@ -162,8 +162,8 @@ class Judge:
         while left and best.weight <= allowed:
             told = [*self._same_story(left[-1], left[:-1]), left[-1]]
             best = max(best, self._weigh(told), key=lambda evidence: evidence.weight)
-            ends = {frozenset((x.a, x.b)) for x in told}
-            left = [x for x in left if frozenset((x.a, x.b)) not in ends]
+            pairs = {x.pair for x in told}
+            left = [x for x in left if x.pair not in pairs]
         return best
 
     # ------------------------------------------------------------ witnesses
@@ -188,7 +188,7 @@ class Judge:
     def _facing(self, loop: Loop, other: Loop) -> Loop | None:
         """The other loop, from where this one comes from to where it goes, if it has such ends and is
         not about the very same keyframes."""
-        if {loop.a, loop.b} == {other.a, other.b}:
+        if loop.pair == other.pair:
             return None
         chart = self._chart
         side = chart.stretch_of if chart.founder_of(loop.a) == chart.founder_of(loop.b) else chart.founder_of
@@ -231,8 +231,8 @@ class Judge:
         return Decision(True, reason, (survivor, gone), (*loops, *waited))
 
     def _believe(self, loops: Sequence[Loop]) -> None:
-        told = {frozenset((loop.a, loop.b)) for loop in loops}
-        self.waiting = [loop for loop in self.waiting if frozenset((loop.a, loop.b)) not in told]
+        told = {loop.pair for loop in loops}
+        self.waiting = [loop for loop in self.waiting if loop.pair not in told]
         for loop in loops:
             self._chart.tie(loop)
 
