@@ -235,9 +235,10 @@ class MergeConfig:
     min_loop_gap: int = 10  # keyframes of one stretch nearer than this are odometry's business
     agree_chi2: float = 22.5  # two loops agree, or a loop fits the map (99.9 %, 6 dof)
     surprise_chi2: float = 200.0  # beyond this a loop contradicts the map whatever witnesses say
-    odometry_scale: float = 2.0  # agents' sigmas are this much too small
-    odometry_floor_deg: float = 0.02  # per edge, added in quadrature
-    odometry_floor_m: float = 0.002  # the same, for the position
+    odometry_scale: float = 1.0  # agents' sigmas are this much too small
+    odometry_floor_deg: float = 0.002  # per edge, added in quadrature
+    odometry_floor_m: float = 0.0002  # the same, for the position
+    gravity_floor_deg: float = 0.1  # the same, of an agent's up: what its calibration may be wrong
     most_loops: int = 10  # of a keyframe, when those of others that are taken out are moved to it
     max_pending: int = 200  # loops that wait for a witness; the oldest is dropped
     place_m: float = 0.5  # views further apart than this,

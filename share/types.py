@@ -117,6 +117,14 @@ def checked_cov(name: str, value: ArrayLike) -> F64:
     return cov
 
 
+def checked_sigma(name: str, value: float) -> float:
+    """`value` as a float. Raises ValueError if it is negative or not finite."""
+    sigma = float(value)
+    if not 0 <= sigma < np.inf:
+        raise ValueError(f"{name}: {sigma} is no standard deviation")
+    return sigma
+
+
 def _set(obj: object, **values: object) -> None:
     """Replace fields of a frozen dataclass during its own __post_init__."""
     for key, value in values.items():
@@ -211,14 +219,18 @@ class View:
 class Candidate:
     """A keyframe as the tracker offers it, before it is decided whether it is sent.
 
-    T_odom_body (4, 4). cov (6, 6): of the motion since the previous candidate. up (3,): unit
-    vector against gravity in the body frame, zeros if unknown. new_stretch: odometry broke before
-    this keyframe, so nothing relates it to the ones before.
+    T_odom_body (4, 4). T_last_body (4, 4): the motion since the previous candidate as it is known by now,
+    which the difference of the two T_odom_body was when each was told; of the first of a stretch it is
+    T_odom_body. cov (6, 6): of T_last_body. up (3,): unit vector against gravity in the body frame, zeros
+    if unknown; up_sigma: of both its angles, rad. new_stretch: odometry broke before this keyframe, so
+    nothing relates it to the ones before.
     """
 
     T_odom_body: F64
+    T_last_body: F64
     cov: F64
     up: F64
+    up_sigma: float
     view: View
     new_stretch: bool = False
 
@@ -226,8 +238,10 @@ class Candidate:
         _set(
             self,
             T_odom_body=checked_pose("T_odom_body", self.T_odom_body),
+            T_last_body=checked_pose("T_last_body", self.T_last_body),
             cov=checked_cov("cov", self.cov),
             up=checked("up", self.up, (3,), np.float64),
+            up_sigma=checked_sigma("up_sigma", self.up_sigma),
         )
 
 
@@ -237,9 +251,11 @@ class Keyframe:
 
     id: per agent run, rising from 0. reference: id of the sent keyframe that T_ref_body (4, 4) and
     its covariance (6, 6) are relative to, or -1: then T_ref_body is T_odom_body and a new stretch
-    of odometry begins. up (3,): unit vector against gravity in the body frame, zeros if unknown.
-    follows: id of the keyframe to be applied before this one, -1 for none; at least the reference,
-    and more where a new stretch begins, so that a reordering network cannot overtake with it.
+    of odometry begins. T_odom_body (4, 4): where the agent took itself to be, by which a correction
+    moves its odometry; T_ref_body is surer, since an estimator learns of the past too.
+    up (3,): unit vector against gravity in the body frame, zeros if unknown; up_sigma: of both its
+    angles, rad. follows: id of the keyframe to be applied before this one, -1 for none; at least the
+    reference, and more where a new stretch begins, so that a reordering network cannot overtake with it.
     """
 
     id: int
@@ -247,7 +263,9 @@ class Keyframe:
     stamp_ns: int
     T_ref_body: F64
     cov: F64
+    T_odom_body: F64
     up: F64
+    up_sigma: float
     view: View
     follows: int = -1
 
@@ -261,7 +279,9 @@ class Keyframe:
             self,
             T_ref_body=checked_pose("T_ref_body", self.T_ref_body),
             cov=checked_cov("cov", self.cov),
+            T_odom_body=checked_pose("T_odom_body", self.T_odom_body),
             up=checked("up", self.up, (3,), np.float64),
+            up_sigma=checked_sigma("up_sigma", self.up_sigma),
         )
 
 

@@ -265,7 +265,8 @@ class Town:
         at = self.now_ns
         tracked = ev.FrameTracked(k, person.stamp_ns(at), at, at + 4 * MS, TrackState.OK, T, True, k == 0)
         self.to_agent(peer, tracked)
-        candidate = Candidate(T, person.cov, np.zeros(3), view, k == 0)
+        T_last_body = T if k == 0 else se3.inverse(person.T_odom_body[-2]) @ T
+        candidate = Candidate(T, T_last_body, person.cov, np.zeros(3), 0.0, view, k == 0)
         self.to_agent(peer, ev.KeyframeMade(tracked, candidate))
 
     def _in(self, ns: int, act: Callable[[], None]) -> None:

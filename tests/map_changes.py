@@ -34,14 +34,13 @@ def keyframe(key: str, i: int, points: int = 40, first: bool = False) -> KeepKey
     T = pose(i) if begins else se3.inverse(pose(i - 1)) @ pose(i)
     cov = np.diag([1e-6, 1e-6, 1e-6, 1e-5, 1e-5, 2e-5])
     up = np.array([0.0, 0.0, 1.0])
-    own = Keyframe(i, -1 if begins else i - 1, 10**9 + i * 10**8, T, cov, up, view, i - 1)
-    return KeepKeyframe(key, own, pose(i))
+    own = Keyframe(i, -1 if begins else i - 1, 10**9 + i * 10**8, T, cov, pose(i), up, 0.01, view, i - 1)
+    return KeepKeyframe(key, own)
 
 
 def kept_keyframe(key: str, i: int, stretch: int = 0) -> KeptKeyframe:
     """The same, found again."""
-    sent = keyframe(key, i)
-    return KeptKeyframe(key, sent.keyframe, sent.T_odom_body, f"{key}/{stretch}", i)
+    return KeptKeyframe(key, keyframe(key, i).keyframe, f"{key}/{stretch}", i)
 
 
 def loop(i: int, j: int) -> Loop:
@@ -76,7 +75,7 @@ def told(kept: Kept) -> dict[str, object]:
 def _keyframe(k: KeptKeyframe) -> tuple[object, ...]:
     own = k.keyframe
     arrays = (
-        k.T_odom_body,
+        k.keyframe.T_odom_body,
         own.T_ref_body,
         own.cov,
         own.up,

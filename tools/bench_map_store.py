@@ -59,7 +59,8 @@ def keyframes() -> Callable[[int], KeepKeyframe]:
     step, up = np.eye(4), np.array([0.0, 0.0, 1.0])
 
     def make(i: int) -> KeepKeyframe:
-        return KeepKeyframe(RUN, Keyframe(i, i - 1, i * 10**8, step, np.eye(6) * 1e-6, up, view), step)
+        cov = np.eye(6) * 1e-6
+        return KeepKeyframe(RUN, Keyframe(i, i - 1, i * 10**8, step, cov, step, up, 0.01, view))
 
     return make
 

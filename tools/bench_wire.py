@@ -35,7 +35,9 @@ def messages() -> dict[str, Message]:
     return {
         "ping": Ping(1, 10**18),
         "pose": PoseUpdate(10**18, TrackState.OK, 100, np.eye(4)),
-        "keyframe_500": Keyframe(100, 99, 10**18, np.eye(4), np.eye(6), np.array([0, 0, 1.0]), view),
+        "keyframe_500": Keyframe(
+            100, 99, 10**18, np.eye(4), np.eye(6), np.eye(4), np.array([0, 0, 1.0]), 0.01, view
+        ),
     }
 
 

@@ -70,9 +70,13 @@ def _agent(actor: Actor, truth: Trajectory, seen: list[View], rng: np.random.Gen
 
 def _chained(T_odom_body: F64, cov: F64, stamps_ns: I64, seen: list[View]) -> tuple[Keyframe, ...]:
     """Candidates that are all sent. As a tracker has it, up is the z of odom."""
+    before = np.concatenate([np.eye(4)[None], T_odom_body[:-1]])
+    T_last_body = se3.orthonormal(se3.inverse(before) @ T_odom_body)
     chain, out = Chain(), []
-    for T, step, stamp_ns, view in zip(T_odom_body, cov, stamps_ns.tolist(), seen, strict=True):
-        candidate = Candidate(T, step, T[2, :3], view)
+    for T, T_last, step, stamp_ns, view in zip(
+        T_odom_body, T_last_body, cov, stamps_ns.tolist(), seen, strict=True
+    ):
+        candidate = Candidate(T, T_last, step, T[2, :3], Drift().tilt_rad, view)
         chain.extend(candidate)
         out.append(chain.keyframe(candidate, stamp_ns))
     return tuple(out)

@@ -56,7 +56,9 @@ class Walker:
                 int(stamps_ns[k]),
                 se3.inverse(T[k - 1]) @ T[k] if k else T[k],
                 cov[k],
+                T[k],
                 _up(T[k]),
+                Drift().tilt_rad,
                 self._seen_anew(self._track.keyframes[source].view),
                 number + k - 1,
             )

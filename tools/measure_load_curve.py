@@ -16,7 +16,6 @@ import os
 import sys
 import tempfile
 import time
-from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -35,10 +34,9 @@ from tool_main import exit_code  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.core.keeping import KeepKeyframe, KeepRun  # noqa: E402
-from share.geometry import se3  # noqa: E402
 from share.io.files import atomic_write, writable_dir  # noqa: E402
 from share.io.map_store import MapStore  # noqa: E402
-from share.types import F64, Keyframe  # noqa: E402
+from share.types import Keyframe  # noqa: E402
 
 ROOM_FOR = 10**7  # keyframes: no bound
 MARKS = (100, 200, 500, 1000, 2000, 3000, 5000, 7000, 10_000, 14_000, 20_000)
@@ -127,7 +125,6 @@ def hour(limit_s: float, every: int, most: int) -> Iterator[Row]:
     config = Config()
     timed = TimedMap(replace(config, edge=replace(config.edge, max_keyframes=most, max_waiting=1)))
     began, count = time.monotonic(), 0
-    feet: dict[str, F64] = defaultdict(lambda: np.eye(4))
     with tempfile.TemporaryDirectory(prefix="load-") as folder:
         store = MapStore.open(Path(folder) / "map.sqlite")
         store.load()
@@ -136,14 +133,12 @@ def hour(limit_s: float, every: int, most: int) -> Iterator[Row]:
                 timed.join(name, walker.hello)
                 store.write([KeepRun(name, walker.hello)])
                 continue
-            before = feet[name] if keyframe.reference >= 0 else np.eye(4)
-            feet[name] = se3.orthonormal(before @ keyframe.T_ref_body)
             timed.add(name, keyframe)
             if count % every == 0:
                 timed.look()
             if count % (3 * every) == 0:
                 timed.solve()
-            store.write([KeepKeyframe(name, keyframe, feet[name]), *timed.mapper.take_changes()])
+            store.write([KeepKeyframe(name, keyframe), *timed.mapper.take_changes()])
             count += 1
             if count % 45 == 0:  # 5 s
                 store.write([timed.mapper.poses()])

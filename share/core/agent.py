@@ -132,7 +132,7 @@ class Agent:
         last = self._ledger.last_acknowledged
         if last is None or last.keyframe.id < self._chain.first_of_stretch:
             return m.PoseUpdate(frame.stamp_ns, frame.state, -1, T_odom_body)
-        T_keyframe_body = inverse(last.T_odom_body) @ T_odom_body
+        T_keyframe_body = inverse(last.keyframe.T_odom_body) @ T_odom_body
         return m.PoseUpdate(frame.stamp_ns, frame.state, last.keyframe.id, T_keyframe_body)
 
     def _spend(self, now_ns: int) -> None:
@@ -142,7 +142,7 @@ class Agent:
         frame, candidate = self._waiting.frame, self._waiting.candidate
         self._waiting = None
         keyframe = self._chain.keyframe(candidate, frame.stamp_ns)
-        self._ledger.add(Entry(keyframe, candidate.T_odom_body, frame.index, frame.arrived_ns))
+        self._ledger.add(Entry(keyframe, frame.index, frame.arrived_ns))
         self._frame_done(frame, sent=True)
         if self._connected and self._clock.rtt_ms is not None:
             delay_ms = self._clock.rtt_ms + max(0.0, frame.track_ms)

@@ -269,7 +269,7 @@ class Edge:
         if complaint:
             self._record(now_ns, "odometry doubted", peer, complaint)
         assert peer.foot is not None
-        self._keep(KeepKeyframe(peer.key, keyframe, peer.foot.T_odom_body))
+        self._keep(KeepKeyframe(peer.key, keyframe))
         self._effects.append(Add(peer.key, keyframe))
 
     def _keep(self, *changes: Change) -> None:

@@ -28,17 +28,13 @@ class KeepRun:
 
 @dataclass(frozen=True, eq=False)
 class KeepKeyframe:
-    """A keyframe of a run, and where it stands in its odometry: T_odom_body (4, 4).
+    """A keyframe of a run.
 
     Numbers of a run rise; one that is not above all before was kept already, or retired, and changes nothing.
     """
 
     key: str
     keyframe: Keyframe
-    T_odom_body: F64
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "T_odom_body", checked_pose("T_odom_body", self.T_odom_body))
 
     @property
     def at(self) -> Key:
@@ -157,7 +153,7 @@ def placed(kept: Kept) -> dict[Key, tuple[str, F64]]:
         edge = edge_to(keyframe, kept.links)
         before = out.get(Key(keyframe.key, edge.reference))
         if before is None:
-            out[keyframe.at] = keyframe.stretch, keyframe.T_odom_body
+            out[keyframe.at] = keyframe.stretch, keyframe.keyframe.T_odom_body
         else:
             out[keyframe.at] = before[0], se3.orthonormal(before[1] @ edge.T_ref_body)
     return out

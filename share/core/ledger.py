@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from share.config import AgentConfig, LinkConfig
 from share.core.rate import seconds
 from share.geometry.se3 import compose_cov
-from share.types import F64, Keyframe
+from share.types import Keyframe
 from share.wire.messages import Ack, Welcome
 
 
@@ -17,7 +17,6 @@ class Entry:
     """A keyframe, its frame, and how far it has come."""
 
     keyframe: Keyframe
-    T_odom_body: F64
     frame: int
     arrived_ns: int
     attempts: int = 0  # in this life of the edge
@@ -154,4 +153,4 @@ def _inherit(keyframe: Keyframe, dropped: Keyframe) -> Keyframe:
 
 def _cut_loose(entry: Entry) -> Keyframe:
     """The keyframe at the beginning of a stretch, for an edge that has nothing before it."""
-    return replace(entry.keyframe, reference=-1, follows=-1, T_ref_body=entry.T_odom_body)
+    return replace(entry.keyframe, reference=-1, follows=-1, T_ref_body=entry.keyframe.T_odom_body)

@@ -98,10 +98,7 @@ class Mapper:
         poses = {} if kept.poses is None else dict(zip(kept.poses.keys, kept.poses.T_map_body, strict=True))
         agents = [name.rpartition("/")[0] for name in kept.stretches]
         placed = [
-            Placed(
-                k.at, k.stretch, k.ordinal, k.T_odom_body, edge_to(k, kept.links).cov, k.at not in kept.links
-            )
-            for k in kept.keyframes
+            _placed(found, edge_to(found, kept.links), found.at in kept.links) for found in kept.keyframes
         ]
         numbers = self._atlas.restore(agents, placed, kept.loops, poses)
         self._unseen = list(zip(numbers, kept.keyframes, strict=True))
@@ -288,6 +285,12 @@ class Mapper:
             "queries_skipped": self._lookups.skipped[agent],
             "map_id": self._atlas.current_map(agent),
         }
+
+
+def _placed(found: KeptKeyframe, edge: KeepLink, linked: bool) -> Placed:
+    return Placed(
+        found.at, found.stretch, found.ordinal, found.keyframe, edge.T_ref_body, edge.cov, not linked
+    )
 
 
 def _changes_of(taken: list[TakenOut]) -> list[Change]:

@@ -50,10 +50,10 @@ def mended(keyframes: Sequence[KeptKeyframe], links: Mapping[Key, KeepLink]) -> 
 
 def _tie(keyframe: KeptKeyframe, edge: KeepLink, before: KeptKeyframe | None) -> KeepLink:
     if before is None:
-        return KeepLink(keyframe.at, -1, keyframe.T_odom_body, edge.cov)
+        return KeepLink(keyframe.at, -1, keyframe.keyframe.T_odom_body, edge.cov)
     lost = max(1, edge.reference - before.at.id)
     cov: F64 = se3.compose_cov(edge.T_ref_body, lost * edge.cov, edge.cov)
-    T = se3.orthonormal(se3.inverse(before.T_odom_body) @ keyframe.T_odom_body)
+    T = se3.orthonormal(se3.inverse(before.keyframe.T_odom_body) @ keyframe.keyframe.T_odom_body)
     return KeepLink(keyframe.at, before.at.id, T, (cov + cov.T) / 2)
 
 

@@ -12,8 +12,7 @@ from share.core.finding import Finding
 from share.core.inorder import InOrder
 from share.core.keeping import Kept
 from share.core.rate import SECOND_NS
-from share.geometry import se3
-from share.types import F64, Keyframe, TrackState
+from share.types import Keyframe, TrackState
 from share.wire.messages import Hello
 
 _LEAP_M, _LEAP_M_S = 2.0, 10.0  # further than this, and so much more a second, nobody moves between keyframes
@@ -22,11 +21,10 @@ _MOST_VARIANCE = 100.0  # rad^2, m^2: says nothing; more would only upset the so
 
 @dataclass(frozen=True, eq=False)
 class Foot:
-    """Where the newest applied keyframe stands: its id, its stamp, T_odom_body (4, 4)."""
+    """The newest applied keyframe: its id, its stamp."""
 
     id: int
     stamp_ns: int
-    T_odom_body: F64
 
     def leaps(self, keyframe: Keyframe) -> float:
         """How far (m) the keyframe is from here, if nobody can have moved so far meanwhile, else 0."""
@@ -70,16 +68,15 @@ class Peer:
         Raises ValueError where what it refers to is not the keyframe before it.
         """
         complaint = None
-        if keyframe.reference < 0:
-            T_odom_body = keyframe.T_ref_body
-        elif self.foot is None or keyframe.reference != self.foot.id:
-            raise ValueError(f"keyframe {keyframe.id} refers to {keyframe.reference}, which is not the last")
-        else:
-            T_odom_body = se3.orthonormal(self.foot.T_odom_body @ keyframe.T_ref_body)
+        if keyframe.reference >= 0:
+            if self.foot is None or keyframe.reference != self.foot.id:
+                raise ValueError(
+                    f"keyframe {keyframe.id} refers to {keyframe.reference}, which is not the last"
+                )
             if leap_m := self.foot.leaps(keyframe):
                 complaint = f"keyframe {keyframe.id} is {leap_m:.0f} m from the one before: a new stretch"
-                keyframe = replace(keyframe, reference=-1, T_ref_body=T_odom_body)
-        self.foot = Foot(keyframe.id, keyframe.stamp_ns, T_odom_body)
+                keyframe = replace(keyframe, reference=-1, T_ref_body=keyframe.T_odom_body)
+        self.foot = Foot(keyframe.id, keyframe.stamp_ns)
         if (most := float(keyframe.cov.diagonal().max())) > _MOST_VARIANCE:
             complaint = complaint or f"keyframe {keyframe.id} has a variance of {most:.0e}; taken as unknown"
             keyframe = replace(keyframe, cov=keyframe.cov * (_MOST_VARIANCE / most))
@@ -115,6 +112,6 @@ def known_runs(kept: Kept) -> list[Known]:
     for run in kept.runs:
         foot = None
         if (found := last.get(run.key)) is not None:
-            foot = Foot(found.keyframe.id, found.keyframe.stamp_ns, found.T_odom_body)
+            foot = Foot(found.keyframe.id, found.keyframe.stamp_ns)
         out.append(Known(run.key, run.hello, foot, 0 if foot is None else foot.id + 1))
     return out

@@ -13,6 +13,7 @@ KEPT = 200  # samples that a guess in motion is averaged over
 SIZE_TOLERANCE = 0.08  # of gravity; the zero of an uncalibrated BMI055, a D435i's, is up to 0.07 off
 MAX_SHAKE = 0.6  # m/s^2, standard deviation: a headset worn by somebody who stands, motors idling
 MAX_TURN = 0.15  # rad/s
+SIGMA_RAD = float(np.radians(3.0))  # of up, for as long as nothing corrects it
 
 
 class AtRest:

@@ -60,6 +60,7 @@ class VisualTracker:
         self._keyframe_tracks = 0
         self._T_odom_keyframe = np.eye(4)
         self._new_stretch = True  # of the last keyframe
+        self._T_shown = np.eye(4)  # T_odom_body of the last keyframe that others were told of
         self._to_anchor = False  # the last frame is to become a keyframe of the local map
         self._lost_since_ns: int | None = None
         self._places_tried = 0
@@ -88,8 +89,10 @@ class VisualTracker:
         self._map.set_view(view)
         T_odom_body = self._T_odom_body()
         up = T_odom_body[2, :3] if self._gravity else np.zeros(3)
+        T_last_body = T_odom_body if self._new_stretch else se3.inverse(self._T_shown) @ T_odom_body
+        self._T_shown = T_odom_body
         cov = se3.compose_cov(self._T_cam_body, self._cov, np.zeros((6, 6)))
-        return Candidate(T_odom_body, cov, up, view, self._new_stretch)
+        return Candidate(T_odom_body, T_last_body, cov, up, gravity.SIGMA_RAD, view, self._new_stretch)
 
     # ------------------------------------------------------------------ the usual frame
 

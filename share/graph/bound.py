@@ -16,6 +16,7 @@ from share.config import GraphConfig
 from share.graph.chains import Equations
 from share.graph.descent import Minimum, weighted_jacobians
 from share.graph.linear import Edges
+from share.graph.plumb import equations as plumb_equations
 from share.graph.ways import Ways, on_the_way
 from share.types import F64, I64
 
@@ -23,13 +24,15 @@ _LEAST_WEIGHT = 1e-9  # of a loop that all else speaks against, so that it can b
 _UNKNOWN = 1e6 * np.eye(6)
 
 
-def covariances(n: int, edges: Edges, at: Minimum, anchor: int, wanted: I64, config: GraphConfig) -> F64:
+def covariances(edges: Edges, plumb: F64, at: Minimum, anchor: int, wanted: I64, config: GraphConfig) -> F64:
     """Covariances (K, 6, 6) of `wanted` (K,) of n poses relative to `anchor`, right perturbation.
+
+    plumb (n, 3): see `share.graph.plumb`; where there are any, tilts are relative to gravity.
 
     Every wanted pose must be joined to the anchor. Where edges differ so much in certainty (beyond some
     16 orders of magnitude) that nothing can be told, a sigma of 1000 rad and m says so.
     """
-    out = np.zeros((len(wanted), 6, 6))
+    n, out = len(plumb), np.zeros((len(wanted), 6, 6))
     free = np.flatnonzero(wanted != anchor)
     if not len(free):
         return out
@@ -37,9 +40,10 @@ def covariances(n: int, edges: Edges, at: Minimum, anchor: int, wanted: I64, con
     part = _surest(n, edges, edges.spread / weights, anchor, wanted[free], config)
     poses = np.unique(np.concatenate([edges.a[part], edges.b[part]]))
     inside = edges[part].between(*(np.searchsorted(poses, end[part]) for end in (edges.a, edges.b)))
-    equations = Equations(len(poses), inside, int(np.searchsorted(poses, anchor)))
+    equations = Equations(len(poses), inside, int(np.searchsorted(poses, anchor)), at.free)
     J = weighted_jacobians(at.at[part], weights[part], inside)
-    out[free] = _blocks_of_inverse(equations.information(J), np.searchsorted(poses, wanted[free]))
+    own = plumb_equations(at.poses[poses], plumb[poses])
+    out[free] = _blocks_of_inverse(equations.information(J, own), np.searchsorted(poses, wanted[free]))
     return out
 
 

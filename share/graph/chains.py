@@ -31,15 +31,15 @@ def chain_order(n: int, odometry: Edges) -> I64:
 
 class Equations:
     """What stays the same while the edges of n poses, in `chain_order`, are linearised again and
-    again: which block goes where. Pose `held` does not move."""
+    again: which block goes where. Pose `held` moves only as projector `free` (6, 6) lets it."""
 
-    def __init__(self, n: int, edges: Edges, held: int) -> None:
+    def __init__(self, n: int, edges: Edges, held: int, free: F64) -> None:
         from scipy.sparse import csr_array
 
         a, b, e = edges.a, edges.b, len(edges)
-        self._n, self._held = n, held
-        self._free = ((a != held)[:, None, None], (b != held)[:, None, None])
+        self._n, self._held, self._free = n, held, free
         ends = np.concatenate([a, b])
+        self._at_held = np.flatnonzero(ends == held)
         self._gather = csr_array((np.ones(2 * e), (ends, np.arange(2 * e))), shape=(n, 2 * e))
         rows, columns = np.concatenate([np.arange(n), ends]), np.concatenate([np.arange(n), b, a])
         self._order = np.lexsort((columns, rows))
@@ -53,15 +53,23 @@ class Equations:
     def __len__(self) -> int:
         return self._n
 
-    def step(self, J: tuple[F64, F64], whitened: F64, damping: float, tolerance: float) -> F64:
+    def step(
+        self,
+        J: tuple[F64, F64],
+        whitened: F64,
+        own: tuple[F64, F64],
+        damping: float,
+        tolerance: float,
+    ) -> F64:
         """The perturbations (n, 6) that solve the equations with their diagonal raised by `damping`.
 
-        J: two (E, 6, 6); whitened (E, 6). tolerance: of the equations' residual, relative. Raises
-        np.linalg.LinAlgError if the chains cannot be solved.
+        J: two (E, 6, 6); whitened (E, 6). own: slope (n, 6) and curvature (n, 6, 6) of what each pose knows
+        without an edge. tolerance: of the equations' residual, relative. Raises np.linalg.LinAlgError if
+        the chains cannot be solved.
         """
         from scipy.sparse.linalg import LinearOperator, cg
 
-        slope, diagonal, coupling = self._blocks(J, whitened)
+        slope, diagonal, coupling = self._blocks(J, whitened, own)
         diagonal[:, range(6), range(6)] *= 1 + damping
         whole = self._whole(diagonal, coupling)
         chains = _factorised(self._band(diagonal, coupling))
@@ -69,9 +77,9 @@ class Equations:
         step, _ = cg(whole, -slope.ravel(), rtol=tolerance, maxiter=MOST_ITERATIONS, M=easy)
         return np.asarray(step.reshape(-1, 6))
 
-    def information(self, J: tuple[F64, F64]) -> Any:
-        """J'J as a sparse matrix (6 n, 6 n), the held pose's part the identity."""
-        _, diagonal, coupling = self._blocks(J, np.zeros((len(J[0]), 6)))
+    def information(self, J: tuple[F64, F64], own: tuple[F64, F64]) -> Any:
+        """J'J as a sparse matrix (6 n, 6 n), the identity where the held pose is not free."""
+        _, diagonal, coupling = self._blocks(J, np.zeros((len(J[0]), 6)), own)
         whole = self._whole(diagonal, coupling).tocsc()
         whole.sum_duplicates()
         return whole
@@ -82,16 +90,21 @@ class Equations:
         blocks = np.concatenate([diagonal, coupling, np.swapaxes(coupling, 1, 2)])[self._order]
         return bsr_array((blocks, self._columns, self._starts), shape=(6 * self._n,) * 2)
 
-    def _blocks(self, J: tuple[F64, F64], whitened: F64) -> tuple[F64, F64, F64]:
+    def _blocks(self, J: tuple[F64, F64], whitened: F64, own: tuple[F64, F64]) -> tuple[F64, F64, F64]:
         """J'r (n, 6), and of J'J the blocks on the diagonal (n, 6, 6) and at every (a, b) (E, 6, 6)."""
-        both = np.concatenate([J[0] * self._free[0], J[1] * self._free[1]])
+        both = np.concatenate(J)
+        both[self._at_held] = both[self._at_held] @ self._free
         transposed = np.swapaxes(both, 1, 2)
         e = len(whitened)
         pull = (transposed.reshape(2, e, 6, 6) @ whitened[:, :, None]).reshape(2 * e, 6)
-        own = (transposed @ both).reshape(2 * e, 36)
-        diagonal = (self._gather @ own).reshape(-1, 6, 6)
-        diagonal[self._held] = np.eye(6)
-        return self._gather @ pull, diagonal, transposed[:e] @ both[e:]
+        squares = (transposed @ both).reshape(2 * e, 36)
+        slope, curvature = own
+        slope = self._gather @ pull + slope
+        diagonal = (self._gather @ squares).reshape(-1, 6, 6) + curvature
+        held, free = self._held, self._free
+        slope[held] = free @ slope[held]
+        diagonal[held] = free @ diagonal[held] @ free + np.eye(6) - free
+        return slope, diagonal, transposed[:e] @ both[e:]
 
     def _band(self, diagonal: F64, coupling: F64) -> F64:
         """LAPACK's lower band (12, 6 n) of the blocks on the diagonal and next to it."""

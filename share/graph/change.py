@@ -15,13 +15,15 @@ from share.types import F64, I64, checked
 class Change:
     """News of the graph. What is gone goes first, and a gone pose takes its edges along.
 
-    numbers (N,), poses (N, 4, 4), rigid: new ones, and known ones that lie elsewhere now. edge_ids (E,),
+    numbers (N,), poses (N, 4, 4), rigid: new ones, and known ones that lie elsewhere now; plumb (N, 3) of
+    each, see `share.graph.plumb`. edge_ids (E,),
     ends (E, 2), measured (E, 4, 4), covs (E, 6, 6): new edges, T_a_b with ends (a, b), right
     perturbation. is_loop (E,): may be false, so it is judged robustly. gone_edges, gone_poses: ids.
     """
 
     numbers: I64
     poses: F64
+    plumb: F64
     edge_ids: I64
     ends: I64
     measured: F64
@@ -35,6 +37,7 @@ class Change:
         shapes = {
             "numbers": ((n,), np.int64),
             "poses": ((n, 4, 4), np.float64),
+            "plumb": ((n, 3), np.float64),
             "edge_ids": ((e,), np.int64),
             "ends": ((e, 2), np.int64),
             "measured": ((e, 4, 4), np.float64),
@@ -52,12 +55,15 @@ class Change:
         edges: Iterable[tuple[int, Edge, bool]] = (),
         gone_edges: Iterable[int] = (),
         gone_poses: Iterable[int] = (),
+        plumb: Mapping[int, F64] | None = None,
     ) -> Change:
-        """From poses by number, and edges as (id, edge, may it be false)."""
-        edges = list(edges)
+        """From poses by number, and edges as (id, edge, may it be false). plumb: by number, of some of the
+        poses."""
+        edges, plumb = list(edges), plumb or {}
         return Change(
             np.array(list(poses), np.int64),
             np.array(list(poses.values()) or np.zeros((0, 4, 4)), np.float64),
+            np.array([plumb.get(number, np.zeros(3)) for number in poses], np.float64).reshape(-1, 3),
             np.array([i for i, _, _ in edges], np.int64),
             np.array([(edge.a, edge.b) for _, edge, _ in edges], np.int64).reshape(-1, 2),
             np.array([edge.T_a_b for _, edge, _ in edges], np.float64).reshape(-1, 4, 4),

@@ -15,6 +15,9 @@ from share.config import GraphConfig
 from share.geometry import se3
 from share.graph.chains import Equations
 from share.graph.linear import Edges, Residuals, jacobians, residuals
+from share.graph.plumb import cost as plumb_cost
+from share.graph.plumb import equations as plumb_equations
+from share.graph.plumb import tilting
 from share.types import F64
 
 _FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e8
@@ -23,34 +26,43 @@ _LEAST_CURVATURE = 0.5  # of a loop along its residual, beside that across; 0.3 
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """poses (N, 4, 4). at: the residuals there. weights (E,): what the kernel leaves of each edge's
-    information. reason: why there is no minimum and the poses are as they were, or empty."""
+    """poses (N, 4, 4). free (6, 6): what the held pose may do, a projector. at: the residuals there. weights
+    (E,): what the kernel leaves of each edge's information. reason: why there is no minimum and the poses
+    are as they were, or empty."""
 
     poses: F64
+    free: F64
     at: Residuals
     weights: F64
     iterations: int
     reason: str = ""
 
 
-def minimise(poses: F64, edges: Edges, held: int, config: GraphConfig) -> Minimum:
-    """From poses (N, 4, 4), in `chain_order`; pose `held` stays to the bit. Deterministic."""
+def minimise(poses: F64, plumb: F64, edges: Edges, held: int, config: GraphConfig) -> Minimum:
+    """From poses (N, 4, 4), in `chain_order`, with `share.graph.plumb` (N, 3) each. Pose `held` stays, to the
+    bit where no plumb line is known; where one is, it tilts about its place. Deterministic."""
     with np.errstate(all="ignore"):
-        return _minimise(poses, edges, held, config)
+        return _minimise(poses, plumb, edges, held, config)
 
 
-def _minimise(poses: F64, edges: Edges, held: int, config: GraphConfig) -> Minimum:
+def _minimise(poses: F64, plumb: F64, edges: Edges, held: int, config: GraphConfig) -> Minimum:
     at, damping, iterations = residuals(poses, edges), 0.0, 0
-    cost = _cost(at, edges, config)
+    free = tilting(poses[held]) if plumb.any() else np.zeros((6, 6))
+
+    def cost_of(at: Residuals, poses: F64) -> float:
+        return _cost(at, edges, config) + plumb_cost(poses, plumb)
+
+    cost = cost_of(at, poses)
     if not np.isfinite(cost):
-        return Minimum(poses, at, _weights(at, edges, config), 0, "the error is not finite to begin with")
-    equations = Equations(len(poses), edges, held)
-    while len(edges) and iterations < config.max_iterations and damping <= _MOST_DAMPING:
+        why = "the error is not finite to begin with"
+        return Minimum(poses, free, at, _weights(at, edges, config), 0, why)
+    equations = Equations(len(poses), edges, held, free)
+    while (len(edges) or free.any()) and iterations < config.max_iterations and damping <= _MOST_DAMPING:
         iterations += 1
-        step = _step(equations, at, edges, damping, config)
+        step = _step(equations, at, edges, plumb_equations(poses, plumb), damping, config)
         moved = poses @ se3.exp(step)
         there = residuals(moved, edges)
-        lower = _cost(there, edges, config)
+        lower = cost_of(there, moved)
         if not lower <= cost:  # nor if it is not finite
             damping = max(10 * damping, _FIRST_DAMPING)
             continue
@@ -58,7 +70,7 @@ def _minimise(poses: F64, edges: Edges, held: int, config: GraphConfig) -> Minim
         damping = damping / 10 if damping > _FIRST_DAMPING else 0.0
         if np.abs(step).max() < config.step_tolerance or gain <= config.relative_tolerance * cost:
             break
-    return Minimum(poses, at, _weights(at, edges, config), iterations)
+    return Minimum(poses, free, at, _weights(at, edges, config), iterations)
 
 
 def weighted_jacobians(at: Residuals, weights: F64, edges: Edges) -> tuple[F64, F64]:
@@ -68,14 +80,21 @@ def weighted_jacobians(at: Residuals, weights: F64, edges: Edges) -> tuple[F64, 
     return by_a * root, by_b * root
 
 
-def _step(equations: Equations, at: Residuals, edges: Edges, damping: float, config: GraphConfig) -> F64:
+def _step(
+    equations: Equations,
+    at: Residuals,
+    edges: Edges,
+    own: tuple[F64, F64],
+    damping: float,
+    config: GraphConfig,
+) -> F64:
     weights = _weights(at, edges, config)
     J, softness = weighted_jacobians(at, weights, edges), np.ones(len(edges))
     if not damping:
         J, softness = _softened(J, at, weights, edges)
     whitened = at.whitened * (np.sqrt(weights) / softness)[:, None]
     try:
-        return equations.step(J, whitened, damping, config.inner_tolerance)
+        return equations.step(J, whitened, own, damping, config.inner_tolerance)
     except np.linalg.LinAlgError:
         return np.full((len(equations), 6), np.nan)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from share.geometry import se3
 from share.types import F64, checked, checked_pose
 
 
@@ -23,6 +24,10 @@ class Edge:
             raise ValueError(f"edge: {self.a} - {self.b} does not join two poses")
         object.__setattr__(self, "T_a_b", checked_pose("T_a_b", self.T_a_b))
         object.__setattr__(self, "cov", checked("cov", self.cov, (6, 6), np.float64))
+
+    def reverse(self) -> Edge:
+        """The same, from the other end."""
+        return Edge(self.b, self.a, se3.inverse(self.T_a_b), se3.inverse_cov(self.T_a_b, self.cov))
 
     @property
     def spread(self) -> float:

@@ -30,7 +30,11 @@ class Solver:
     def clear(self) -> None:
         """Know nothing any more."""
         nothing = Change.of({})
-        self._numbers, self._poses = nothing.numbers, nothing.poses  # numbers rise
+        self._numbers, self._poses, self._plumb = (
+            nothing.numbers,
+            nothing.poses,
+            nothing.plumb,
+        )  # numbers rise
         self._ids, self._edges = nothing.edge_ids, _edges_of(nothing)  # their ends are numbers
 
     def __len__(self) -> int:
@@ -39,12 +43,14 @@ class Solver:
     def update(self, change: Change) -> None:
         """Take news in. Raises ValueError, and stays as it was, if an edge or a pose that should go is
         not known, if an edge's id is known already, or if an end of it is not there."""
-        numbers, poses = self._poses_after(change)
+        numbers, poses, plumb = self._poses_after(change)
         ids, edges = self._edges_after(change, numbers)
-        self._numbers, self._poses, self._ids, self._edges = numbers, poses, ids, edges
+        self._numbers, self._poses, self._plumb = numbers, poses, plumb
+        self._ids, self._edges = ids, edges
 
     def solve(self, anchor: int, wanted: Sequence[int] = ()) -> Solution:
-        """The most likely poses of all that is joined to pose `anchor`, which stays to the bit.
+        """The most likely poses of all that is joined to pose `anchor`, which stays where it is and, where
+        plumb lines are known, turns only to be upright.
 
         wanted: the poses whose covariances are asked for. What cannot be solved comes back as it
         was, with the reason. Deterministic. Raises ValueError if the anchor is not known or a
@@ -58,7 +64,8 @@ class Solver:
         rank = np.argsort(order)
         chained = local.between(rank[local.a], rank[local.b])
         held = int(rank[np.searchsorted(numbers, anchor)])
-        minimum = minimise(self._poses[part][order], chained, held, self._config)
+        plumb = self._plumb[part][order]
+        minimum = minimise(self._poses[part][order], plumb, chained, held, self._config)
         poses = minimum.poses[rank]
         if minimum.reason:
             goals = goals[:0]
@@ -67,7 +74,7 @@ class Solver:
         return Solution(
             numbers,
             poses,
-            covariances(len(part), chained, minimum, held, rank[goals], self._config),
+            covariances(chained, plumb, minimum, held, rank[goals], self._config),
             self._ids[touching][edges.is_loop],
             minimum.at.chi2[edges.is_loop],
             minimum.iterations,
@@ -86,14 +93,18 @@ class Solver:
         label = connected_components(graph, directed=False)[1]
         return np.flatnonzero(label == label[at]), np.flatnonzero(label[a] == label[at])
 
-    def _poses_after(self, change: Change) -> tuple[I64, F64]:
+    def _poses_after(self, change: Change) -> tuple[I64, F64, F64]:
         kept = np.ones(len(self._numbers), bool)
         kept[_places(self._numbers, change.gone_poses, "known")] = False
         numbers = np.union1d(self._numbers[kept], change.numbers)
-        poses = np.empty((len(numbers), 4, 4))
-        poses[np.searchsorted(numbers, self._numbers[kept])] = self._poses[kept]
-        poses[np.searchsorted(numbers, change.numbers)] = change.poses
-        return numbers, poses
+        poses, plumb = np.empty((len(numbers), 4, 4)), np.empty((len(numbers), 3))
+        for known, at, of_them in (
+            (self._numbers[kept], self._poses[kept], self._plumb[kept]),
+            (change.numbers, change.poses, change.plumb),
+        ):
+            places = np.searchsorted(numbers, known)
+            poses[places], plumb[places] = at, of_them
+        return numbers, poses, plumb
 
     def _edges_after(self, change: Change, numbers: I64) -> tuple[I64, Edges]:
         _require(np.isin(change.gone_edges, self._ids), change.gone_edges, "edge", "is not known")

@@ -37,13 +37,14 @@ class Applied:
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A keyframe as an earlier life kept it. stretch: by name. cov (6, 6): of the step that leads to it, as
-    the agent sent it or as the pose graph had it."""
+    """A keyframe as an earlier life kept it. stretch: by name. T_ref_body (4, 4), cov (6, 6): of the step
+    that leads to it, as the agent sent it or as the pose graph had it."""
 
     key: Key
     stretch: str
     ordinal: int
-    T_odom_body: F64
+    keyframe: Keyframe
+    T_ref_body: F64
     cov: F64
     as_sent: bool
 
@@ -129,7 +130,7 @@ class Atlas:
 
         Raises ValueError for a keyframe known already or whose reference is unknown.
         """
-        return self._chart.add(agent, keyframe, self._believed(keyframe.cov))
+        return self._chart.add(agent, keyframe, self._believed(keyframe.cov), self._plumb(keyframe))
 
     def restore(
         self,
@@ -149,8 +150,9 @@ class Atlas:
         numbers = []
         for found in keyframes:
             cov = self._believed(found.cov) if found.as_sent else found.cov
-            numbers.append(chart.trails.put(found.key, at[found.stretch], found.T_odom_body, found.ordinal))
-            chart.place(numbers[-1], cov)
+            T_odom_body = found.keyframe.T_odom_body
+            numbers.append(chart.trails.put(found.key, at[found.stretch], T_odom_body, found.ordinal))
+            chart.place(numbers[-1], found.T_ref_body, cov, self._plumb(found.keyframe))
             chart.poses[numbers[-1]] = T_map_body.get(found.key, chart.poses[numbers[-1]])
         for loop in loops:
             chart.tie(loop)
@@ -191,6 +193,12 @@ class Atlas:
         floor = [np.radians(c.odometry_floor_deg) ** 2] * 3 + [c.odometry_floor_m**2] * 3
         return c.odometry_scale**2 * cov + np.diag(floor)
 
+    def _plumb(self, keyframe: Keyframe) -> F64:
+        """See `share.graph.plumb`: no camera sits on its IMU better than it was calibrated."""
+        size = float(np.linalg.norm(keyframe.up))
+        sigma = np.hypot(keyframe.up_sigma, np.radians(self._config.gravity_floor_deg))
+        return keyframe.up / (size * sigma) if size else np.zeros(3)
+
     # ------------------------------------------------------------ the solver's side
 
     def due(self) -> list[str]:
@@ -210,7 +218,7 @@ class Atlas:
             stretches,
             chart.anchor(founder),
             tuple(chart.trails.stretches[s].nodes[-1] for s in stretches),
-            chart.ties.news(chart.poses),
+            chart.ties.news(chart.poses, chart.plumb),
             anew,
             tuple((agent, self._answers.pop(agent)) for agent in sorted(agents & self._answers.keys())),
         )

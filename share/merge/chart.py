@@ -20,32 +20,43 @@ from share.types import F64, Keyframe
 
 
 class Chart:
-    """poses: T_map_body (4, 4) of every node, by its number. founder: of the map of each stretch."""
+    """poses: T_map_body (4, 4) of every node, by its number. plumb: which way is up there, if it is known
+    (`share.graph.plumb`). founder: of the map of each stretch."""
 
     def __init__(self) -> None:
         self.trails = Trails()
         self.ties = Ties()
         self.poses: dict[int, F64] = {}
+        self.plumb: dict[int, F64] = {}
         self.founder: list[int] = []
         self.unsolved: set[int] = set()  # founders of maps with news for the solver
 
-    def add(self, agent: str, keyframe: Keyframe, cov: F64) -> int:
-        """The number of the new node. cov (6, 6): of its step from the one before, as it is believed."""
+    def add(self, agent: str, keyframe: Keyframe, cov: F64, plumb: F64) -> int:
+        """The number of the new node. cov (6, 6): of its step from the one before, as it is believed; so is
+        plumb (3,)."""
         number = self.trails.add(agent, keyframe)
-        self.place(number, cov)
+        self.place(number, keyframe.T_ref_body, cov, plumb)
         return number
 
-    def place(self, number: int, cov: F64) -> None:
-        """Give a new node its pose, by odometry, and tie it to the one before it."""
+    def place(self, number: int, T_ref_body: F64, cov: F64, plumb: F64) -> None:
+        """Give a new node its pose, by odometry, and tie it to the one before it, if there is one."""
         node, before = self.trails.nodes[number], self.trails.before(number)
         self.founder += range(len(self.founder), len(self.trails.stretches))
         if before is None:
             self.poses[number] = node.T_odom_body
         else:
-            T = self.trails.T_between(before, number)
-            self.ties.add(Edge(before, number, T, cov))
-            self.poses[number] = se3.orthonormal(self.poses[before] @ T)
+            self.ties.add(Edge(before, number, T_ref_body, cov))
+            self.poses[number] = se3.orthonormal(self.poses[before] @ T_ref_body)
+        if plumb.any():
+            self.plumb[number] = plumb
         self.ties.moved([number])
+
+    def forget(self, number: int) -> None:
+        """A node without edges goes."""
+        self.ties.forget(number)
+        self.trails.take_out(number)
+        del self.poses[number]
+        self.plumb.pop(number, None)
 
     # ------------------------------------------------------------ changes
 
@@ -90,7 +101,7 @@ class Chart:
         for number in numbers:
             before = self.trails.before(number)
             if before is not None:
-                T = self.poses[before] @ self.trails.T_between(before, number)
+                T = self.poses[before] @ self.step(before, number).T_a_b
                 self.poses[number] = se3.orthonormal(T)
 
     # ------------------------------------------------------------ looking things up
@@ -98,6 +109,14 @@ class Chart:
     def ends(self, loop: Loop) -> tuple[int, int]:
         """The nodes of its keyframes. Raises ValueError if one is unknown."""
         return self.trails.number(loop.a), self.trails.number(loop.b)
+
+    def step(self, before: int, number: int) -> Edge:
+        """The odometry edge from a node to the next of its stretch."""
+        for n in self.ties.touching(number):
+            edge = self.ties.edges[n]
+            if n not in self.ties.loops and before in (edge.a, edge.b):
+                return edge if edge.a == before else edge.reverse()
+        raise ValueError(f"odometry does not lead from node {before} to {number}")
 
     def stretch_of(self, key: Key) -> int:
         return self.trails.nodes[self.trails.number(key)].stretch

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from share.geometry import se3
 from share.graph.contract import contract
 from share.graph.posegraph import Edge
 from share.merge.chart import Chart
@@ -83,15 +82,13 @@ def take_out(chart: Chart, number: int, bonds: Bonds, most_loops: int) -> TakenO
     bonds.subtract(_pair(chart, edge) for _, edge in loops)
     for n in touching:
         ties.remove(n)
-    ties.forget(number)
-    trails.take_out(number)
-    del chart.poses[number]
+    chart.forget(number)
     if not odometry:
         return TakenOut(number, key, None, ())
     left = contract(number, odometry, [edge for _, edge in loops])
     for edge in left.odometry:
         ties.add(edge)
-    link = None if after is None else _link(chart, before, after, left.odometry)
+    link = None if after is None else _link(chart, before, after)
     pairs = [(old, edge) for (old, _), edge in zip(loops, left.loops, strict=True) if edge is not None]
     moved = [_move(chart, old, edge, bonds, most_loops) for old, edge in pairs]
     return TakenOut(number, key, link, tuple(loop for loop in moved if loop is not None))
@@ -106,13 +103,12 @@ def _unlike(poses: F64, apart_m: float, apart_rad: float) -> F64:
     return gap
 
 
-def _link(chart: Chart, before: int | None, after: int, odometry: tuple[Edge, ...]) -> Link:
+def _link(chart: Chart, before: int | None, after: int) -> Link:
     node = chart.trails.nodes[after]
     if before is None:
         return Link(node.key, None, node.T_odom_body, np.zeros((6, 6)))
-    (edge,) = odometry
-    cov = edge.cov if edge.b == after else se3.inverse_cov(edge.T_a_b, edge.cov)
-    return Link(node.key, chart.trails.nodes[before].key, chart.trails.T_between(before, after), cov)
+    edge = chart.step(before, after)
+    return Link(node.key, chart.trails.nodes[before].key, edge.T_a_b, edge.cov)
 
 
 def _move(chart: Chart, old: Loop, edge: Edge, bonds: Bonds, most_loops: int) -> Loop | None:

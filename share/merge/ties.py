@@ -66,14 +66,16 @@ class Ties:
             self._known.discard(pose)
             self._lost.add(pose)
 
-    def news(self, poses: Mapping[int, F64]) -> Change:
-        """All that the solver has not been told yet; it is taken as told. poses: of all numbers."""
+    def news(self, poses: Mapping[int, F64], plumb: Mapping[int, F64]) -> Change:
+        """All that the solver has not been told yet; it is taken as told. poses: of all numbers, as is
+        plumb (`share.graph.plumb`)."""
         edges = [(n, self.edges[n], n in self.loops) for n in sorted(self._fresh)]
         change = Change.of(
             {number: poses[number] for number in sorted(self._moved)},
             edges,
             sorted(self._gone),
             sorted(self._lost),
+            plumb,
         )
         self.anew = False
         self._known |= self._moved

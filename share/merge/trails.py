@@ -5,14 +5,14 @@ from __future__ import annotations
 from bisect import bisect_left
 from dataclasses import dataclass, field
 
-from share.geometry import se3
 from share.merge.join import Key
 from share.types import F64, Keyframe
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """A keyframe's place on its stretch: T_odom_body (4, 4). ordinal: how many came before it there."""
+    """A keyframe of a stretch. T_odom_body (4, 4): where its agent took itself to be. ordinal: how many
+    came before it there."""
 
     key: Key
     stretch: int
@@ -48,9 +48,9 @@ class Trails:
         if key in self._at:
             raise ValueError(f"keyframe {key} was added before")
         if keyframe.reference < 0:
-            return self.put(key, self.begin(agent), keyframe.T_ref_body)
+            return self.put(key, self.begin(agent), keyframe.T_odom_body)
         before = self.nodes[self.number(Key(agent, keyframe.reference))]
-        return self.put(key, before.stretch, se3.orthonormal(before.T_odom_body @ keyframe.T_ref_body))
+        return self.put(key, before.stretch, keyframe.T_odom_body)
 
     def begin(self, agent: str) -> int:
         """A new stretch of this agent, which is on it from now on."""
@@ -93,10 +93,6 @@ class Trails:
     def after(self, number: int) -> int | None:
         """The node after this one on its stretch; None for the newest."""
         return self._beside(number, +1)
-
-    def T_between(self, a: int, b: int) -> F64:
-        """Pose (4, 4) of node b in node a of the same stretch, by odometry."""
-        return se3.inverse(self.nodes[a].T_odom_body) @ self.nodes[b].T_odom_body
 
     def are_neighbours(self, a: int, b: int, gap: int) -> bool:
         """Fewer than `gap` keyframes apart on one stretch, so that odometry knows their pose best."""

@@ -22,7 +22,7 @@ from share.errors import WireError
 from share.types import DESCRIPTOR_BYTES, MAX_KEYPOINTS, AgentKind, Correction, Keyframe, TrackState, View
 from share.wire import messages as m
 
-VERSION = 1
+VERSION = 2
 MAX_HEADER_BYTES = 4096
 MAX_ARRAYS = 8
 MAX_FRAME_BYTES = MAX_KEYPOINTS * DESCRIPTOR_BYTES  # the largest array of any message
@@ -143,10 +143,11 @@ _LAYOUTS: dict[type, _Layout] = {
     Keyframe: _Layout(
         3,
         _keyframe,
-        _Scalars.of(id=Int64, reference=Int64, stamp_ns=Int64, follows=Int64),
+        _Scalars.of(id=Int64, reference=Int64, stamp_ns=Int64, follows=Int64, up_sigma=float),
         (
             _pose("T_ref_body"),
             _Array("cov", "<f8", (6, 6)),
+            _pose("T_odom_body"),
             _Array("up", "<f8", (3,)),
             _Array("view.uv", "<f4", (None, 2)),
             _Array("view.points", "<f4", (None, 3)),

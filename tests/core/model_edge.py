@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -33,12 +34,18 @@ def tracked(
     return ev.FrameTracked(k, 10**15 + at, at, at + round(ms * MS), TrackState.OK, T, candidate, new_stretch)
 
 
+_T_LAST: WeakKeyDictionary[Agent, np.ndarray] = WeakKeyDictionary()  # of its last candidate
+
+
 def handle(agent: Agent, event: ev.AgentEvent, now_ns: int) -> list[ev.AgentEffect]:
     """Gives the agent the event, and after a keyframe's pose the keyframe, as a tracker does."""
     effects = agent.handle(event, now_ns)
     if isinstance(event, ev.FrameTracked) and event.keyframe:
         assert event.T_odom_body is not None
-        candidate = Candidate(event.T_odom_body, COV, UP, EMPTY, event.new_stretch)
+        T = event.T_odom_body
+        T_last_body = se3.inverse(_T_LAST.get(agent, np.eye(4))) @ T
+        _T_LAST[agent] = T
+        candidate = Candidate(T, T_last_body, COV, UP, 0.01, EMPTY, event.new_stretch)
         effects = effects + agent.handle(ev.KeyframeMade(event, candidate), now_ns)
     return effects
 

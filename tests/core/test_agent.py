@@ -115,10 +115,10 @@ def test_bad_messages_are_counted_and_said_once_a_kind() -> None:
 
 def test_another_wire_version_is_said_in_words() -> None:
     agent = Agent(HELLO, Config())
-    newer = b"\x94\x02\x01\x90\x90"
+    newer = b"\x94\x03\x01\x90\x90"
     assert said(handle(agent, ev.Received([newer]), 0)) == [
         "a message from the edge is not understood: "
-        "header: peer speaks version 2, this is 1; update the older one"
+        "header: peer speaks version 3, this is 2; update the older one"
     ]
 
 

@@ -28,7 +28,7 @@ HELLO = m.Hello("ann", AgentKind.AR, 0xA000B, 400.0, np.eye(4))
 
 def keyframe(id: int, cov: np.ndarray | None = None, view: View = EMPTY) -> Keyframe:
     cov = 1e-6 * np.eye(6) if cov is None else cov
-    return Keyframe(id, id - 1, 10**8 * id, np.eye(4), cov, np.zeros(3), view, id - 1)
+    return Keyframe(id, id - 1, 10**8 * id, np.eye(4), cov, np.eye(4), np.zeros(3), 0.0, view, id - 1)
 
 
 def tell(edge: ed.Edge, message: m.Message, peer: int = HELLO.run_id) -> list[ed.Effect]:
@@ -46,15 +46,15 @@ def sent(effects: list, kind: type) -> list:
 
 @pytest.mark.parametrize(
     ("frame", "value"),
-    [(1, np.nan), (2, -1.0), (2, np.inf), (3, np.nan), (4, np.inf)],
-    ids=["pose", "covariance not positive", "covariance not finite", "up", "uv"],
+    [(1, np.nan), (2, -1.0), (2, np.inf), (3, np.nan), (4, np.nan), (5, np.inf)],
+    ids=["pose", "covariance not positive", "covariance not finite", "place", "up", "uv"],
 )
 def test_numbers_that_are_none_stop_at_the_door(frame, value):
     edge = ed.Edge(Config(), 7)
     tell(edge, HELLO)
     view = View(np.zeros((2, 2)), np.ones((2, 3)), np.zeros((2, 32), np.uint8))
     frames = [bytearray(f) for f in encode(keyframe(0, view=view))]
-    dtype = np.float64 if frame <= 3 else np.float32
+    dtype = np.float64 if frame <= 4 else np.float32
     frames[frame][:] = np.full(len(frames[frame]) // np.dtype(dtype).itemsize, value, dtype).tobytes()
     with pytest.raises(WireError):
         decode([bytes(f) for f in frames])

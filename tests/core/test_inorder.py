@@ -16,7 +16,7 @@ def keyframe(id_: int, follows: int | None = None, reference: int | None = None)
     """By default relative to its predecessor, as an agent's keyframes are."""
     follows = id_ - 1 if follows is None else follows
     reference = follows if reference is None else reference
-    return Keyframe(id_, reference, id_, np.eye(4), np.eye(6), np.zeros(3), EMPTY, follows)
+    return Keyframe(id_, reference, id_, np.eye(4), np.eye(6), np.eye(4), np.zeros(3), 0.0, EMPTY, follows)
 
 
 def ids(keyframes: list[Keyframe]) -> list[int]:

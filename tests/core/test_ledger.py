@@ -23,7 +23,8 @@ COV = np.diag([1.0, 2, 3, 4, 5, 6]) * 1e-6
 
 
 def candidate(k: int, new_stretch: bool = False) -> Candidate:
-    return Candidate(ODOMETRY[k], COV, np.array([0, 0, 1.0]), EMPTY, new_stretch)
+    T_last_body = ODOMETRY[k] if k == 0 or new_stretch else se3.inverse(ODOMETRY[k - 1]) @ ODOMETRY[k]
+    return Candidate(ODOMETRY[k], T_last_body, COV, np.array([0, 0, 1.0]), 0.01, EMPTY, new_stretch)
 
 
 def entries(n: int, new_stretches: tuple[int, ...] = ()) -> list[Entry]:
@@ -31,7 +32,7 @@ def entries(n: int, new_stretches: tuple[int, ...] = ()) -> list[Entry]:
     made = []
     for k in range(n):
         chain.extend(candidate(k, k in new_stretches))
-        made.append(Entry(chain.keyframe(candidate(k), k), ODOMETRY[k], frame=k, arrived_ns=k))
+        made.append(Entry(chain.keyframe(candidate(k), k), frame=k, arrived_ns=k))
     return made
 
 

@@ -41,7 +41,7 @@ def test_with_nothing_before_it_a_keyframe_begins_its_stretch():
     whole = mended(frames, {})
     for found in whole.keyframes[1:]:
         assert found.keyframe.reference == -1
-        assert np.array_equal(found.keyframe.T_ref_body, found.T_odom_body)
+        assert np.array_equal(found.keyframe.T_ref_body, found.keyframe.T_odom_body)
 
 
 def test_a_link_is_mended_as_a_link():

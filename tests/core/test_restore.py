@@ -38,8 +38,8 @@ class Life:
         T, view = person.step()
         id = len(person.T_odom_body) - 1
         T_ref_body = T if before is None else se3.inverse(before) @ T
-        keyframe = Keyframe(id, id - 1, id * 10**8, T_ref_body, 4e-6 * np.eye(6), np.zeros(3), view)
-        self.changes.append(KeepKeyframe(person.name, keyframe, T))
+        keyframe = Keyframe(id, id - 1, id * 10**8, T_ref_body, 4e-6 * np.eye(6), T, np.zeros(3), 0.0, view)
+        self.changes.append(KeepKeyframe(person.name, keyframe))
         self.mapper.add(person.name, keyframe)
         self.work()
 

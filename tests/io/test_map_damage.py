@@ -170,7 +170,7 @@ def test_a_lost_keyframe_that_others_hang_on(tmp_path):
     assert kept.next_keyframe == {ANN: 9}
     tie = kept.links[Key(ANN, 6)]
     assert tie.reference == 2
-    T_odom = {k.at.id: k.T_odom_body for k in kept.keyframes}
+    T_odom = {k.at.id: k.keyframe.T_odom_body for k in kept.keyframes}
     assert np.allclose(T_odom[2] @ tie.T_ref_body, T_odom[6], atol=1e-12)
     assert np.linalg.eigvalsh(tie.cov - link.cov)[0] > 0
     assert "1 keyframes lost the one before them and are tied to an earlier one" in kept.complaints

@@ -55,7 +55,7 @@ def test_all_is_found_again(path):
     for found, sent in zip(kept.keyframes, frames, strict=True):
         assert np.array_equal(found.keyframe.view.descriptors, sent.keyframe.view.descriptors)
         assert np.array_equal(found.keyframe.view.points, sent.keyframe.view.points)
-        assert np.array_equal(found.T_odom_body, sent.T_odom_body)
+        assert np.array_equal(found.keyframe.T_odom_body, sent.keyframe.T_odom_body)
     assert [(x.a.id, x.inliers) for x in kept.loops] == [(i, 20 + i) for i in range(0, 20, 4)]
     assert np.array_equal(kept.poses.T_map_body[5], pose(7) @ pose(2))
     assert kept.stretches == (f"{ANN}/0", f"{BOB}/0")
@@ -185,7 +185,7 @@ def schema_said(path, number):
     connection = sqlite3.connect(path, isolation_level=None)
     connection.execute("DELETE FROM about WHERE name = 'schema'")
     insert(connection, "about", ("schema", str(number)))
-    if number == 0:  # made up: loops did not count their inliers
+    if number == 1:  # made up: loops did not count their inliers
         connection.execute("ALTER TABLE loop RENAME COLUMN inliers TO matches")
     connection.close()
 
@@ -196,9 +196,9 @@ STEP = ("ALTER TABLE loop RENAME COLUMN matches TO inliers",)
 def test_a_newer_schema_is_left_alone(path):
     with MapStore.open(path) as store:
         store.write(small_map())
-    schema_said(path, 2)
+    schema_said(path, 3)
     before = path.read_bytes()
-    with pytest.raises(UsageError, match=r"newer SHARE \(schema 2, this one knows 1\)"):
+    with pytest.raises(UsageError, match=r"newer SHARE \(schema 3, this one knows 2\)"):
         MapStore.open(path)
     assert path.read_bytes() == before
 
@@ -207,17 +207,17 @@ def test_an_older_schema_is_brought_up_to_date_and_kept_beside(path, monkeypatch
     with MapStore.open(path) as store:
         store.write(small_map())
         whole = told(store.load())
-    schema_said(path, 0)
+    schema_said(path, 1)
     before = path.read_bytes()
-    with pytest.raises(UsageError, match="is of schema 0, from which no way leads to 1"):
+    with pytest.raises(UsageError, match="is of schema 1, from which no way leads to 2"):
         MapStore.open(path)
-    monkeypatch.setattr(schema, "STEPS", {0: STEP})
+    monkeypatch.setattr(schema, "STEPS", {1: STEP})
     with MapStore.read(path) as reader:
-        assert reader.schema == 0
+        assert reader.schema == 1
         assert told(reader.load()) == whole
     assert path.read_bytes() == before
     assert told(again(path)) == whole
-    assert path.with_name("room.sqlite.schema-0").read_bytes() == before
+    assert path.with_name("room.sqlite.schema-1").read_bytes() == before
     assert told(again(path)) == whole
     assert [name for name in files(path) if "damaged" in name] == []
 
@@ -225,16 +225,16 @@ def test_an_older_schema_is_brought_up_to_date_and_kept_beside(path, monkeypatch
 def test_a_step_that_fails_leaves_the_old_file(path, monkeypatch):
     with MapStore.open(path) as store:
         store.write(small_map())
-    schema_said(path, 0)
+    schema_said(path, 1)
     before = path.read_bytes()
-    monkeypatch.setattr(schema, "STEPS", {0: (*STEP, "ALTER TABLE nonsense RENAME TO sense")})
+    monkeypatch.setattr(schema, "STEPS", {1: (*STEP, "ALTER TABLE nonsense RENAME TO sense")})
     with pytest.raises(
-        StoreError, match="no such table: nonsense; it is of schema 0: use the SHARE that made it"
+        StoreError, match="no such table: nonsense; it is of schema 1: use the SHARE that made it"
     ):
         MapStore.open(path)
-    monkeypatch.setattr(schema, "STEPS", {0: STEP})
+    monkeypatch.setattr(schema, "STEPS", {1: STEP})
     assert len(again(path).keyframes) == 40
-    assert path.with_name("room.sqlite.schema-0").read_bytes() == before
+    assert path.with_name("room.sqlite.schema-1").read_bytes() == before
 
 
 # ---------------------------------------------------------------- the disk

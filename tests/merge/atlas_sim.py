@@ -11,7 +11,7 @@ from share.types import F64, Keyframe, View
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
 STEP = np.diag([0.002**2] * 3 + [0.005**2] * 3)
 SEEN = np.diag([0.003**2] * 3 + [0.01**2] * 3)
-UP = np.array([0.0, 0.0, 1.0])
+UP, UP_SIGMA = np.array([0.0, 0.0, 1.0]), float(np.radians(0.5))
 
 
 class Walker:
@@ -44,7 +44,8 @@ class Walker:
                 T = T @ se3.exp(rng.multivariate_normal(np.zeros(6), STEP))
                 odom = self.T_odom_body[-1] @ T
             self.T_odom_body.append(odom)
-            self.keyframes.append(Keyframe(i, -1 if fresh else i - 1, i * 10**8, T, STEP, UP, EMPTY))
+            before = -1 if fresh else i - 1
+            self.keyframes.append(Keyframe(i, before, i * 10**8, T, STEP, odom, UP, UP_SIGMA, EMPTY))
 
 
 def loop(a: Walker, i: int, b: Walker, j: int, rng: np.random.Generator, wrong: F64 | None = None) -> Loop:

@@ -74,7 +74,10 @@ def test_every_stretch_is_a_map_until_joined(ann: Walker, bob: Walker) -> None:
 def test_two_agents_are_joined_to_truth(ann: Walker, bob: Walker) -> None:
     atlas = atlas_of(ann, bob)
     rng = np.random.default_rng(0)
-    decisions = [atlas.propose(x) for x in near_loops(ann, bob, rng) + near_loops(bob, bob, rng)]
+    decisions, applied = [], []
+    for x in near_loops(ann, bob, rng) + near_loops(bob, bob, rng):
+        decisions.append(atlas.propose(x))
+        applied += settle(atlas)
     assert "would join two maps, 1 of 5 places that say so: waits" in decisions[0].reason
     joining = [k for k, d in enumerate(decisions) if d.joined]
     assert joining == [4]  # every one of these loops is at a place of its own
@@ -83,8 +86,7 @@ def test_two_agents_are_joined_to_truth(ann: Walker, bob: Walker) -> None:
     assert len(decisions[4].tied) == 5
     assert all(d.accepted for d in decisions[4:])
     before = error(np.array(ann.T_odom_body), ann.truth), error(np.array(bob.T_odom_body), bob.truth)
-    (applied,) = settle(atlas)
-    assert applied.corrections.keys() == {"ann", "bob"}
+    assert applied[-1].corrections.keys() == {"ann", "bob"}
     after = error(poses(atlas, ann, bob), truth(ann, bob))
     assert after < 0.06
     assert after < max(before)
@@ -96,7 +98,10 @@ def test_the_founders_gauge_never_moves(ann: Walker, bob: Walker) -> None:
     for x in near_loops(bob, ann, rng) + near_loops(ann, ann, rng):
         atlas.propose(x)
         settle(atlas)
-        assert np.array_equal(atlas.pose(Key("ann", 0)), ann.T_odom_body[0])
+        T = se3.inverse(ann.T_odom_body[0]) @ atlas.pose(Key("ann", 0))
+        assert np.array_equal(T[:3, 3], np.zeros(3))
+        turned = np.degrees(se3.so3_log(T[:3, :3]))
+        assert abs(turned[2]) < 1e-4 and np.abs(turned).max() < 0.5
         assert atlas.map_of(Key("ann", 5)) == "ann/0"
 
 
@@ -321,7 +326,12 @@ def test_a_false_join_is_taken_out_once_better_evidence_is_there(ann: Walker, bo
     assert [atlas.propose(x).accepted for x in false] == [False] * 4 + [True]
     settle(atlas)
     true = [replace(x, found=0.6) for x in near_loops(ann, bob, np.random.default_rng(0))]
-    first, second, third, fourth, *others = [atlas.propose(x) for x in true]
+    first, second, third, fourth = [atlas.propose(x) for x in true[:4]]
+    settle(atlas)
+    others = []
+    for x in true[4:]:
+        others.append(atlas.propose(x))
+        settle(atlas)
     assert "contradicts the map" in first.reason
     assert "1 places (weight 0.36) say so, 5 places (weight 1.06) do not" in first.reason
     assert not (first.dropped or second.dropped or third.dropped)

@@ -16,8 +16,9 @@ def chart_of(**lengths: int) -> tuple[Chart, dict[str, list[int]]]:
     chart, numbers = Chart(), {}
     step = se3.exp(np.array([0, 0, 0, 1.0, 0, 0]))
     for agent, count in lengths.items():
-        keyframes = [Keyframe(i, i - 1, i, step if i else np.eye(4), STEP, UP, EMPTY) for i in range(count)]
-        numbers[agent] = [chart.add(agent, keyframe, STEP) for keyframe in keyframes]
+        steps = [step if i else np.eye(4) for i in range(count)]
+        keyframes = [Keyframe(i, i - 1, i, T, STEP, T, UP, 0.01, EMPTY) for i, T in enumerate(steps)]
+        numbers[agent] = [chart.add(agent, keyframe, STEP, UP) for keyframe in keyframes]
     return chart, numbers
 
 

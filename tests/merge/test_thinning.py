@@ -22,7 +22,7 @@ def chart_of(*walkers: Walker) -> Chart:
     chart = Chart()
     for walker in walkers:
         for keyframe in walker.keyframes:
-            chart.add(walker.name, keyframe, keyframe.cov)
+            chart.add(walker.name, keyframe, keyframe.cov, keyframe.up)
     return chart
 
 

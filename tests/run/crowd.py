@@ -12,6 +12,7 @@ from edge_sim import Person, walls
 from share.config import Config
 from share.core import events as ev
 from share.core.agent import Agent
+from share.geometry import se3
 from share.io.transport import AgentLink, connect
 from share.types import F64, Candidate, TrackState, View
 from share.wire.messages import Hello
@@ -55,6 +56,7 @@ class Walker(threading.Thread):
     def __init__(self, hello: Hello, script: Script, address: str) -> None:
         super().__init__(name=hello.name, daemon=True)
         self.script, self.machine = script, Agent(hello, Config())
+        self._T_last = np.eye(4)  # of the last candidate
         self.lives: list[Life] = []
         self.maps: list[tuple[float, str]] = []
         self.odometry: list[F64] = []
@@ -101,7 +103,9 @@ class Walker(threading.Thread):
         frame = ev.FrameTracked(k, stamp, now, now, TrackState.OK, T, view is not None, k == 0)
         self._handle(link, frame)
         if view is not None:
-            candidate = Candidate(T, 4e-6 * np.eye(6), np.zeros(3), view, k == 0)
+            T_last_body = se3.inverse(self._T_last) @ T
+            self._T_last = T
+            candidate = Candidate(T, T_last_body, 4e-6 * np.eye(6), np.zeros(3), 0.0, view, k == 0)
             self._handle(link, ev.KeyframeMade(frame, candidate))
 
     def _handle(self, link: AgentLink, event: ev.AgentEvent) -> None:

@@ -51,11 +51,11 @@ def test_a_flipped_byte(path, tmp_path):
 def test_a_newer_schema(path, tmp_path):
     with MapStore.open(path) as store:
         store._db.execute("DELETE FROM about WHERE name = 'schema'")
-        insert(store._db, "about", ("schema", "2"))
+        insert(store._db, "about", ("schema", "3"))
     before = path.read_bytes()
     child = edge(tmp_path)
     assert child.wait(20) == 2
-    newer = "was made by a newer SHARE (schema 2, this one knows 1); use that, or give another file"
+    newer = "was made by a newer SHARE (schema 3, this one knows 2); use that, or give another file"
     assert child.said == f"share: {path}: {newer}\n"
     assert path.read_bytes() == before
 

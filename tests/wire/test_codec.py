@@ -27,7 +27,7 @@ def keyframe(n: int, id_: int = 7) -> Keyframe:
     points = rng.normal(size=(n, 3)).astype(np.float32)
     points[::3] = np.nan
     view = View(rng.normal(size=(n, 2)), points, rng.integers(0, 256, (n, 32)))
-    return Keyframe(id_, id_ - 1, 10**18, POSE, np.eye(6), np.array([0, 0, 1.0]), view)
+    return Keyframe(id_, id_ - 1, 10**18, POSE, np.eye(6), POSE, np.array([0, 0, 1.0]), 0.01, view)
 
 
 EXAMPLES: list[m.Message] = [
@@ -88,7 +88,7 @@ def test_a_pose_fits_into_200_bytes_and_a_keyframe_into_30_kb() -> None:
 def test_arrays_are_views_on_both_sides() -> None:
     sent = keyframe(500)
     frames = codec.encode(sent)
-    assert np.shares_memory(np.frombuffer(frames[6], np.uint8), sent.view.descriptors)
+    assert np.shares_memory(np.frombuffer(frames[7], np.uint8), sent.view.descriptors)
     got = codec.decode(copied(frames))
     assert isinstance(got, Keyframe)
     assert not got.view.descriptors.flags.writeable
@@ -114,7 +114,7 @@ def test_what_could_not_be_decoded_is_not_encoded(message: m.Message) -> None:
         codec.encode(message)
 
 
-def header(version: object = 1, code: object = 5, scalars: object = (1, 2), arrays: object = ()) -> bytes:
+def header(version: object = 2, code: object = 5, scalars: object = (1, 2), arrays: object = ()) -> bytes:
     return msgspec.msgpack.encode((version, code, scalars, arrays))
 
 
@@ -124,7 +124,7 @@ BAD = {
     "empty message": [],
     "header of 4097 bytes": [b"\0" * 4097],
     "header: ": [b""],
-    "peer speaks version 2, this is 1; update the older one": [header(version=2)],
+    "peer speaks version 3, this is 2; update the older one": [header(version=3)],
     "peer speaks version 9": [msgspec.msgpack.encode((9, "some", {"other": "layout"}))],
     "unknown message type 99": [header(code=99)],
     "Ping: Expected `int`": [header(scalars=("a", 2))],
@@ -132,20 +132,23 @@ BAD = {
     "Rate: a number is not finite": [header(code=20, scalars=(float("nan"),))],
     "Rate: rate: -1.0": [header(code=20, scalars=(-1.0,))],
     "Ping: 1 array frames, 0 declared, 0 expected": [header(), b""],
-    "PoseUpdate: 0 array frames, 1 declared": [header(1, 2, POSE_SCALARS, [("<f8", (4, 4))])],
-    "unknown dtype '|O'": [header(1, 2, POSE_SCALARS, [("|O", (4, 4))]), *T_FRAMES],
-    "T_keyframe_body: <f4 of shape": [header(1, 2, POSE_SCALARS, [("<f4", (4, 4))]), *T_FRAMES],
-    "T_keyframe_body: <f8 of shape (2, 8)": [header(1, 2, POSE_SCALARS, [("<f8", (2, 8))]), *T_FRAMES],
-    "T_keyframe_body: 127 bytes": [header(1, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\0" * 127],
-    "is not a rigid transform": [header(1, 2, POSE_SCALARS, [("<f8", (4, 4))]), *T_FRAMES],
-    "not finite": [header(1, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\xff" * 128],
-    "Invalid enum value 'LOSTER'": [header(1, 2, (1, "LOSTER", -1), [("<f8", (4, 4))]), *T_FRAMES],
-    "follows: 9": [header(1, 3, (7, -1, 0, 9), codec_table := [
-        ("<f8", (4, 4)), ("<f8", (6, 6)), ("<f8", (3,)), ("<f4", (0, 2)), ("<f4", (0, 3)), ("|u1", (0, 32))]),
-        POSE.tobytes(), np.eye(6).tobytes(), b"\0" * 24, b"", b"", b""],
-    "view.uv: <f4 of shape (2001, 2)": [header(1, 3, (7, -1, 0, 6), [
-        *codec_table[:3], ("<f4", (2001, 2)), *codec_table[4:]]),
-        POSE.tobytes(), np.eye(6).tobytes(), b"\0" * 24, b"\0" * 16008, b"", b""],
+    "PoseUpdate: 0 array frames, 1 declared": [header(2, 2, POSE_SCALARS, [("<f8", (4, 4))])],
+    "unknown dtype '|O'": [header(2, 2, POSE_SCALARS, [("|O", (4, 4))]), *T_FRAMES],
+    "T_keyframe_body: <f4 of shape": [header(2, 2, POSE_SCALARS, [("<f4", (4, 4))]), *T_FRAMES],
+    "T_keyframe_body: <f8 of shape (2, 8)": [header(2, 2, POSE_SCALARS, [("<f8", (2, 8))]), *T_FRAMES],
+    "T_keyframe_body: 127 bytes": [header(2, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\0" * 127],
+    "is not a rigid transform": [header(2, 2, POSE_SCALARS, [("<f8", (4, 4))]), *T_FRAMES],
+    "not finite": [header(2, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\xff" * 128],
+    "Invalid enum value 'LOSTER'": [header(2, 2, (1, "LOSTER", -1), [("<f8", (4, 4))]), *T_FRAMES],
+    "follows: 9": [header(2, 3, (7, -1, 0, 9, 0.0), codec_table := [
+        ("<f8", (4, 4)), ("<f8", (6, 6)), ("<f8", (4, 4)), ("<f8", (3,)),
+        ("<f4", (0, 2)), ("<f4", (0, 3)), ("|u1", (0, 32))]),
+        POSE.tobytes(), np.eye(6).tobytes(), POSE.tobytes(), b"\0" * 24, b"", b"", b""],
+    "up_sigma: -0.1 is no standard deviation": [header(2, 3, (7, -1, 0, 6, -0.1), codec_table),
+        POSE.tobytes(), np.eye(6).tobytes(), POSE.tobytes(), b"\0" * 24, b"", b"", b""],
+    "view.uv: <f4 of shape (2001, 2)": [header(2, 3, (7, -1, 0, 6, 0.0), [
+        *codec_table[:4], ("<f4", (2001, 2)), *codec_table[5:]]),
+        POSE.tobytes(), np.eye(6).tobytes(), POSE.tobytes(), b"\0" * 24, b"\0" * 16008, b"", b""],
 }  # fmt: skip
 
 
@@ -160,7 +163,7 @@ def test_says_what_is_wrong(says: str) -> None:
 def test_a_peer_cannot_write_into_our_log() -> None:
     for text in ("a\nb", "\x1b[2J", "x" * 2000):
         assert refused([header(1, 2, (1, text, -1), [(text, (4, 4))]), *T_FRAMES])
-        assert refused([header(1, 2, POSE_SCALARS, [(text, (4, 4))]), *T_FRAMES])
+        assert refused([header(2, 2, POSE_SCALARS, [(text, (4, 4))]), *T_FRAMES])
 
 
 def test_infinite_points_and_disagreeing_lengths_are_refused() -> None:

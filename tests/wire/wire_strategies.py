@@ -41,7 +41,10 @@ def keyframes(draw: st.DrawFn) -> Keyframe:
     id_ = draw(ids)
     reference = draw(st.integers(-1, id_ - 1))
     follows = draw(st.integers(reference, id_ - 1))
-    return Keyframe(id_, reference, draw(int64), draw(poses()), draw(covs), draw(ups), draw(views()), follows)
+    motion = draw(poses()), draw(covs), draw(poses())
+    return Keyframe(
+        id_, reference, draw(int64), *motion, draw(ups), draw(st.floats(0, 10)), draw(views()), follows
+    )
 
 
 amount = st.floats(0, 1e9)

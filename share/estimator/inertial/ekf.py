@@ -308,6 +308,11 @@ def _keep_columns(state: State, keep: NDArray[np.bool_]) -> None:
         state.cov = np.ascontiguousarray(state.cov[np.ix_(keep, keep)])
 
 
+def motion(state: State, a: int, b: int) -> F64:
+    """T_a_b (4, 4) between keyframes number a and b of the state."""
+    return se3.orthonormal(se3.inverse(state.poses[a]) @ state.poses[b])
+
+
 def motion_cov(state: State, a: int, b: int) -> F64:
     """Of T_a_b (6, 6) between keyframes number a and b of the state, perturbed on the right."""
     Ad = se3.adjoint(se3.inverse(state.poses[b]))

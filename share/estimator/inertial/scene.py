@@ -197,18 +197,19 @@ class Scene:
 
     def _forget(self) -> None:
         """Keyframes whose features are all gone, and, where there are too many, the most redundant ones.
-        Never the newest."""
+        Never the newest two: others are told of the motion between them."""
         s = self.state
+        newest = len(s.keyframes) - np.arange(1, 3)
         busy = np.isin(np.arange(len(s.keyframes)), s.host)
         leave = ~busy & ~np.array([self._memory.has(int(k)) for k in s.keyframes], bool)
-        leave[-1] = False
+        leave[-2:] = False
         while len(s.keyframes) - leave.sum() > self._config.max_keyframes:
             left = np.flatnonzero(~leave)
             apart = se3.log(se3.inverse(s.poses[left, None]) @ s.poses[None, left])
             cost = np.linalg.norm(apart[..., 3:], axis=-1) + np.linalg.norm(apart[..., :3], axis=-1)
             cost[np.diag_indices(len(left))] = np.inf
             nearest = cost.min(axis=1) + _FAR * busy[left]
-            nearest[-1] = np.inf
+            nearest[np.isin(left, newest)] = np.inf
             leave[left[np.argmin(nearest)]] = True
         self._memory.forget(s.keyframes[leave])
         self.looks = self.looks.take(~leave[s.host])

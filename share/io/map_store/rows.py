@@ -23,9 +23,9 @@ COLUMNS = {
     "run": ("key", "next", "codec", "hello"),
     "run_copy": ("key", "next", "codec", "hello"),
     "stretch": ("run", "nth"),
-    "keyframe": ("run", "id", "stretch", "ordinal", "codec", "T_odom_body", "message"),
+    "keyframe": ("run", "id", "stretch", "ordinal", "codec", "message"),
     "link": ("run", "id", "reference", "T_ref_body", "cov"),
-    "loop": ("a_run", "a_id", "b_run", "b_id", "T_a_b", "cov", "inliers"),
+    "loop": ("a_run", "a_id", "b_run", "b_id", "T_a_b", "cov", "inliers", "found"),
     "poses": ("keys", "T_map_body"),
 }
 
@@ -66,8 +66,7 @@ def of_run(run: KeepRun, next_keyframe: int) -> Row:
 
 
 def of_keyframe(keyframe: KeepKeyframe, stretch: int, ordinal: int) -> Row:
-    place = _bytes(keyframe.T_odom_body)
-    return (*keyframe.at, stretch, ordinal, codec.VERSION, place, _message(keyframe.keyframe))
+    return (*keyframe.at, stretch, ordinal, codec.VERSION, _message(keyframe.keyframe))
 
 
 def of_link(link: KeepLink) -> Row:
@@ -75,7 +74,8 @@ def of_link(link: KeepLink) -> Row:
 
 
 def of_loop(loop: Loop) -> Row:
-    return (*loop.a, *loop.b, _bytes(loop.T_a_b), _bytes(loop.cov), int(loop.inliers))
+    T_a_b, cov = _bytes(loop.T_a_b), _bytes(loop.cov)
+    return (*loop.a, *loop.b, T_a_b, cov, int(loop.inliers), float(loop.found))
 
 
 def of_poses(poses: KeepPoses) -> Row:
@@ -92,11 +92,11 @@ def run(row: Row) -> KeepRun:
 
 
 def keyframe(row: Row) -> KeptKeyframe:
-    agent, id, stretch, ordinal, version, place, message = row
+    agent, id, stretch, ordinal, version, message = row
     own = _decoded(Keyframe, version, message)
     if own.id != id:
         raise ValueError(f"keyframe {agent}:{id} says that it is {own.id}")
-    return KeptKeyframe(agent, own, _array(place, 4, 4), stretch_name(agent, stretch), ordinal)
+    return KeptKeyframe(agent, own, stretch_name(agent, stretch), ordinal)
 
 
 def stretch_name(run: str, nth: int) -> str:
@@ -110,8 +110,8 @@ def link(row: Row) -> KeepLink:
 
 
 def loop(row: Row) -> Loop:
-    a, a_id, b, b_id, T, cov, inliers = row
-    return Loop(Key(a, a_id), Key(b, b_id), _array(T, 4, 4), _array(cov, 6, 6), inliers)
+    a, a_id, b, b_id, T, cov, inliers, found = row
+    return Loop(Key(a, a_id), Key(b, b_id), _array(T, 4, 4), _array(cov, 6, 6), inliers, found)
 
 
 def poses(row: Row) -> KeepPoses:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from share import __version__
 from share.io.map_store.rows import insert, is_whole
 
-SCHEMA = 1
+SCHEMA = 2
 PAGE_BYTES = 8192
 
 TABLES = """
@@ -21,18 +21,19 @@ CREATE TABLE run(number INTEGER PRIMARY KEY, key TEXT UNIQUE, next INTEGER, code
 CREATE TABLE run_copy(number INTEGER PRIMARY KEY, key TEXT UNIQUE, next INTEGER, codec INTEGER, hello BLOB, crc INTEGER);
 CREATE TABLE stretch(number INTEGER PRIMARY KEY, run TEXT, nth INTEGER, crc INTEGER, UNIQUE(run, nth));
 CREATE TABLE keyframe(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, stretch INTEGER, ordinal INTEGER,
-    codec INTEGER, T_odom_body BLOB, message BLOB, crc INTEGER, UNIQUE(run, id));
+    codec INTEGER, message BLOB, crc INTEGER, UNIQUE(run, id));
 CREATE TABLE link(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, reference INTEGER, T_ref_body BLOB, cov BLOB,
     crc INTEGER, UNIQUE(run, id));
 CREATE TABLE loop(number INTEGER PRIMARY KEY, a_run TEXT, a_id INTEGER, b_run TEXT, b_id INTEGER, T_a_b BLOB,
-    cov BLOB, inliers INTEGER, crc INTEGER);
+    cov BLOB, inliers INTEGER, found REAL, crc INTEGER);
 CREATE INDEX loop_a ON loop(a_run, a_id);
 CREATE INDEX loop_b ON loop(b_run, b_id);
 CREATE TABLE poses(number INTEGER PRIMARY KEY, keys BLOB, T_map_body BLOB, crc INTEGER)
 """  # noqa: E501
 STATEMENTS = tuple(TABLES.strip().split(";\n"))
 
-# From each older schema to the next, in SQL. There is none yet: schema 1 is the first.
+# From each older schema to the next, in SQL. None leads on from schema 1: its keyframes do not say where
+# their agents took themselves to be.
 STEPS: Mapping[int, tuple[str, ...]] = {}
 
 
