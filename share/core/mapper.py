@@ -41,7 +41,8 @@ from share.types import Correction, Keyframe
 from share.wire.messages import Hello
 
 _TIMES = 5000  # of each kind of step that a report is about: the newest
-_SLACK = 1.05  # so much above the bound before keyframes are taken out, many at once
+_SLACK = 1.05  # so much above the bound before it is asked which keyframes may go
+_AT_ONCE = 2
 
 
 @dataclass
@@ -68,6 +69,7 @@ class Mapper:
         self._concern = Concern()
         self._verify: Verify | None = None
         self._looking = self._solving = False
+        self._leaving: list[int] = []  # keyframes that go next
         self._changes: list[Change] = []
         self._accounts: dict[str, _Account] = {}
         self._ms = {kind: deque[float](maxlen=_TIMES) for kind in ("place", "verify", "solve")}
@@ -84,8 +86,7 @@ class Mapper:
         self._see(number, agent, keyframe)
         self._lookups.add(agent, self._hellos[agent].kind, number)
         findings = [] if keyframe.reference >= 0 else [self._founding(agent)]
-        if len(self._atlas) > self._config.edge.max_keyframes * _SLACK:
-            self._thin()
+        self._thin()
         return findings
 
     def restore(self, kept: Kept) -> list[Finding]:
@@ -247,8 +248,15 @@ class Mapper:
         self._changes += [KeepLoop(loop) for loop in made.tied]
 
     def _thin(self) -> None:
+        """Two keyframes go while one comes: all at once would hold the others up."""
+        most = self._config.edge.max_keyframes
+        if not self._leaving and len(self._atlas) > most * _SLACK:
+            self._leaving = self._atlas.redundant(len(self._atlas) - most)
+        if not self._leaving:
+            return
         self._see_restored()
-        taken = self._atlas.thin(self._config.edge.max_keyframes)
+        taken = self._atlas.take_out(self._leaving[:_AT_ONCE])
+        del self._leaving[:_AT_ONCE]
         for out in taken:
             self._index.remove(out.number)
             del self._sights[out.number]

@@ -158,24 +158,40 @@ class Atlas:
             chart.tie(loop)
         return numbers
 
-    def thin(self, most: int) -> list[TakenOut]:
-        """Take keyframes out until `most` are left: those of which there are others like them, in the same
-        map. Anchors and the newest of every stretch stay."""
-        chart, c = self._chart, self._config
-        numbers = list(chart.poses)
-        stay = {n for s in chart.trails.stretches for n in (*s.nodes[:1], *s.nodes[-c.min_loop_gap :])}
+    def redundant(self, count: int) -> list[int]:
+        """Numbers of so many keyframes, if there are as many that may go, of which there are others like them
+        in the same map; the largest maps give first."""
+        chart, c, stay = self._chart, self._config, self._staying()
         by_map: dict[int, list[int]] = {}
-        for n in numbers:
+        for n in chart.poses:
             by_map.setdefault(chart.founder[chart.trails.nodes[n].stretch], []).append(n)
-        largest = max(by_map.values(), key=len)
-        may_go = [i for i, n in enumerate(largest) if n not in stay]
-        poses = np.array([chart.poses[n] for n in largest])
-        chosen = redundant(poses, may_go, len(numbers) - most, c.place_m, c.place_rad)
+        out: list[int] = []
+        for numbers in sorted(by_map.values(), key=len, reverse=True):
+            may_go = [i for i, n in enumerate(numbers) if n not in stay]
+            if may_go and len(out) < count:
+                poses = np.array([chart.poses[n] for n in numbers])
+                chosen = redundant(poses, may_go, count - len(out), c.place_m, c.place_rad)
+                out += [numbers[i] for i in chosen]
+        return out
+
+    def take_out(self, numbers: Iterable[int]) -> list[TakenOut]:
+        """These keyframes, but for those that have to stay by now."""
+        chart, stay = self._chart, self._staying()
         counts = bonds(chart)
-        taken = [take_out(chart, largest[i], counts, c.most_loops) for i in chosen]
+        going = [n for n in numbers if n in chart.poses and n not in stay]
+        taken = [take_out(chart, n, counts, self._config.most_loops) for n in going]
         chart.find_maps()
         self._judge.forget({out.key for out in taken})
         return taken
+
+    def _staying(self) -> set[int]:
+        """Keyframes that hold a map's gauge, and the newest of every agent."""
+        chart, gap = self._chart, self._config.min_loop_gap
+        current = {
+            s for stretch in chart.trails.stretches if (s := chart.trails.current(stretch.agent)) is not None
+        }
+        newest = {n for s in current for n in chart.trails.stretches[s].nodes[-gap:]}
+        return newest | {chart.anchor(f) for f in set(chart.founder) if chart.trails.stretches[f].nodes}
 
     def propose(self, loop: Loop) -> Decision:
         """A verified loop from candidate a to query b: accepted, waiting, or refused, with the reason.

@@ -155,14 +155,13 @@ class Chart:
         T_odom_body = self.trails.nodes[number].T_odom_body
         return se3.orthonormal(self.poses[number] @ se3.inverse(T_odom_body))
 
-    def between(self, a: int, goals: Sequence[int]) -> list[Known]:
-        """Pose of each goal in node a of the same map, as the map has it now."""
-        out = []
-        for goal, cov in zip(goals, self.ties.roads.known_from(a, goals, self.poses), strict=True):
+    def between(self, a: int, goals: Sequence[int]) -> Known:
+        """Poses (N, 4, 4) of the goals in node a of the same map, as the map has them now."""
+        covs = self.ties.roads.known_from(a, goals, self.poses)
+        for goal, cov in zip(goals, covs, strict=True):
             if cov is None:
                 raise ValueError(f"nodes {a} and {goal} are not in one map")
-            out.append(Known(se3.inverse(self.poses[a]) @ self.poses[goal], cov))
-        return out
+        return Known(se3.inverse(self.poses[a]) @ np.array([self.poses[n] for n in goals]), np.array(covs))
 
     def find_maps(self) -> None:
         """Every stretch's founder, from the loops: the connected parts."""

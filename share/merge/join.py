@@ -7,6 +7,7 @@ Mangelson et al., ICRA 2018.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -66,13 +67,17 @@ class Loop:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A relative pose T (4, 4) and its covariance (6, 6)."""
+    """A relative pose T (..., 4, 4) and its covariance (..., 6, 6), or many of them."""
 
     T: F64
     cov: F64
 
     def then(self, other: Known) -> Known:
         return Known(self.T @ other.T, se3.compose_cov(other.T, self.cov, other.cov))
+
+    def __iter__(self) -> Iterator[Known]:
+        """Each of many."""
+        return (Known(T, cov) for T, cov in zip(self.T, self.cov, strict=True))
 
 
 @dataclass(frozen=True)
@@ -94,12 +99,20 @@ def opposite(known: Known) -> Known:
 
 def disagreement(first: Known, second: Known) -> Disagreement:
     """Of two independent estimates of the same pose."""
+    xi, chi2 = _apart(first, second)
+    metres, radians = np.linalg.norm(xi[3:]), np.linalg.norm(xi[:3])
+    return Disagreement(float(chi2), float(metres), float(np.degrees(radians)))
+
+
+def witness_chi2(first: Loop, a1_a2: Known, second: Sequence[Loop], b2_b1: Known) -> F64:
+    """By how much each of N loops disagrees with the first (N,), given the ways (N, ...) between their ends
+    on either side."""
+    said = Known(np.array([loop.T_a_b for loop in second]), np.array([loop.cov for loop in second]))
+    return _apart(Known(first.T_a_b, first.cov), a1_a2.then(said).then(b2_b1))[1]
+
+
+def _apart(first: Known, second: Known) -> tuple[F64, F64]:
+    """xi (..., 6) from the one to the other, and its squared Mahalanobis length (...)."""
     xi = se3.log(se3.inverse(first.T) @ second.T)
-    chi2 = float(xi @ np.linalg.solve(first.cov + second.cov, xi))
-    return Disagreement(chi2, float(np.linalg.norm(xi[3:])), float(np.degrees(np.linalg.norm(xi[:3]))))
-
-
-def witness_disagreement(first: Loop, a1_a2: Known, second: Loop, b2_b1: Known) -> Disagreement:
-    """Of two loops, given the ways between their ends on either side."""
-    told = a1_a2.then(Known(second.T_a_b, second.cov)).then(b2_b1)
-    return disagreement(Known(first.T_a_b, first.cov), told)
+    told = np.linalg.solve(first.cov + second.cov, xi[..., None])[..., 0]
+    return xi, np.asarray((xi * told).sum(-1))

@@ -14,7 +14,7 @@ from share.config import MergeConfig
 from share.merge.chart import Chart
 from share.merge.cut import fewest
 from share.merge.evidence import Evidence, near, places, weigh
-from share.merge.join import Disagreement, Key, Known, Loop, disagreement, opposite, witness_disagreement
+from share.merge.join import Disagreement, Key, Known, Loop, disagreement, opposite, witness_chi2
 from share.merge.places import near_any
 
 
@@ -56,7 +56,10 @@ class Judge:
     def settle(self) -> tuple[Loop, ...]:
         """Those that waited and fit the map that they are in by now are believed."""
         inside = [loop for loop in self.waiting if self._chart.same_map(*self._chart.ends(loop))]
-        fitting = [loop for loop in inside if self._gap(loop).chi2 <= self._config.agree_chi2]
+        gaps = self._gaps(inside)
+        fitting = [
+            loop for loop, gap in zip(inside, gaps, strict=True) if gap.chi2 <= self._config.agree_chi2
+        ]
         self._believe(fitting)
         return tuple(fitting)
 
@@ -68,18 +71,26 @@ class Judge:
     # ------------------------------------------------------------ within a map
 
     def _close(self, loop: Loop) -> Decision:
-        gap = self._gap(loop)
+        (gap,) = self._gaps([loop])
         if gap.chi2 <= self._config.agree_chi2:
             return self._accept([loop], f"loop {loop}: fits the map, {gap}")
         if gap.chi2 > self._config.surprise_chi2:
             return self._contradiction(loop, f"loop {loop}: contradicts the map, {gap}")
         return self._corrected(loop, f"loop {loop}: fits the map badly ({gap})")
 
-    def _gap(self, loop: Loop) -> Disagreement:
-        """Between what the loop says and what its map knows."""
-        a, b = self._chart.ends(loop)
-        (known,) = self._chart.between(b, [a])
-        return disagreement(opposite(known), Known(loop.T_a_b, loop.cov))
+    def _gaps(self, loops: Sequence[Loop]) -> list[Disagreement]:
+        """Between what each loop says and what its map knows."""
+        ends = [self._chart.ends(loop) for loop in loops]
+        to = {b: [a for a, other in ends if other == b] for b in {b for _, b in ends}}
+        known = {
+            (a, b): k
+            for b, goals in to.items()
+            for a, k in zip(goals, self._chart.between(b, goals), strict=True)
+        }
+        return [
+            disagreement(opposite(known[end]), Known(loop.T_a_b, loop.cov))
+            for loop, end in zip(loops, ends, strict=True)
+        ]
 
     def _corrected(self, loop: Loop, why: str) -> Decision:
         """The map has drifted, if another loop elsewhere says so too."""
@@ -179,11 +190,8 @@ class Judge:
             return []
         (a, b), ends = self._chart.ends(loop), [self._chart.ends(x) for x in facing]
         from_a = self._chart.between(a, [x for x, _ in ends])
-        to_b = [opposite(known) for known in self._chart.between(b, [y for _, y in ends])]
-        return [
-            (other, witness_disagreement(loop, a_a, other, b_b).chi2)
-            for other, a_a, b_b in zip(facing, from_a, to_b, strict=True)
-        ]
+        to_b = opposite(self._chart.between(b, [y for _, y in ends]))
+        return list(zip(facing, witness_chi2(loop, from_a, facing, to_b).tolist(), strict=True))
 
     def _facing(self, loop: Loop, other: Loop) -> Loop | None:
         """The other loop, from where this one comes from to where it goes, if it has such ends and is

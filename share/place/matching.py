@@ -36,6 +36,12 @@ def hamming(a: U8, b: U8) -> NDArray[np.uint16]:
     return out
 
 
+def apart(a: U8, b: U8) -> I64:
+    """Differing bits (N,) of descriptors a (N, 32) and b (N, 32), each with its own."""
+    differ = np.ascontiguousarray(a).view(np.uint64) ^ np.ascontiguousarray(b).view(np.uint64)
+    return np.asarray(np.bitwise_count(differ).sum(1, dtype=np.int64))
+
+
 def near(distance: NDArray[np.uint16], max_bits: int) -> Pairs:
     """All pairs of a distance matrix (N, K) that differ in at most `max_bits`."""
     at = np.flatnonzero(distance <= max_bits)

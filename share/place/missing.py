@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.geometry import se3
-from share.place.matching import hamming
+from share.place.matching import apart
 from share.place.refine import move
 from share.place.verify import Sight
-from share.types import F64
+from share.types import F64, I64
 
 _BESIDE_PX = 6.0  # a point is found if one as like as this lies beside where it should be
 _BITS = 90
@@ -40,22 +40,27 @@ class Missing(NamedTuple):
 def missing(query: Sight, candidate: Sight, T_c_q: F64) -> Missing:
     """With T_c_q (4, 4): the query's body in the candidate's body frame."""
     T = se3.inverse(candidate.T_body_cam0) @ T_c_q @ query.T_body_cam0
-    bits = hamming(query.view.descriptors, candidate.view.descriptors)
-    there = _seen(T, query.y, candidate.y, bits, candidate.focal)
-    back = _seen(se3.inverse(T), candidate.y, query.y, bits.T, query.focal)
+    there = _seen(T, query, candidate)
+    back = _seen(se3.inverse(T), candidate, query)
     return Missing(len(there) + len(back), int(there.sum() + back.sum()))
 
 
-def _seen(T: F64, source: F64, target: F64, bits: NDArray[np.uint16], focal: float) -> NDArray[np.bool_]:
+def _seen(T: F64, source: Sight, target: Sight) -> NDArray[np.bool_]:
     """Of each source point that the target camera ought to see, whether it does."""
-    if not len(source) or not len(target):
+    y = target.y
+    if not len(source.view) or not len(y):
         return np.zeros(0, bool)
-    moved = move(T, source)
-    inside = np.flatnonzero(_inside(moved, target))
+    moved = move(T, source.y)
+    inside = np.flatnonzero(_inside(moved, y))
     moved = moved[inside]
-    px = focal * np.linalg.norm(moved[:, None, :2] - target[None, :, :2], axis=2)
-    found = ((px < _BESIDE_PX) & (bits[inside] <= _BITS)).any(1)
-    return np.asarray(found[_open(moved[:, 2], px, target[:, 2])])
+    rows, cols, px = _beside(target.focal * moved[:, :2], target.focal * y[:, :2])
+    bits = apart(source.view.descriptors[inside[rows]], target.view.descriptors[cols])
+    found = np.zeros(len(inside), bool)
+    found[rows[(px < _BESIDE_PX) & (bits <= _BITS)]] = True
+    around = np.full(len(inside), np.inf)  # least inverse depth of those near it
+    np.fmin.at(around, rows, y[cols, 2])
+    hides_nothing = around <= _HIDDEN * moved[:, 2] + _HIDDEN_RHO
+    return np.asarray(found[hides_nothing])
 
 
 def _inside(moved: F64, target: F64) -> NDArray[np.bool_]:
@@ -65,7 +70,10 @@ def _inside(moved: F64, target: F64) -> NDArray[np.bool_]:
     return np.asarray(((moved[:, :2] > low + margin) & (moved[:, :2] < high - margin)).all(1))
 
 
-def _open(rho: F64, px: F64, rho_target: F64) -> NDArray[np.bool_]:
-    """Whether something around it is known that is as far, so that nothing need hide it."""
-    around = np.where((px < _AROUND_PX) & np.isfinite(rho_target), rho_target, np.inf)
-    return np.asarray(around.min(1, initial=np.inf) <= _HIDDEN * rho + _HIDDEN_RHO)
+def _beside(a: F64, b: F64) -> tuple[I64, I64, F64]:
+    """Which of a (N, 2) and b (K, 2) are near, pixels: rows, columns, distances (M,)."""
+    square = (a[:, :1] - b[:, 0]) ** 2
+    square += (a[:, 1:] - b[:, 1]) ** 2
+    at = np.flatnonzero(square < _AROUND_PX**2)
+    rows, cols = np.divmod(at, len(b))
+    return rows, cols, np.sqrt(square.ravel()[at])

@@ -62,11 +62,16 @@ def move(T: F64, y: F64) -> F64:
 def by_pose(moved: F64) -> F64:
     """dy'/dxi (N, 3, 6) for Exp(xi) T, at y' = `moved` (N, 3)."""
     u, v, rho = moved.T
-    zero, one = np.zeros_like(u), np.ones_like(u)
-    by_u = [-u * v, one + u * u, -v, rho, zero, -u * rho]
-    by_v = [-one - v * v, u * v, u, zero, rho, -v * rho]
-    by_rho = [-rho * v, rho * u, zero, zero, zero, -rho * rho]
-    return np.stack(by_u + by_v + by_rho, axis=1).reshape(-1, 3, 6)
+    out = np.zeros((len(moved), 3, 6))
+    by_u, by_v, by_rho = out[:, 0], out[:, 1], out[:, 2]
+    out[:, :, 5] = -rho[:, None] * moved
+    by_u[:, 3] = by_v[:, 4] = rho
+    by_u[:, 2], by_v[:, 2] = -v, u
+    by_v[:, 1] = u * v
+    by_u[:, 0], by_u[:, 1] = -by_v[:, 1], 1 + u * u
+    by_v[:, 0] = -1 - v * v
+    by_rho[:, 0], by_rho[:, 1] = -rho * v, rho * u
+    return out
 
 
 def by_keypoint(T: F64, y: F64, moved: F64) -> F64:
@@ -146,9 +151,11 @@ class _Problem:
     def linear(self, T_c_q: F64, information: F64) -> _Linear:
         back = se3.inverse(T_c_q)
         Jr = np.zeros((len(self.rows), 3, 7))
-        Jr[self._ways[0].at] = self._ways[0].linear(T_c_q, np.eye(6))
-        # (Exp(xi) T)^-1 = Exp(-Ad(T^-1) xi) T^-1
-        Jr[self._ways[1].at] = self._ways[1].linear(back, -se3.adjoint(back))
+        Jr[self._ways[0].at] = self._ways[0].linear(T_c_q)
+        if len(self._ways[1].at):  # (Exp(xi) T)^-1 = Exp(-Ad(T^-1) xi) T^-1
+            there = self._ways[1].linear(back)
+            there[:, :, :6] = there[:, :, :6] @ -se3.adjoint(back)
+            Jr[self._ways[1].at] = there
         WJr = information @ Jr
         d2 = (Jr[:, :, 6] * WJr[:, :, 6]).sum(1)
         d2[Jr[:, 0, 3] == 0] = _NOT_SEEN
@@ -174,11 +181,11 @@ class _Way:
         S[np.isnan(moved[:, 2])] = np.eye(3)
         return np.asarray(np.linalg.inv(S))
 
-    def linear(self, T: F64, by_xi: F64) -> F64:
-        """[J r] (N, 3, 7); zeros for a point behind the camera, whose rows then count for nothing."""
+    def linear(self, T: F64) -> F64:
+        """[J r] (N, 3, 7) by Exp(xi) T; zeros for a point behind the camera: its rows count for nothing."""
         moved = move(T, self.source)
         r = self.target - moved
         r[np.isnan(self.target[:, 2]), 2] = 0.0
-        out = np.concatenate([by_pose(moved) @ by_xi, r[:, :, None]], axis=2)
+        out = np.concatenate([by_pose(moved), r[:, :, None]], axis=2)
         out[np.isnan(moved[:, 2])] = 0.0
         return out

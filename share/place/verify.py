@@ -118,7 +118,7 @@ def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> V
     upright = bool(query.up.any() and candidate.up.any())
     if not upright and len(roughs) > 1:
         raise _RefusedError("the two directions differ, and no gravity decides")
-    fit = _best([_fit(rough, alike, y_q, y_c, noises, config) for rough in roughs], config)
+    fit = _best(_fits(roughs, alike, y_q, y_c, noises, config), config)
     _need(fit.inliers, config.min_inliers, "inliers")
     for y, whose in ((fit.y_q, "query"), (fit.y_c, "candidate")):
         known = int(np.isfinite(y[:, 2]).sum())
@@ -135,16 +135,26 @@ def _noise(sight: Sight, config: PlaceConfig) -> Noise:
     return Noise(config.sigma_px / sight.focal, config.sigma_inverse_depth)
 
 
-def _fit(
-    rough: F64, alike: Pairs, y_q: F64, y_c: F64, noises: tuple[Noise, Noise], config: PlaceConfig
-) -> _Fit:
-    """Matches again beside where `rough` moves the points, and the pose from them."""
+def _fits(
+    roughs: list[F64], alike: Pairs, y_q: F64, y_c: F64, noises: tuple[Noise, Noise], config: PlaceConfig
+) -> list[_Fit]:
+    """What the rough poses become, but for those that have too few matches to matter."""
     radius = noises[0].uv / config.sigma_px * config.guided_px
-    pairs = mutual(beside(alike, rough, y_q, y_c, radius))
-    y_q, y_c = y_q[pairs.rows], y_c[pairs.cols]
+    matched = [(mutual(beside(alike, rough, y_q, y_c, radius)), rough) for rough in roughs]
+    matched.sort(key=lambda found: -len(found[0].rows))
+    _need(len(matched[0][0].rows), config.min_inliers, "matches beside where the pose moves the points")
+    fits: list[_Fit] = []
+    for pairs, rough in matched:
+        if not fits or len(pairs.rows) > config.rival_share * max(fit.inliers for fit in fits):
+            fits.append(_fit(rough, y_q[pairs.rows], y_c[pairs.cols], noises, config))
+    return fits
+
+
+def _fit(rough: F64, y_q: F64, y_c: F64, noises: tuple[Noise, Noise], config: PlaceConfig) -> _Fit:
+    """The pose from matched keypoints, and which of them agree with it."""
     fine = refine(rough, y_q, y_c, *noises, config.inlier_chi2)
     inlier = fine.d2 < config.inlier_chi2
-    return _Fit(fine.T, fine.cov, len(pairs.rows), y_q[inlier], y_c[inlier])
+    return _Fit(fine.T, fine.cov, len(y_q), y_q[inlier], y_c[inlier])
 
 
 def _best(fits: list[_Fit], config: PlaceConfig) -> _Fit:

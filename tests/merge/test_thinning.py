@@ -114,7 +114,7 @@ def test_a_thinned_map_is_solved_as_well_and_goes_on() -> None:
     settle(atlas, solver)
     assert len(atlas.sizes()) >= 1
     before = {name: atlas.pose(Key(name, 149)) for name in ("ann", "bob")}
-    gone = {out.key for out in atlas.thin(120)}
+    gone = {out.key for out in atlas.take_out(atlas.redundant(len(atlas) - 120))}
     assert len(atlas) == 120
     assert {Key("ann", 0), Key("ann", 149), Key("bob", 149)}.isdisjoint(gone)
     assert atlas.sizes() == {"ann/0": 120}

@@ -163,6 +163,8 @@ def check_map(path: Path, walkers: list[Walker]) -> None:
         assert [k.at.id for k in own] == list(range(walker.machine.report()["keyframes"]))
         assert {k.stretch for k in own} == {f"{own[0].key}/0"}
         for found in own:
-            np.testing.assert_allclose(found.keyframe.T_odom_body, walker.odometry[EVERY * found.at.id], atol=1e-9)
+            np.testing.assert_allclose(
+                found.keyframe.T_odom_body, walker.odometry[EVERY * found.at.id], atol=1e-9
+            )
     maps = {name for name, _ in placed(kept).values()}
     print(f"kept: {len(kept.keyframes)} keyframes, {len(kept.loops)} loops, {len(maps)} maps")
