@@ -244,6 +244,7 @@ class Edge:
         """A run of an earlier life: it is not here, but may go on where it was."""
         peer_id, asked = wire.peer_id(run.hello.run_id), run.next_keyframe
         peer = Peer(run.hello, run.key, 0, InOrder(asked), asked, run.foot, gone=True, greeted=False)
+        peer.missed = run.finding
         self._peers[peer_id] = peer
         self._by_key[run.key] = peer_id
 

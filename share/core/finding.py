@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from share.types import Correction
+import numpy as np
+
+from share.types import F64, Correction
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,3 +17,11 @@ class Finding:
     what: str
     reason: str
     correction: Correction | None = None
+
+
+def in_map(agent: str, map_id: str, T_map_odom: F64) -> Finding:
+    """Which map a run is in, before anything moves it there. A map is named after what founded it."""
+    founds = "founds" if map_id.startswith(f"{agent}/") else "is in"
+    return Finding(
+        agent, "correction", f"{founds} map {map_id}", Correction(T_map_odom, np.zeros((6, 6)), map_id, 0)
+    )

@@ -11,11 +11,9 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from share.config import Config
 from share.core.concern import Concern
-from share.core.finding import Finding
+from share.core.finding import Finding, in_map
 from share.core.keeping import (
     Change,
     DropLoop,
@@ -37,7 +35,7 @@ from share.merge.thinning import TakenOut
 from share.metrics.latency import summary
 from share.place.index import PlaceIndex
 from share.place.verify import Refusal, Sight, Verified
-from share.types import Correction, Keyframe
+from share.types import Keyframe
 from share.wire.messages import Hello
 
 _TIMES = 5000  # of each kind of step that a report is about: the newest
@@ -89,11 +87,9 @@ class Mapper:
         self._thin()
         return findings
 
-    def restore(self, kept: Kept) -> list[Finding]:
-        """What an earlier life of the edge knew, before anything else comes.
-
-        Agents can be told at once where they are; the views are gone through when one is first looked up.
-        """
+    def restore(self, kept: Kept) -> None:
+        """What an earlier life of the edge knew, before anything else comes. The views are gone through when
+        one is first looked up."""
         for run in kept.runs:
             self.join(run.key, run.hello)
         poses = {} if kept.poses is None else dict(zip(kept.poses.keys, kept.poses.T_map_body, strict=True))
@@ -103,8 +99,6 @@ class Mapper:
         ]
         numbers = self._atlas.restore(agents, placed, kept.loops, poses)
         self._unseen = list(zip(numbers, kept.keyframes, strict=True))
-        there = [agent for agent in self._hellos if self._atlas.T_map_odom(agent) is not None]
-        return [self._founding(agent) for agent in there]
 
     def _see_restored(self) -> None:
         for number, found in self._unseen:
@@ -119,10 +113,7 @@ class Mapper:
     def _founding(self, agent: str) -> Finding:
         T, map_id = self._atlas.T_map_odom(agent), self._atlas.current_map(agent)
         assert T is not None and map_id is not None
-        founded = "founds" if map_id.startswith(f"{agent}/") else "is in"
-        return Finding(
-            agent, "correction", f"{founded} map {map_id}", Correction(T, np.zeros((6, 6)), map_id, 0)
-        )
+        return in_map(agent, map_id, T)
 
     # ------------------------------------------------------------------ what to work on
 

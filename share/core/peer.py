@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from share.core.finding import Finding
+from share.core.finding import Finding, in_map
 from share.core.inorder import InOrder
-from share.core.keeping import Kept
+from share.core.keeping import Kept, placed
 from share.core.rate import SECOND_NS
+from share.geometry import se3
+from share.merge.join import Key
 from share.types import Keyframe, TrackState
 from share.wire.messages import Hello
 
@@ -36,12 +38,13 @@ class Foot:
 @dataclass(frozen=True, eq=False)
 class Known:
     """A run that an earlier life of the edge kept. foot: its last keyframe, None without any.
-    next_keyframe: the number that is asked for."""
+    next_keyframe: the number that is asked for. finding: where it is in the map, to be told at once."""
 
     key: str
     hello: Hello
     foot: Foot | None
     next_keyframe: int
+    finding: Finding | None = None
 
 
 @dataclass
@@ -107,11 +110,15 @@ _COUNTS = (
 
 def known_runs(kept: Kept) -> list[Known]:
     """Of all earlier lives. What comes after a run's last keyframe that is there is asked for."""
-    last = {found.key: found for found in kept.keyframes}
+    last = {found.key: found.keyframe for found in kept.keyframes}
+    there = placed(kept)
     out = []
     for run in kept.runs:
-        foot = None
-        if (found := last.get(run.key)) is not None:
-            foot = Foot(found.keyframe.id, found.keyframe.stamp_ns)
-        out.append(Known(run.key, run.hello, foot, 0 if foot is None else foot.id + 1))
+        if (found := last.get(run.key)) is None:
+            out.append(Known(run.key, run.hello, None, 0))
+            continue
+        map_id, T_map_body = there[Key(run.key, found.id)]
+        T_map_odom = se3.orthonormal(T_map_body @ se3.inverse(found.T_odom_body))
+        finding = in_map(run.key, map_id, T_map_odom)
+        out.append(Known(run.key, run.hello, Foot(found.id, found.stamp_ns), found.id + 1, finding))
     return out

@@ -96,7 +96,7 @@ class _Mapping:
     def _hear(self, message: Any) -> None:
         match message:
             case Restore():
-                self._findings += self._mapper.restore(message.kept)
+                self._mapper.restore(message.kept)
             case Join():
                 self._mapper.join(message.key, message.hello)
             case Add():

@@ -12,6 +12,7 @@ from edge_sim import Person, walls
 from share.config import Config
 from share.core.keeping import Change, KeepKeyframe, KeepRun
 from share.core.mapper import Mapper
+from share.core.peer import known_runs
 from share.geometry import se3
 from share.graph.solver import Solver
 from share.io.map_store import MapStore
@@ -68,8 +69,13 @@ def again(life: Life, path: Path, config: Config) -> Life:
     with MapStore.open(path) as store:
         kept = store.load()
     second = Life(config)
-    findings = second.mapper.restore(kept)
-    assert [finding.agent for finding in findings] == ["ann", "bob"]
+    second.mapper.restore(kept)
+    for run, name in zip(known_runs(kept), ("ann", "bob"), strict=True):
+        told = run.finding  # before the mapper has said anything, and the same as it would
+        assert told is not None and told.correction is not None
+        assert (told.agent, told.correction.map_id) == (name, second.mapper._atlas.current_map(name))
+        T_map_odom = second.mapper._atlas.T_map_odom(name)
+        assert np.allclose(told.correction.T_map_odom, T_map_odom, atol=1e-9)
     return second
 
 
@@ -102,4 +108,5 @@ def test_a_run_of_which_nothing_is_left_is_no_obstacle(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
         store.write(life.changes)
         kept = store.load()
-    assert Mapper(config).restore(kept) == []
+    Mapper(config).restore(kept)
+    assert [run.finding for run in known_runs(kept)] == [None]
