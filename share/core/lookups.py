@@ -11,14 +11,16 @@ _WEIGHT = {AgentKind.AR: 4, AgentKind.ROBOT: 1}  # a robot waits four times as m
 
 
 class Lookups:
-    """Keyframes that wait to be looked up, at most `most`.
+    """Keyframes that wait to be looked up, at most `most`, and `each` of an agent: what waits longer is
+    answered when nobody asks any more.
 
-    One too many: the oldest of the agent with most of them is left out (policy skip_oldest_query).
+    One too many: the oldest, of this agent or of the one with most of them, is left out (policy
+    skip_oldest_query).
     """
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, most: int, each: int) -> None:
         self.skipped: Counter[str] = Counter()  # by agent
-        self._most = most
+        self._most, self._each = most, each
         self._waiting: dict[str, deque[int]] = {}
         self._weight: dict[str, int] = {}
         self._served: dict[str, int] = {}  # when, in turns
@@ -31,10 +33,10 @@ class Lookups:
         self._weight[agent] = _WEIGHT[kind]
         self._served.setdefault(agent, self._turn)
         self._waiting.setdefault(agent, deque()).append(number)
-        if len(self) > self._most:
-            longest = max(self._waiting, key=lambda name: len(self._waiting[name]))
-            self._take(longest, oldest=True)
-            self.skipped[longest] += 1
+        if len(self._waiting[agent]) > self._each:
+            self._skip(agent)
+        elif len(self) > self._most:
+            self._skip(max(self._waiting, key=lambda name: len(self._waiting[name])))
 
     def next(self) -> int | None:
         """Of the newest keyframes, that of the agent that has waited longest for its turn; None without."""
@@ -45,6 +47,10 @@ class Lookups:
         agent = max(newest, key=lambda name: (self._turn - self._served[name]) * self._weight[name])
         self._served[agent] = self._turn
         return self._take(agent, oldest=False)
+
+    def _skip(self, agent: str) -> None:
+        self._take(agent, oldest=True)
+        self.skipped[agent] += 1
 
     def _take(self, agent: str, oldest: bool) -> int:
         queue = self._waiting[agent]

@@ -63,7 +63,7 @@ class Mapper:
         self._hellos: dict[str, Hello] = {}
         self._sights: dict[int, Sight] = {}  # by the number of a keyframe in atlas and index
         self._unseen: list[tuple[int, KeptKeyframe]] = []  # restored
-        self._lookups = Lookups(config.edge.max_waiting)
+        self._lookups = Lookups(config.edge.max_waiting, config.edge.each_waiting)
         self._concern = Concern()
         self._verify: Verify | None = None
         self._looking = self._solving = False

@@ -254,7 +254,7 @@ class Atlas:
         if tuple(chart.stretches_of(founder)) != job.stretches:
             chart.unsolved.add(chart.founder[founder])
             self._answers = dict(job.answers) | self._answers
-            chart.ties.moved(solution.numbers.tolist())
+            chart.ties.moved(n for n in solution.numbers.tolist() if n in chart.poses)
             return Applied({}, f"map {job.map_id}: joined or split while it was solved, due again")
         if solution.reason:
             return Applied({}, f"map {job.map_id}: not solved, {solution.reason}")

@@ -133,3 +133,26 @@ def test_a_thinned_map_is_solved_as_well_and_goes_on() -> None:
     for key in gone:
         with pytest.raises(ValueError, match="is not known"):
             atlas.pose(key)
+
+
+def test_taken_out_and_joined_while_the_map_is_solved() -> None:
+    walkers = Walker("ann", 1), Walker("bob", 2, phase=0.4)
+    rng, atlas, solver = np.random.default_rng(0), Atlas(CONFIG), Solver(GraphConfig())
+    for k in range(60):
+        for w in walkers:
+            atlas.add_keyframe(w.name, w.keyframes[k])
+    for x in near_loops(walkers[1], walkers[1], rng):
+        atlas.propose(x)
+    job = atlas.snapshot("bob/0")
+    solver.update(job.change)
+    solution = solver.solve(job.anchor, job.last)
+    (gone,) = atlas.take_out([atlas._chart.trails.number(Key("bob", 30))])
+    for x in near_loops(*walkers, rng):
+        if gone.key not in (x.a, x.b):
+            atlas.propose(x)
+    assert atlas.sizes() == {"ann/0": 119}
+    assert "due again" in atlas.apply(job, solution).reason
+    settle(atlas, solver)
+    assert (
+        error(np.array([atlas.pose(Key("ann", k)) for k in range(0, 60, 59)]), walkers[0].truth[::59]) < 0.2
+    )
