@@ -199,8 +199,8 @@ class Atlas:
         Raises ValueError if either keyframe is unknown.
         """
         decision = self._judge.decide(loop)
-        for tied in decision.tied:
-            self._answers[tied.b.agent] = max(tied.b.id, self._answers.get(tied.b.agent, -1))
+        if decision.accepted:  # loops that waited are believed because of it: it is what is answered
+            self._answers[loop.b.agent] = max(loop.b.id, self._answers.get(loop.b.agent, -1))
         return decision
 
     def _believed(self, cov: F64) -> F64:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from edge_sim import MS, ModelRun, Person, Town, walls
 
-from share.config import Config
+from share.config import Config, EdgeConfig
 from share.core import edge as ed
 from share.core import events as ev
 from share.core.mapper import Mapper
@@ -242,7 +242,7 @@ def test_under_load_keyframes_are_kept_but_not_looked_up():
 def test_in_a_hurry_fewer_candidates_are_tried_and_one_is_enough():
     both = town()
     both.walk(40)
-    config = Config()
+    config = Config(edge=EdgeConfig(each_waiting=12))
     tried = {}
     for waiting in (0, config.edge.hurry_waiting):
         mapper = Mapper(config)
