@@ -69,10 +69,15 @@ class Roads:
         paths = [self._path(before, start, goal) for goal in goals]
         met = np.array(sorted({place for path in paths for place in path or ()}), np.int64)
         steps = self._steps(before[met], met, start, poses)
-        return [
-            None if path is None else _seen_from_goal(steps[np.searchsorted(met, path)], start, goal, poses)
-            for goal, path in zip(goals, paths, strict=True)
-        ]
+        known = [i for i, path in enumerate(paths) if path is not None]
+        sums = [steps[np.searchsorted(met, paths[i] or [])].sum(0) for i in known]
+        out: list[F64 | None] = [None] * len(goals)
+        if known:  # from perturbing `start` to perturbing the goal
+            there = np.array([poses[goals[i]] for i in known])
+            covs = se3.inverse_cov(se3.inverse(there) @ poses[start], np.array(sums))
+            for i, cov in zip(known, covs, strict=True):
+                out[i] = cov
+        return out
 
     def _search(self) -> Ways:
         if self._ways is None:
@@ -103,8 +108,3 @@ class Roads:
         cov = np.where(onward[:, None, None], cov, se3.inverse_cov(T_a_b, cov))
         there = np.array([poses[end] for end in ends]).reshape(-1, 4, 4)
         return se3.inverse_cov(se3.inverse(poses[start]) @ there, cov)
-
-
-def _seen_from_goal(steps: F64, start: int, goal: int, poses: Placed) -> F64:
-    """The sum of covariances (K, 6, 6) that perturb `start`, as one that perturbs `goal`."""
-    return se3.inverse_cov(se3.inverse(poses[goal]) @ poses[start], steps.sum(0))

@@ -20,7 +20,7 @@ from share.merge.join import Key, Loop
 from share.merge.judge import Decision, Judge, that_waited
 from share.merge.promising import promising_first
 from share.merge.solving import SolveJob
-from share.merge.thinning import TakenOut, bonds, redundant, take_out
+from share.merge.thinning import TakenOut, redundant, take_out
 from share.types import F64, Correction, Keyframe
 
 
@@ -177,7 +177,7 @@ class Atlas:
     def take_out(self, numbers: Iterable[int]) -> list[TakenOut]:
         """These keyframes, but for those that have to stay by now."""
         chart, stay = self._chart, self._staying()
-        counts = bonds(chart)
+        counts = chart.tied()
         going = [n for n in numbers if n in chart.poses and n not in stay]
         taken = [take_out(chart, n, counts, self._config.most_loops) for n in going]
         chart.find_maps()

@@ -7,6 +7,7 @@ are derived from the loops alone, so taking a loop back takes its join back.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -163,6 +164,12 @@ class Chart:
                 raise ValueError(f"nodes {a} and {goal} are not in one map")
         return Known(se3.inverse(self.poses[a]) @ np.array([self.poses[n] for n in goals]), np.array(covs))
 
+    def tied(self) -> Counter[tuple[int, int]]:
+        """How many loops tie each two stretches, the older first."""
+        nodes, edges = self.trails.nodes, self.ties.edges
+        ends = ((nodes[edges[n].a].stretch, nodes[edges[n].b].stretch) for n in self.ties.loops)
+        return Counter((a, b) if a < b else (b, a) for a, b in ends)
+
     def find_maps(self) -> None:
         """Every stretch's founder, from the loops: the connected parts."""
         root = list(range(len(self.founder)))
@@ -172,7 +179,7 @@ class Chart:
                 i = root[i]
             return i
 
-        for loop in self.ties.loops.values():
-            low, high = sorted(find(self.stretch_of(key)) for key in (loop.a, loop.b))
+        for pair in self.tied():
+            low, high = sorted(map(find, pair))
             root[high] = low
         self.founder = [find(i) for i in range(len(root))]

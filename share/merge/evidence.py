@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.config import MergeConfig
-from share.geometry import se3
 from share.merge.chart import Chart
 from share.merge.join import Loop
 from share.merge.places import distinct
@@ -39,8 +38,8 @@ class Evidence:
 
 def near(loop: Loop, config: MergeConfig) -> bool:
     """Whether both views were from about the same spot: copies are told apart from near, if at all."""
-    away, turned = np.linalg.norm(loop.T_a_b[:3, 3]), se3.angle(loop.T_a_b)
-    return bool(away <= config.near_m and turned <= config.near_rad)
+    away, turned = loop.apart
+    return away <= config.near_m and turned <= config.near_rad
 
 
 def weigh(loops: Sequence[Loop], chart: Chart, config: MergeConfig) -> Evidence:

@@ -52,6 +52,11 @@ class Loop:
         """The two keyframes, whichever way round."""
         return frozenset((self.a, self.b))
 
+    @cached_property
+    def apart(self) -> tuple[float, float]:
+        """The two views, m and rad."""
+        return float(np.linalg.norm(self.T_a_b[:3, 3])), float(se3.angle(self.T_a_b))
+
     def reverse(self) -> Loop:
         """The same, from the other end; made once, for a loop that waits is asked for it again and again."""
         return self._reversed

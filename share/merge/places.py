@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from share.types import F64
 
@@ -12,20 +13,21 @@ from share.types import F64
 def distinct(poses: F64, apart_m: float, apart_rad: float, enough: int | None = None) -> int:
     """Of poses (N, 4, 4), as many as lie further than this, or are turned by more, from each one that
     was counted before it. With `enough` counting ends there."""
-    counted: list[F64] = []
-    for T in poses:
-        if enough is not None and len(counted) >= enough:
-            break
-        if not near_any(T, counted, apart_m, apart_rad):
-            counted.append(T)
-    return len(counted)
+    count = 0
+    while len(poses) and count != enough:
+        count += 1
+        poses = poses[~_near(poses[0], poses, apart_m, apart_rad)]
+    return count
 
 
 def near_any(T: F64, poses: Sequence[F64], within_m: float, within_rad: float) -> bool:
     """Whether pose T (4, 4) lies as near as this to one of the others."""
-    if not len(poses):
-        return False
-    others = np.array(poses)
-    away = np.linalg.norm(others[:, :3, 3] - T[:3, 3], axis=1)
-    cosine = (np.einsum("nij,ij->n", others[:, :3, :3], T[:3, :3]) - 1) / 2
-    return bool(((away <= within_m) & (cosine >= np.cos(within_rad))).any())
+    return len(poses) > 0 and bool(_near(T, np.array(poses), within_m, within_rad).any())
+
+
+def _near(T: F64, poses: F64, within_m: float, within_rad: float) -> NDArray[np.bool_]:
+    """Which of poses (N, 4, 4) lie as near as this to T (4, 4); T itself does, whatever was rounded."""
+    shift = poses[:, :3, 3] - T[:3, 3]
+    cosine = (poses[:, :3, :3].reshape(-1, 9) @ T[:3, :3].ravel() - 1) / 2
+    near = ((shift**2).sum(1) <= within_m**2) & (cosine >= min(np.cos(within_rad), 1 - 1e-9))
+    return np.asarray(near)

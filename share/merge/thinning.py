@@ -18,7 +18,7 @@ from share.merge.chart import Chart
 from share.merge.join import Key, Loop
 from share.types import F64
 
-Bonds = Counter[frozenset[int]]  # loops by the two stretches that they tie
+Bonds = Counter[tuple[int, int]]  # loops by the two stretches that they tie: `Chart.tied`
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +63,6 @@ def redundant(poses: F64, may_go: Collection[int], count: int, apart_m: float, a
         gap[gone], gap[:, gone] = np.inf, np.inf
         nearest[stale] = np.partition(gap[stale], 1, axis=1)[:, :2]
     return out
-
-
-def bonds(chart: Chart) -> Bonds:
-    """How many loops tie each two stretches."""
-    return Counter(_pair(chart, edge) for n, edge in chart.ties.edges.items() if n in chart.ties.loops)
 
 
 def take_out(chart: Chart, number: int, bonds: Bonds, most_loops: int) -> TakenOut:
@@ -123,5 +118,6 @@ def _move(chart: Chart, old: Loop, edge: Edge, bonds: Bonds, most_loops: int) ->
     return loop
 
 
-def _pair(chart: Chart, edge: Edge) -> frozenset[int]:
-    return frozenset(chart.trails.nodes[end].stretch for end in (edge.a, edge.b))
+def _pair(chart: Chart, edge: Edge) -> tuple[int, int]:
+    a, b = (chart.trails.nodes[end].stretch for end in (edge.a, edge.b))
+    return (a, b) if a < b else (b, a)
