@@ -74,12 +74,13 @@ class Rounds:
     def kill(self, victim: str, after_s: float) -> None:
         time.sleep(after_s)
         lives = [len(w.lives) for w in self.walkers]
-        pids = family(self.edge.process.pid)
+        until("all three are there", lambda: self._family())
+        pids = self._family()
         self.killed[victim] += 1
         began = time.monotonic()
         os.kill(pids[victim], signal.SIGKILL)
         if victim == "solver":  # nobody but the mapper notices
-            until("a new solver", lambda: self._solver() not in (None, pids["solver"]))
+            until("a new solver", lambda: self._family().get("solver", pids["solver"]) != pids["solver"])
             assert [len(w.lives) for w in self.walkers] == lives
             return
         if victim == "front":
@@ -94,11 +95,12 @@ class Rounds:
             self.seconds["welcomed"].append(walker.lives[before].welcomed - began)
             self.seconds["corrected"].append(walker.lives[-1].corrected - began)
 
-    def _solver(self) -> int | None:
+    def _family(self) -> dict[str, int]:
+        """Nobody while one of them has not begun."""
         try:
-            return family(self.edge.process.pid)["solver"]
+            return family(self.edge.process.pid)
         except (ValueError, FileNotFoundError):
-            return None
+            return {}
 
 
 @pytest.mark.parametrize("rounds", [3, pytest.param(50, marks=pytest.mark.slow)])
