@@ -54,11 +54,11 @@ def contract(x: int, odometry: Sequence[Edge], loops: Sequence[Edge], share: flo
 
 def _moved(edge: Edge, x: int, y: int, road: Edge, share: float) -> Edge:
     """`edge` with its end at x moved to y along `road`, of whose information it is told `share`."""
-    along = road if road.a == x else reverse(road)
-    lead = edge if edge.b == x else reverse(edge)
+    along = road if road.a == x else road.reverse()
+    lead = edge if edge.b == x else edge.reverse()
     cov = se3.compose_cov(along.T_a_b, lead.cov, along.cov / share)
     moved = Edge(lead.a, y, se3.orthonormal(lead.T_a_b @ along.T_a_b), cov)
-    return moved if edge.b == x else reverse(moved)
+    return moved if edge.b == x else moved.reverse()
 
 
 def fuse(edges: Sequence[Edge]) -> tuple[Edge, float]:
@@ -68,15 +68,10 @@ def fuse(edges: Sequence[Edge]) -> tuple[Edge, float]:
     first = edges[0]
     if any({edge.a, edge.b} != {first.a, first.b} for edge in edges):
         raise ValueError("edges between different poses cannot be one")
-    alike = [edge if edge.a == first.a else reverse(edge) for edge in edges]
+    alike = [edge if edge.a == first.a else edge.reverse() for edge in edges]
     xi = se3.log(se3.inverse(first.T_a_b) @ np.array([edge.T_a_b for edge in alike]))
     information = np.linalg.inv(np.array([edge.cov for edge in alike]))
     cov = np.linalg.inv(information.sum(0))
     mean = cov @ np.einsum("kij,kj->i", information, xi)
     chi2 = np.einsum("ki,kij,kj->", xi - mean, information, xi - mean)
     return Edge(first.a, first.b, se3.orthonormal(first.T_a_b @ se3.exp(mean)), cov), float(chi2)
-
-
-def reverse(edge: Edge) -> Edge:
-    """The same measurement, of a from b."""
-    return Edge(edge.b, edge.a, se3.inverse(edge.T_a_b), se3.inverse_cov(edge.T_a_b, edge.cov))

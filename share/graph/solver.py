@@ -30,11 +30,8 @@ class Solver:
     def clear(self) -> None:
         """Know nothing any more."""
         nothing = Change.of({})
-        self._numbers, self._poses, self._plumb = (
-            nothing.numbers,
-            nothing.poses,
-            nothing.plumb,
-        )  # numbers rise
+        self._numbers = nothing.numbers  # rising
+        self._poses, self._plumb = nothing.poses, nothing.plumb
         self._ids, self._edges = nothing.edge_ids, _edges_of(nothing)  # their ends are numbers
 
     def __len__(self) -> int:

@@ -81,7 +81,9 @@ class Judge:
     def _gaps(self, loops: Sequence[Loop]) -> list[Disagreement]:
         """Between what each loop says and what its map knows."""
         ends = [self._chart.ends(loop) for loop in loops]
-        to = {b: [a for a, other in ends if other == b] for b in {b for _, b in ends}}
+        to: dict[int, list[int]] = {}
+        for a, b in ends:
+            to.setdefault(b, []).append(a)
         known = {
             (a, b): k
             for b, goals in to.items()

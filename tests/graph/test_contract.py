@@ -7,7 +7,7 @@ from rooms import LOOP, Room, measured, simulate
 from share.config import GraphConfig
 from share.geometry import se3
 from share.graph.change import Change, Solution
-from share.graph.contract import contract, fuse, reverse
+from share.graph.contract import contract, fuse
 from share.graph.posegraph import Edge
 from share.graph.solver import Solver
 from share.types import F64
@@ -38,12 +38,12 @@ def test_a_link_of_a_chain_is_composed() -> None:
     edge, loops = done.odometry[0], done.loops
     T = first.T_a_b @ second.T_a_b
     cov = se3.compose_cov(second.T_a_b, first.cov, second.cov)
-    edge = edge if edge.a == 1 else reverse(edge)
+    edge = edge if edge.a == 1 else edge.reverse()
     assert ((edge.a, edge.b), loops) == ((1, 3), ())
     assert edge.T_a_b == pytest.approx(T, abs=1e-12)
     assert edge.cov == pytest.approx(cov, rel=1e-9, abs=1e-15)
-    backward = contract(2, [reverse(first), reverse(second)], []).odometry[0]
-    backward = backward if backward.a == 1 else reverse(backward)
+    backward = contract(2, [first.reverse(), second.reverse()], []).odometry[0]
+    backward = backward if backward.a == 1 else backward.reverse()
     assert backward.cov == pytest.approx(cov, rel=1e-9, abs=1e-15)
 
 
@@ -70,7 +70,7 @@ def test_an_end_of_a_chain_is_dropped() -> None:
     assert done.odometry == () and done.loops[0] is not None
     assert (done.loops[0].a, done.loops[0].b) == (1, 4)
     assert done.loops[0].cov == pytest.approx(
-        se3.compose_cov(se3.inverse(last.T_a_b), loop.cov, reverse(last).cov), rel=1e-9, abs=1e-15
+        se3.compose_cov(se3.inverse(last.T_a_b), loop.cov, last.reverse().cov), rel=1e-9, abs=1e-15
     )
     assert contract(5, [last], []).odometry == ()
 
@@ -86,7 +86,7 @@ def test_parallel_loops_become_one() -> None:
     rng = np.random.default_rng(0)
     truth = np.array(path(se3.exp(rng.normal(0, 0.5, 6))))
     edges = [measured(truth, 0, 1, LOOP, rng) for _ in range(400)]
-    one, chi2 = fuse([reverse(e) if k % 2 else e for k, e in enumerate(edges)])
+    one, chi2 = fuse([e.reverse() if k % 2 else e for k, e in enumerate(edges)])
     xi = se3.log(se3.inverse(one.T_a_b) @ truth[1])
     assert one.cov == pytest.approx(LOOP / 400, rel=0.01, abs=1e-8)
     assert xi @ np.linalg.solve(one.cov, xi) < 22.5

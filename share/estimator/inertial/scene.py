@@ -199,7 +199,6 @@ class Scene:
         """Keyframes whose features are all gone, and, where there are too many, the most redundant ones.
         Never the newest two: others are told of the motion between them."""
         s = self.state
-        newest = len(s.keyframes) - np.arange(1, 3)
         busy = np.isin(np.arange(len(s.keyframes)), s.host)
         leave = ~busy & ~np.array([self._memory.has(int(k)) for k in s.keyframes], bool)
         leave[-2:] = False
@@ -209,7 +208,7 @@ class Scene:
             cost = np.linalg.norm(apart[..., 3:], axis=-1) + np.linalg.norm(apart[..., :3], axis=-1)
             cost[np.diag_indices(len(left))] = np.inf
             nearest = cost.min(axis=1) + _FAR * busy[left]
-            nearest[np.isin(left, newest)] = np.inf
+            nearest[-2:] = np.inf
             leave[left[np.argmin(nearest)]] = True
         self._memory.forget(s.keyframes[leave])
         self.looks = self.looks.take(~leave[s.host])

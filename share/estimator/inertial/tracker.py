@@ -22,6 +22,7 @@ from share.estimator.inertial.imu import integrate
 from share.estimator.inertial.noise import louder, without
 from share.estimator.inertial.samples import Samples, coasting, mean_rate, unclipped
 from share.estimator.inertial.scene import Scene
+from share.estimator.inertial.shown import Shown
 from share.estimator.inertial.state import VELOCITY, State
 from share.estimator.inertial.window import Window, window_for, without_force
 from share.estimator.localmap import LocalKeyframe, LocalMap
@@ -43,7 +44,6 @@ _REST_RATE, _REST_M_S = 0.03, 0.02  # rad/s of a body at rest; m/s of its veloci
 _SLOW_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to a filter that knows it moves
 _PATIENCE = 10  # frames without a sample of the IMU, after which we begin without
 _LEVEL_RAD = np.radians(3.0)  # sigma of tilt up to which others are told what is up
-_FOUND_COV = np.diag(np.repeat([0.01**2, 0.03**2], 3))  # rad, m: of a place found again by its ORB features
 
 
 class InertialTracker:
@@ -71,7 +71,7 @@ class InertialTracker:
         self._keyframe_ns = 0
         self._T_keyframe = np.eye(4)
         self._keyframe_count = 0
-        self._shown, self._T_shown = -1, np.eye(4)  # the last keyframe that others were told of, and where
+        self._shown = Shown()
         self._places = LocalMap(places.max_keyframes)  # where to look for oneself when LOST
         self._places_config, self._seed, self._places_tried = places, seed, 0
         self._lost_ns: int | None = None
@@ -107,7 +107,7 @@ class InertialTracker:
             self._places.set_view(view)
         tilt = self._tilt(s)
         up = s.T[2, :3] if self._knows_up and tilt < _LEVEL_RAD else np.zeros(3)
-        T_last_body, cov = self._since_last(s, new_stretch)
+        T_last_body, cov = self._shown.motion(s, new_stretch)
         return Candidate(s.T, T_last_body, cov, up, tilt / np.sqrt(2), view, new_stretch)
 
     def predict(self, t_ns: int, imu: ImuBatch | None = None) -> F64 | None:
@@ -123,23 +123,6 @@ class InertialTracker:
         heard = known.between(s.stamp_ns, min(t_ns, known.last_ns), silent_ns)
         going_on = coasting(s, self._rate, t_ns, gravity) if heard is None else heard
         return integrate(s.T, s.v, s.bg, s.ba, going_on, s.stamp_ns, t_ns, self._noise, gravity).T
-
-    def _since_last(self, s: State, new_stretch: bool) -> tuple[F64, F64]:
-        """The motion (4, 4) since the last keyframe that was shown, and its covariance (6, 6): as the state
-        knows both now. Without that keyframe, after a loss, as they were told, and as unsure as the place
-        where the body was found again.
-
-        What was told of the last one has been corrected since: at first mostly its tilt, by degrees. The
-        difference of what was told would have that as a turn of the body.
-        """
-        newest = len(s.keyframes) - 1
-        known = np.flatnonzero(s.keyframes[:-1] == self._shown)
-        told, self._shown, self._T_shown = self._T_shown, int(s.keyframes[-1]), s.T
-        if new_stretch:
-            return s.T, ekf.pose_cov(s)
-        if len(known):
-            return ekf.motion(s, int(known[0]), newest), ekf.motion_cov(s, int(known[0]), newest)
-        return se3.inverse(told) @ s.T, ekf.pose_cov(s) + _FOUND_COV
 
     # ------------------------------------------------------------------ the usual frame
 
@@ -395,7 +378,8 @@ class InertialTracker:
 
     def _lose(self, frame: Frame) -> TrackResult:
         """What is left of the filter is worth nothing."""
-        self._scene, self._astray, self._refused_s, self._shown = None, 0, 0.0, -1
+        self._scene, self._astray, self._refused_s = None, 0, 0.0
+        self._shown.forget()
         if self._window is not None:  # there was nothing to lose
             return TrackResult(TrackState.INITIALISING, None, waits=Wait.SCALE)
         self._ready, self._lost_ns = False, frame.stamp_ns

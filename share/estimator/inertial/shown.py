@@ -1,0 +1,40 @@
+"""How far the body has moved since the keyframe that others were told of last, as it is known by now.
+
+What was told of that keyframe has been corrected since: at first mostly its tilt, by degrees. The difference
+of what was told would have that as a turn of the body.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from share.estimator.inertial import ekf
+from share.estimator.inertial.state import State
+from share.geometry import se3
+from share.types import F64
+
+_FOUND_COV = np.diag(np.repeat([0.01**2, 0.03**2], 3))  # rad, m: of a place found again by its ORB features
+
+
+class Shown:
+    """The keyframe that others were told of last."""
+
+    def __init__(self) -> None:
+        self._keyframe, self._T_odom_body = -1, np.eye(4)
+
+    def forget(self) -> None:
+        """The filter's keyframes are numbered anew."""
+        self._keyframe = -1
+
+    def motion(self, s: State, new_stretch: bool) -> tuple[F64, F64]:
+        """T_last_body (4, 4) of the newest keyframe, which is the last one from now on, and its covariance
+        (6, 6): as the state knows both now. Where it has the last one no longer, after a loss, as they were
+        told, and as unsure as the place where the body was found again."""
+        newest = len(s.keyframes) - 1
+        known = np.flatnonzero(s.keyframes[:-1] == self._keyframe)
+        told, self._keyframe, self._T_odom_body = self._T_odom_body, int(s.keyframes[-1]), s.T
+        if new_stretch:
+            return s.T, ekf.pose_cov(s)
+        if len(known):
+            return ekf.motion(s, int(known[0]), newest), ekf.motion_cov(s, int(known[0]), newest)
+        return se3.inverse(told) @ s.T, ekf.pose_cov(s) + _FOUND_COV
