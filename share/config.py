@@ -247,8 +247,12 @@ class MergeConfig:
     near_rad: float = 0.8  # or turned by more, are no witnesses for a join
     join_places: int = 2  # at so many places maps must fit to be joined; of a smaller map, at all but one
     join_found: float = 0.3  # of the points that two views should share, so many must be found, on average
+    overlap_pairs: int = 0  # so many views of both maps must be near enough to show whether they look alike
+    overlap_gone: float = 0.06  # the same, wherever both maps should show the same, recognised or not
+    undo_doubt: float = 0.6  # more than that, summed over the views after a join, undoes it
     rival_weight: float = 0.5  # no contradicting story may weigh more than this part of the one that joins
     rebel_places: int = 4  # so many places at least, that weigh more than what stands, take a map apart
+    rebel_weight: float = 1.4  # by how many times they have to weigh more
     drop_chi2: float = 1000.0  # a solved graph at odds with a loop by more than this drops it
 
 

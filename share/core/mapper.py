@@ -58,10 +58,10 @@ class Mapper:
     def __init__(self, config: Config) -> None:
         place = config.place
         self._config = config
-        self._atlas = Atlas(config.merge)
         self._index = PlaceIndex(place.index_seed, place.tables, place.hash_bits)
         self._hellos: dict[str, Hello] = {}
         self._sights: dict[int, Sight] = {}  # by the number of a keyframe in atlas and index
+        self._atlas = Atlas(config.merge, self._sights)
         self._unseen: list[tuple[int, KeptKeyframe]] = []  # restored
         self._lookups = Lookups(config.edge.max_waiting, config.edge.each_waiting)
         self._concern = Concern()
@@ -156,7 +156,7 @@ class Mapper:
         match step:
             case Query() if isinstance(result, list):
                 self._verify = self._verification(step, [c.id for c in result])
-                return []
+                return self._review(step.number)
             case Verify() if isinstance(result, dict):
                 return [f for n, outcome in result.items() for f in self._judge(step.number, n, outcome)]
             case Solve() if isinstance(result, Solution):
@@ -223,6 +223,13 @@ class Mapper:
         account.merges += 1
         what = "merge undone" if decision.dropped else "maps joined" if decision.joined else "loop accepted"
         return [Finding(b.agent, what, reason)]
+
+    def _review(self, number: int) -> list[Finding]:
+        decision = self._atlas.review(number) if number in self._sights else None
+        if decision is None:
+            return []
+        self._note(decision)
+        return [Finding(self._atlas.key(number).agent, "merge undone", decision.reason)]
 
     def _solved(self, step: Solve, solution: Solution) -> list[Finding]:
         applied = self._atlas.apply(step.job, solution)

@@ -20,7 +20,9 @@ from share.merge.join import Key, Loop
 from share.merge.judge import Decision, Judge, that_waited
 from share.merge.promising import promising_first
 from share.merge.solving import SolveJob
+from share.merge.survey import Survey
 from share.merge.thinning import TakenOut, redundant, take_out
+from share.place.verify import Sight
 from share.types import F64, Correction, Keyframe
 
 
@@ -52,10 +54,11 @@ class Placed:
 class Atlas:
     """All keyframes of all agents, in maps."""
 
-    def __init__(self, config: MergeConfig) -> None:
+    def __init__(self, config: MergeConfig, sights: Mapping[int, Sight] | None = None) -> None:
+        """sights: what each keyframe saw, by its number; kept by whoever asks."""
         self._config = config
         self._chart = Chart()
-        self._judge = Judge(config, self._chart)
+        self._judge = Judge(config, self._chart, Survey(self._chart, {} if sights is None else sights))
         self._answers: dict[str, int] = {}  # agent -> its newest keyframe that a loop came from
 
     # ------------------------------------------------------------ what is known
@@ -202,6 +205,10 @@ class Atlas:
         if decision.accepted:  # loops that waited are believed because of it: it is what is answered
             self._answers[loop.b.agent] = max(loop.b.id, self._answers.get(loop.b.agent, -1))
         return decision
+
+    def review(self, number: int) -> Decision | None:
+        """Whether what this keyframe saw speaks against a young join of its map: it is undone."""
+        return self._judge.review(number)
 
     def _believed(self, cov: F64) -> F64:
         """Agents are surer of themselves than they should be; none is surer than the floor."""

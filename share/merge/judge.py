@@ -7,6 +7,7 @@ other story may be nearly as good (`share.merge.evidence`).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,9 @@ from share.merge.cut import fewest
 from share.merge.evidence import Evidence, near, places, weigh
 from share.merge.join import Disagreement, Key, Known, Loop, disagreement, opposite, witness_chi2
 from share.merge.places import near_any
+from share.merge.survey import Survey, doubt
+
+_NAMED = 3  # loops, in a reason
 
 
 @dataclass(frozen=True)
@@ -36,11 +40,11 @@ class Judge:
     waiting: for witnesses, oldest first. rebels: those that contradict their map.
     """
 
-    def __init__(self, config: MergeConfig, chart: Chart) -> None:
+    def __init__(self, config: MergeConfig, chart: Chart, survey: Survey) -> None:
         self.waiting: list[Loop] = []
         self.rebels: list[Loop] = []
         self._alike: set[int] = set()  # nodes at places of which a look-alike is known
-        self._config, self._chart = config, chart
+        self._config, self._chart, self._survey = config, chart, survey
 
     def decide(self, loop: Loop) -> Decision:
         """Accepted, waiting, or refused, with the reason. Raises ValueError if a keyframe is unknown."""
@@ -52,6 +56,18 @@ class Judge:
             need = f"at least {gap} keyframes apart needed"
             return Decision(False, f"loop {loop}: neighbours by odometry, {need}")
         return self._close(loop) if self._chart.same_map(a, b) else self._join(loop)
+
+    def review(self, number: int) -> Decision | None:
+        """A new node, in a map: undoes the join that what it sees speaks against, if any does."""
+        c = self._config
+        for (a, b), doubts in self._survey.review(number, c.overlap_gone):
+            if doubts > c.undo_doubt:
+                self._survey.end((a, b))
+                dropped = self._chart.drop(self._ties_between(a, b))
+                one, other = (self._chart.trails.stretches[s].name for s in (a, b))
+                why = f"what {one} and {other} should share is gone (doubt {doubts:.1f})"
+                return Decision(True, f"{why}; {taken_out(dropped)}", dropped=dropped)
+        return None
 
     def settle(self) -> tuple[Loop, ...]:
         """Those that waited and fit the map that they are in by now are believed."""
@@ -113,10 +129,12 @@ class Judge:
         self.rebels = [*self.rebels, loop][-self._config.max_pending :]
         against = self._ties_between(a, b)
         standing = self._weigh([self._chart.ties.loops[n] for n in against])
-        have, need = self._weigh(story), self._config.rebel_places
+        c, have, need = self._config, self._weigh(story), self._config.rebel_places
         why = f"{why}; {have} say so, {standing} do not"
-        if have.places < need or have.weight <= standing.weight:
+        if have.places < need or have.weight <= c.rebel_weight * standing.weight:
             return Decision(False, f"{why}, {need} places and more weight needed")
+        if denial := self._denial(loop):
+            return Decision(False, why + denial)
         return self._overthrow(story, against, why)
 
     def _ties_between(self, a: int, b: int) -> list[int]:
@@ -131,10 +149,9 @@ class Judge:
 
     def _overthrow(self, loops: list[Loop], against: list[int], why: str) -> Decision:
         dropped = self._chart.drop(against)
-        names = ", ".join(map(str, dropped))
         self.rebels, others = [], [loop for loop in self.rebels if loop not in loops]
         self.waiting += others
-        accepted = self._accept(loops, f"{why}; taken out: {names}")
+        accepted = self._accept(loops, f"{why}; {taken_out(dropped)}")
         return Decision(True, accepted.reason, accepted.joined, accepted.tied, dropped)
 
     # ------------------------------------------------------------ between two maps
@@ -144,7 +161,7 @@ class Judge:
         have, need = self._unique(story), self._places_needed(loop)
         why = f"loop {loop}: would join two maps, {have.places} of {need} places that say so"
         lacks = "" if have.places >= need and have.keyframes >= 2 else ": waits"
-        lacks = lacks or self._doubt(loop, have)
+        lacks = lacks or self._doubt(loop, have) or self._denial(loop)
         if lacks:
             self._wait(loop)
             return Decision(False, why + lacks)
@@ -158,6 +175,22 @@ class Judge:
         allowed = c.rival_weight * have.weight
         rival = self._rival(loop, allowed)
         return f"; another story has {rival}: waits" if rival.weight > allowed else ""
+
+    def _denial(self, loop: Loop) -> str:
+        """What the overlap of both maps has against it, whatever was recognised; empty if nothing."""
+        looks, c = self._survey.overlap(loop), self._config
+        if len(looks) < c.overlap_pairs:
+            return f", but only {len(looks)} views overlap: waits"
+        gone = sum(look.share for look in looks) / max(1, len(looks))
+        if gone > c.overlap_gone:
+            return f", but {gone:.0%} of the {len(looks)} views that overlap is gone: waits"
+        doubts = itertools.accumulate(looks, lambda d, look: doubt(d, look, c.overlap_gone), initial=0.0)
+        worst = max(doubts)
+        return (
+            f", but views in a row show things gone (doubt {worst:.1f}): waits"
+            if worst > c.undo_doubt
+            else ""
+        )
 
     def _places_needed(self, loop: Loop) -> int:
         """Of a map that knows few places, all but one."""
@@ -174,7 +207,9 @@ class Judge:
         best = Evidence()
         while left and best.weight <= allowed:
             told = [*self._same_story(left[-1], left[:-1]), left[-1]]
-            best = max(best, self._weigh(told), key=lambda evidence: evidence.weight)
+            weighs = self._weigh(told)
+            if weighs.weight > best.weight and not self._denial(told[-1]):
+                best = weighs
             pairs = {x.pair for x in told}
             left = [x for x in left if x.pair not in pairs]
         return best
@@ -235,6 +270,7 @@ class Judge:
         self._believe(loops)
         if len(before) == 1:
             return Decision(True, reason, tied=tuple(loops))
+        self._survey.begin(loops[-1])
         waited = self.settle()
         survivor, gone = (chart.trails.stretches[s].name for s in before)
         reason += f"{that_waited(waited)}: map {gone} joins {survivor}"
@@ -248,6 +284,12 @@ class Judge:
 
     def _wait(self, loop: Loop) -> None:
         self.waiting = [*self.waiting, loop][-self._config.max_pending :]
+
+
+def taken_out(loops: Sequence[Loop]) -> str:
+    """For a reason."""
+    named = ", ".join(map(str, loops[:_NAMED]))
+    return f"taken out: {named}" + (f" and {len(loops) - _NAMED} more" if len(loops) > _NAMED else "")
 
 
 def that_waited(loops: Sequence[Loop]) -> str:

@@ -1,8 +1,10 @@
 """What ought to be seen, if two views stand as verification says, and is not.
 
 Two places that look alike share most points, but not all: what only one of them has is missing in the
-other. In one pair of views that proves nothing (detectors miss points, things hide each other), so
-this is evidence to be added up over many pairs, not a verdict. docs/places.md has its distributions.
+other. Single points are missing anywhere (detectors miss them, things hide each other); where all points of
+a patch of the image are missing, a *thing* is gone: a poster, a door, a box. In one pair of views even that
+proves little, so this is evidence to be added up over many pairs, not a verdict. docs/places.md has its
+distributions.
 """
 
 from __future__ import annotations
@@ -19,10 +21,13 @@ from share.place.verify import Sight
 from share.types import F64, I64
 
 _BESIDE_PX = 6.0  # a point is found if one as like as this lies beside where it should be
+_THING_PX = 15.0  # a thing is still there if it has moved by this: the map may have drifted
 _BITS = 90
 _AROUND_PX = 40.0  # whose depth says whether something may hide the point
 _MARGIN = 0.03  # of the image's sides; a detector finds nothing at its border
 _HIDDEN, _HIDDEN_RHO = 1.2, 0.02  # share, and 1/m, by which all around is nearer than a hidden point
+_THING_RAD = 0.1  # a patch of the image, so far around a point,
+_THING_POINTS = 10  # in which so many ought to be seen: if none is, a thing is gone
 
 
 class Missing(NamedTuple):
@@ -37,30 +42,74 @@ class Missing(NamedTuple):
         return 1 - self.found / self.visible if self.visible else 0.0
 
 
+class Gone(NamedTuple):
+    """Points of both views that the other ought to show, and those amid a patch of which it shows none."""
+
+    visible: int
+    gone: int
+
+    @property
+    def share(self) -> float:
+        """0 if none is visible."""
+        return self.gone / self.visible if self.visible else 0.0
+
+
 def missing(query: Sight, candidate: Sight, T_c_q: F64) -> Missing:
     """With T_c_q (4, 4): the query's body in the candidate's body frame."""
+    there, back = _both(query, candidate, T_c_q, _BESIDE_PX)
+    return Missing(len(there.found) + len(back.found), int(there.found.sum() + back.found.sum()))
+
+
+def gone(query: Sight, candidate: Sight, T_c_q: F64) -> Gone:
+    """The same, of whole things: from about one spot, and within 1 m say little else is gone in a true pair.
+
+    From further apart things hide each other that no keypoint tells of.
+    """
+    there, back = _both(query, candidate, T_c_q, _THING_PX)
+    return Gone(len(there.found) + len(back.found), _amid_nothing(there) + _amid_nothing(back))
+
+
+class _Seen(NamedTuple):
+    """Points of one view that the other camera ought to see: where (N, 2), and whether it does (N,)."""
+
+    uv: F64
+    found: NDArray[np.bool_]
+
+
+def _both(query: Sight, candidate: Sight, T_c_q: F64, reach_px: float) -> tuple[_Seen, _Seen]:
     T = se3.inverse(candidate.T_body_cam0) @ T_c_q @ query.T_body_cam0
-    there = _seen(T, query, candidate)
-    back = _seen(se3.inverse(T), candidate, query)
-    return Missing(len(there) + len(back), int(there.sum() + back.sum()))
+    return _seen(T, query, candidate, reach_px), _seen(se3.inverse(T), candidate, query, reach_px)
 
 
-def _seen(T: F64, source: Sight, target: Sight) -> NDArray[np.bool_]:
-    """Of each source point that the target camera ought to see, whether it does."""
+def _seen(T: F64, source: Sight, target: Sight, reach_px: float) -> _Seen:
     y = target.y
     if not len(source.view) or not len(y):
-        return np.zeros(0, bool)
+        return _Seen(np.zeros((0, 2)), np.zeros(0, bool))
     moved = move(T, source.y)
     inside = np.flatnonzero(_inside(moved, y))
     moved = moved[inside]
     rows, cols, px = _beside(target.focal * moved[:, :2], target.focal * y[:, :2])
     bits = apart(source.view.descriptors[inside[rows]], target.view.descriptors[cols])
     found = np.zeros(len(inside), bool)
-    found[rows[(px < _BESIDE_PX) & (bits <= _BITS)]] = True
+    found[rows[(px < reach_px) & (bits <= _BITS)]] = True
     around = np.full(len(inside), np.inf)  # least inverse depth of those near it
     np.fmin.at(around, rows, y[cols, 2])
-    hides_nothing = around <= _HIDDEN * moved[:, 2] + _HIDDEN_RHO
-    return np.asarray(found[hides_nothing])
+    visible = around <= _HIDDEN * moved[:, 2] + _HIDDEN_RHO
+    return _Seen(moved[visible, :2], found[visible])
+
+
+def _amid_nothing(seen: _Seen) -> int:
+    """How many points are amid others of which none is found."""
+    lost = seen.uv[~seen.found]
+    alone = ~_within(lost, seen.uv[seen.found], _THING_RAD).any(1)
+    amid = _within(lost[alone], lost, _THING_RAD).sum(1) >= _THING_POINTS
+    return int(amid.sum())
+
+
+def _within(a: F64, b: F64, reach: float) -> NDArray[np.bool_]:
+    """Which of a (N, 2) and b (K, 2) lie nearer than reach to each other (N, K)."""
+    square = (a[:, :1] - b[:, 0]) ** 2 + (a[:, 1:] - b[:, 1]) ** 2
+    return np.asarray(square < reach**2)
 
 
 def _inside(moved: F64, target: F64) -> NDArray[np.bool_]:

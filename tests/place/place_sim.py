@@ -35,10 +35,12 @@ def view(
     return View(uv, np.column_stack([uv, np.ones(len(uv))]) / rho[:, None], bits ^ flips)
 
 
-def sights(seed: int, T_c_q: F64, depth_share: float = 0.8, up: bool = True) -> tuple[Sight, Sight]:
+def sights(
+    seed: int, T_c_q: F64, depth_share: float = 0.8, up: bool = True, n: int = 400
+) -> tuple[Sight, Sight]:
     """Query and candidate; T_c_q (4, 4) between the cameras; the candidate's body stands upright."""
     rng = np.random.default_rng(seed + 1000)
-    points, descriptors = scene(seed)
+    points, descriptors = scene(seed, n)
     query = view(points, descriptors, se3.inverse(T_c_q), rng, depth_share)
     candidate = view(points, descriptors, np.eye(4), rng, depth_share)
     order = rng.permutation(len(query))

@@ -2,10 +2,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from place_sim import bodies, sights
 
 from share.geometry import se3
-from share.place.missing import Missing, missing
+from share.place.missing import Gone, Missing, gone, missing
+from share.place.verify import Sight
 from share.types import View
 
 T_C_Q = se3.exp(np.array([0.02, -0.03, 0.01, 0.1, 0.05, -0.1]))
@@ -17,15 +19,29 @@ def test_nothing_is_missing_where_both_see_the_same() -> None:
     assert seen.share < 0.1
 
 
-def test_what_was_taken_away_is_missing() -> None:
-    """A third of the candidate's image shows something else."""
-    query, candidate = sights(1, T_C_Q)
-    view = candidate.view
-    left = view.uv[:, 0] < np.quantile(view.uv[:, 0], 1 / 3)
+def changed(sight: Sight, where: NDArray[np.bool_]) -> Sight:
+    """The same view, with something else at the keypoints where (N,)."""
+    view = sight.view
     other = np.random.default_rng(0).integers(0, 256, view.descriptors.shape, np.uint8)
-    changed = View(view.uv, view.points, np.where(left[:, None], other, view.descriptors))
-    seen = missing(query, replace(candidate, view=changed), bodies(T_C_Q))
-    assert seen.share == pytest.approx(1 / 3, abs=0.1)
+    return replace(sight, view=View(view.uv, view.points, np.where(where[:, None], other, view.descriptors)))
+
+
+def test_what_was_taken_away_is_missing_and_a_thing_that_is_gone() -> None:
+    """A third of the candidate's image shows something else."""
+    query, candidate = sights(1, T_C_Q, n=1500)
+    u = candidate.view.uv[:, 0]
+    bare = changed(candidate, u < np.quantile(u, 1 / 3))
+    assert missing(query, bare, bodies(T_C_Q)).share == pytest.approx(1 / 3, abs=0.1)
+    assert gone(query, bare, bodies(T_C_Q)).share == pytest.approx(1 / 3 - 0.05, abs=0.05)  # not at its edge
+
+
+def test_points_that_are_missing_here_and_there_are_no_thing() -> None:
+    """Half of all, as detectors miss them."""
+    query, candidate = sights(1, T_C_Q, n=1500)
+    some = changed(candidate, np.random.default_rng(1).random(len(candidate.view)) < 0.5)
+    assert missing(query, some, bodies(T_C_Q)).share > 0.45
+    assert gone(query, some, bodies(T_C_Q)).share < 0.01
+    assert gone(query, candidate, bodies(T_C_Q)).share == 0
 
 
 def test_a_wrong_pose_misses_nearly_all() -> None:
@@ -47,4 +63,5 @@ def test_an_empty_view_says_nothing() -> None:
     query, candidate = sights(4, T_C_Q)
     empty = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
     assert missing(query, replace(candidate, view=empty), np.eye(4)) == Missing(0, 0)
-    assert Missing(0, 0).share == 0.0
+    assert gone(query, replace(candidate, view=empty), np.eye(4)) == Gone(0, 0)
+    assert Missing(0, 0).share == Gone(0, 0).share == 0.0
