@@ -34,7 +34,7 @@ from share.wire.codec import encode  # noqa: E402
 from share.wire.messages import Bye, Evaluation, Ping, PoseUpdate, peer_id  # noqa: E402
 
 _POSE_S, _PING_S, _KEYFRAME_S = 1 / 30, 0.5, 1 / RATE_HZ
-_COMING_S = 3.0  # within which they come in, one after the other
+_COMING_S = 3.0  # within which they come in, at odd moments: nobody's keyframes keep step
 _QUEUE = 128
 
 Frames = list[bytes]
@@ -119,7 +119,8 @@ def _talk(everybody: list[_Agent], began: float, seconds: float, counted_from: f
     by_socket = {agent.socket: agent for agent in everybody}
     for agent in everybody:
         poller.register(agent.socket, zmq.POLLIN)
-    due = [(began + _COMING_S * i / len(everybody), i, "hello") for i in range(len(everybody))]
+    odd = np.random.default_rng(len(everybody)).uniform(size=len(everybody))
+    due = [(began + _COMING_S * (i + odd[i]) / len(everybody), i, "hello") for i in range(len(everybody))]
     heapq.heapify(due)
     cpu_at = 0.0
     while (now := time.monotonic()) < began + seconds:

@@ -33,7 +33,7 @@ from make_keyframe_sets import parser as set_parser  # noqa: E402
 from make_keyframe_sets import recipe_of  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 
-from share.config import Config, from_mapping, to_mapping  # noqa: E402
+from share.config import Config  # noqa: E402
 from share.core.mapper import Mapper  # noqa: E402
 from share.core.steps import Solve  # noqa: E402
 from share.errors import UsageError  # noqa: E402
@@ -41,6 +41,7 @@ from share.geometry import se3  # noqa: E402
 from share.graph.solver import Solver  # noqa: E402
 from share.merge.join import Key  # noqa: E402
 from share.metrics.ate import joint_ate  # noqa: E402
+from share.strict import from_mapping, to_mapping  # noqa: E402
 from share.types import F64  # noqa: E402
 
 SEEN_M, SEEN_RAD = 1.0, float(np.radians(30))

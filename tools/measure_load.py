@@ -27,7 +27,7 @@ from share import process
 process.prepare()
 
 from load_process import cpu_s, rss_mb, worker_of  # noqa: E402
-from tool_main import exit_code  # noqa: E402
+from tool_main import exit_code, line  # noqa: E402
 
 from share.errors import ShareError  # noqa: E402
 from share.io.files import atomic_write, writable_dir  # noqa: E402
@@ -183,10 +183,6 @@ def cells_of(row: Row) -> list[str]:
         f"{row['file_mb']:.0f}",
         f"{row['load_average']:.1f}",
     ]
-
-
-def line(cells: Any) -> str:
-    return "| " + " | ".join(cells) + " |"
 
 
 if __name__ == "__main__":

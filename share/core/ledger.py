@@ -87,6 +87,8 @@ class Ledger:
             self.counts["acknowledged"] += 1
         self._held = frozenset(ack.held)
         top = max(self._held, default=-1)
+        if top in self._open:  # it was under way when this life of the edge began
+            self._sent_to = max(self._sent_to, top)
         for entry in list(self._open.values())[: self._link.window]:
             if entry.attempts and entry.keyframe.id < top:
                 entry.due_ns = min(entry.due_ns or 0, entry.sent_ns + seconds(self._link.gap_s))

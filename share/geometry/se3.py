@@ -110,10 +110,11 @@ def inverse(T: F64) -> F64:
 def exp(xi: F64) -> F64:
     """(..., 6) -> (..., 4, 4)."""
     phi, rho = xi[..., :3], xi[..., 3:]
-    _, B, C = _coefficients(phi)
+    A, B, C = _coefficients(phi)
     K = hat(phi)
-    V = np.eye(3) + B * K + C * (K @ K)
-    return compose(so3_exp(phi), (V @ rho[..., None])[..., 0])
+    KK = K @ K
+    V = np.eye(3) + B * K + C * KK
+    return compose(np.eye(3) + A * K + B * KK, (V @ rho[..., None])[..., 0])
 
 
 def log(T: F64) -> F64:

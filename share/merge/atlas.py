@@ -60,6 +60,7 @@ class Atlas:
         self._chart = Chart()
         self._judge = Judge(config, self._chart, Survey(self._chart, {} if sights is None else sights))
         self._answers: dict[str, int] = {}  # agent -> its newest keyframe that a loop came from
+        self._surety: dict[int, tuple[int, F64]] = {}  # of a stretch: its map's founder, cov of T_map_odom
 
     # ------------------------------------------------------------ what is known
 
@@ -180,9 +181,8 @@ class Atlas:
     def take_out(self, numbers: Iterable[int]) -> list[TakenOut]:
         """These keyframes, but for those that have to stay by now."""
         chart, stay = self._chart, self._staying()
-        counts = chart.tied()
         going = [n for n in numbers if n in chart.poses and n not in stay]
-        taken = [take_out(chart, n, counts, self._config.most_loops) for n in going]
+        taken = [take_out(chart, n, self._config.most_loops) for n in going]
         chart.find_maps()
         self._judge.forget({out.key for out in taken})
         return taken
@@ -225,8 +225,8 @@ class Atlas:
     # ------------------------------------------------------------ the solver's side
 
     def due(self) -> list[str]:
-        """Maps with news that no job has had yet, the oldest first."""
-        return [self._chart.trails.stretches[founder].name for founder in sorted(self._chart.unsolved)]
+        """Maps with news that no job has had yet, the oldest news first."""
+        return [self._chart.trails.stretches[founder].name for founder in self._chart.unsolved]
 
     def snapshot(self, map_id: str) -> SolveJob:
         """What the solver has to know to solve this map. ValueError if there is none."""
@@ -234,16 +234,27 @@ class Atlas:
         founder = chart.named(map_id)
         stretches = tuple(chart.stretches_of(founder))
         agents = {chart.trails.stretches[s].agent for s in stretches}
-        chart.unsolved.discard(founder)
+        chart.unsolved.pop(founder, None)
         anew = chart.ties.anew
         return SolveJob(
             map_id,
             stretches,
             chart.anchor(founder),
             tuple(chart.trails.stretches[s].nodes[-1] for s in stretches),
+            self._asked(founder, stretches),
             chart.ties.news(chart.poses, chart.plumb),
             anew,
             tuple((agent, self._answers.pop(agent)) for agent in sorted(agents & self._answers.keys())),
+        )
+
+    def _asked(self, founder: int, stretches: Sequence[int]) -> tuple[int, ...]:
+        """Whose covariance is worth its time: who is answered, or never heard how sure he is in this map."""
+        trails, known = self._chart.trails, self._surety
+        return tuple(
+            s
+            for s in stretches
+            if trails.current(agent := trails.stretches[s].agent) == s
+            and (agent in self._answers or s not in known or known[s][0] != founder)
         )
 
     def solver_lost(self) -> None:
@@ -259,7 +270,7 @@ class Atlas:
         chart = self._chart
         founder = job.stretches[0]
         if tuple(chart.stretches_of(founder)) != job.stretches:
-            chart.unsolved.add(chart.founder[founder])
+            chart.unsolved[chart.founder[founder]] = None
             self._answers = dict(job.answers) | self._answers
             chart.ties.moved(n for n in solution.numbers.tolist() if n in chart.poses)
             return Applied({}, f"map {job.map_id}: joined or split while it was solved, due again")
@@ -286,13 +297,19 @@ class Atlas:
 
     def _corrections(self, job: SolveJob, solution: Solution) -> dict[str, Correction]:
         trails, answers, out = self._chart.trails, dict(job.answers), {}
-        for stretch, last, cov in zip(job.stretches, job.last, solution.covariances, strict=True):
+        told = dict(zip(job.wanted, solution.covariances, strict=True))
+        for stretch, last in zip(job.stretches, job.last, strict=True):
             agent = trails.stretches[stretch].agent
             if trails.current(agent) != stretch or last not in trails.nodes:
                 continue  # that odometry has ended: nothing is left to correct
+            if last in told:  # those after it hang on it rigidly
+                cov = se3.inverse_cov(trails.nodes[last].T_odom_body, told[last])
+                self._surety[stretch] = job.stretches[0], cov
+            if stretch not in self._surety:
+                continue
             out[agent] = Correction(
                 self._chart.placement(last),
-                se3.inverse_cov(trails.nodes[last].T_odom_body, cov),  # those after it hang on it rigidly
+                self._surety[stretch][1],
                 self._chart.name(stretch),
                 0,
                 answers.get(agent, -1),

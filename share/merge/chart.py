@@ -30,7 +30,8 @@ class Chart:
         self.poses: dict[int, F64] = {}
         self.plumb: dict[int, F64] = {}
         self.founder: list[int] = []
-        self.unsolved: set[int] = set()  # founders of maps with news for the solver
+        self.bonds: Counter[tuple[int, int]] = Counter()  # loops by the two stretches that they tie
+        self.unsolved: dict[int, None] = {}  # founders of maps with news, the oldest first
 
     def add(self, agent: str, keyframe: Keyframe, cov: F64, plumb: F64) -> int:
         """The number of the new node. cov (6, 6): of its step from the one before, as it is believed; so is
@@ -64,10 +65,23 @@ class Chart:
     def tie(self, loop: Loop) -> None:
         """Two maps that it ties are one from now on."""
         a, b = self.ends(loop)
-        self.ties.add(Edge(a, b, loop.T_a_b, loop.cov), loop)
+        self.bind(Edge(a, b, loop.T_a_b, loop.cov), loop)
         if not self.same_map(a, b):
             self.find_maps()
-        self.unsolved = {self.founder[f] for f in self.unsolved} | {self.founder_of(loop.a)}
+        self.unsolved = dict.fromkeys([*(self.founder[f] for f in self.unsolved), self.founder_of(loop.a)])
+
+    def bind(self, edge: Edge, loop: Loop) -> None:
+        """A loop as an edge; if it ties what no other does, `find_maps` is due."""
+        self.ties.add(edge, loop)
+        self.bonds[self.bond(edge)] += 1
+
+    def unbind(self, number: int) -> None:
+        """Take a loop's edge out; if it was the last of its bond, `find_maps` is due."""
+        bond = self.bond(self.ties.edges[number])
+        self.bonds[bond] -= 1
+        if not self.bonds[bond]:
+            del self.bonds[bond]
+        self.ties.remove(number)
 
     def drop(self, numbers: Sequence[int]) -> tuple[Loop, ...]:
         """Take loops, by their edges' numbers, back, and the joins that hung on them."""
@@ -75,12 +89,12 @@ class Chart:
         touched = {self.founder_of(key) for loop in dropped for key in (loop.a, loop.b)}
         stretches = [s for founder in touched for s in self.stretches_of(founder)]
         for number in numbers:
-            self.ties.remove(number)
+            self.unbind(number)
         self.find_maps()
         for founder in sorted({self.founder[s] for s in stretches}):
             anchor = self.anchor(founder)
             self.move(founder, self.trails.nodes[anchor].T_odom_body @ se3.inverse(self.poses[anchor]))
-            self.unsolved.add(founder)
+            self.unsolved[founder] = None
         return dropped
 
     def lay_beside(self, loop: Loop) -> None:
@@ -156,6 +170,10 @@ class Chart:
         T_odom_body = self.trails.nodes[number].T_odom_body
         return se3.orthonormal(self.poses[number] @ se3.inverse(T_odom_body))
 
+    def lie(self, a: int, b: int) -> F64:
+        """T_a_b (4, 4) of two nodes of a map."""
+        return se3.inverse(self.poses[a]) @ self.poses[b]
+
     def between(self, a: int, goals: Sequence[int]) -> Known:
         """Poses (N, 4, 4) of the goals in node a of the same map, as the map has them now."""
         covs = self.ties.roads.known_from(a, goals, self.poses)
@@ -164,11 +182,10 @@ class Chart:
                 raise ValueError(f"nodes {a} and {goal} are not in one map")
         return Known(se3.inverse(self.poses[a]) @ np.array([self.poses[n] for n in goals]), np.array(covs))
 
-    def tied(self) -> Counter[tuple[int, int]]:
-        """How many loops tie each two stretches, the older first."""
-        nodes, edges = self.trails.nodes, self.ties.edges
-        ends = ((nodes[edges[n].a].stretch, nodes[edges[n].b].stretch) for n in self.ties.loops)
-        return Counter((a, b) if a < b else (b, a) for a, b in ends)
+    def bond(self, edge: Edge) -> tuple[int, int]:
+        """The stretches at its ends, the older first."""
+        a, b = (self.trails.nodes[end].stretch for end in (edge.a, edge.b))
+        return (a, b) if a < b else (b, a)
 
     def find_maps(self) -> None:
         """Every stretch's founder, from the loops: the connected parts."""
@@ -179,7 +196,7 @@ class Chart:
                 i = root[i]
             return i
 
-        for pair in self.tied():
+        for pair in self.bonds:
             low, high = sorted(map(find, pair))
             root[high] = low
         self.founder = [find(i) for i in range(len(root))]

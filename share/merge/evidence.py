@@ -18,6 +18,8 @@ from share.merge.join import Loop
 from share.merge.places import distinct
 from share.types import F64
 
+_USUAL = 0.5  # found where nobody has looked: what most true loops have
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -52,7 +54,8 @@ def weigh(loops: Sequence[Loop], chart: Chart, config: MergeConfig) -> Evidence:
         for number in chart.ends(loop):
             sides.setdefault(chart.trails.nodes[number].stretch, []).append(chart.poses[number])
     count = min(places(poses, config) for poses in sides.values())
-    found = float(np.mean([loop.found for loop in seen]))
+    told = [loop.found for loop in seen if loop.found is not None]
+    found = float(np.mean(told)) if told else _USUAL
     keyframes = min(len({loop.a for loop in seen}), len({loop.b for loop in seen}))
     return Evidence(count, found, keyframes)
 

@@ -33,7 +33,7 @@ class Loop:
     """Body of keyframe b as seen from that of a: T_a_b (4, 4), cov (6, 6), and the inliers behind it.
 
     found: of the points that both views should then show, the share that they do (`share.place.missing`);
-    half where nobody knows, which is what most true loops have.
+    None where nobody has looked.
     """
 
     a: Key
@@ -41,13 +41,13 @@ class Loop:
     T_a_b: F64
     cov: F64
     inliers: int
-    found: float = 0.5
+    found: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_a_b", checked_pose("T_a_b", self.T_a_b))
         object.__setattr__(self, "cov", checked("cov", self.cov, (6, 6), np.float64))
 
-    @property
+    @cached_property
     def pair(self) -> frozenset[Key]:
         """The two keyframes, whichever way round."""
         return frozenset((self.a, self.b))

@@ -11,15 +11,21 @@ import itertools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from share.config import MergeConfig
+from share.geometry import se3
 from share.merge.chart import Chart
 from share.merge.cut import fewest
 from share.merge.evidence import Evidence, near, places, weigh
 from share.merge.join import Disagreement, Key, Known, Loop, disagreement, opposite, witness_chi2
 from share.merge.places import near_any
 from share.merge.survey import Survey, doubt
+from share.types import F64
 
 _NAMED = 3  # loops, in a reason
+_MOVED = 2e-3  # rad and m: with less, what did not fit does not
+_LOOKED_AT = 8  # loops that stand, whenever others contradict them
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,7 @@ class Judge:
         self.waiting: list[Loop] = []
         self.rebels: list[Loop] = []
         self._alike: set[int] = set()  # nodes at places of which a look-alike is known
+        self._held: dict[Loop, F64] = {}  # waiting loops that did not fit their map, which then had T_a_b
         self._config, self._chart, self._survey = config, chart, survey
 
     def decide(self, loop: Loop) -> Decision:
@@ -55,7 +62,9 @@ class Judge:
         if self._chart.trails.are_neighbours(a, b, gap):
             need = f"at least {gap} keyframes apart needed"
             return Decision(False, f"loop {loop}: neighbours by odometry, {need}")
-        return self._close(loop) if self._chart.same_map(a, b) else self._join(loop)
+        if self._chart.same_map(a, b):
+            return self._close(loop)
+        return self._join(self._survey.looked_at(loop))
 
     def review(self, number: int) -> Decision | None:
         """A new node, in a map: undoes the join that what it sees speaks against, if any does."""
@@ -72,10 +81,11 @@ class Judge:
     def settle(self) -> tuple[Loop, ...]:
         """Those that waited and fit the map that they are in by now are believed."""
         inside = [loop for loop in self.waiting if self._chart.same_map(*self._chart.ends(loop))]
-        gaps = self._gaps(inside)
-        fitting = [
-            loop for loop, gap in zip(inside, gaps, strict=True) if gap.chi2 <= self._config.agree_chi2
-        ]
+        lie = {loop: self._chart.lie(*self._chart.ends(loop)) for loop in inside}
+        moved = [loop for loop in inside if loop not in self._held or _has_moved(self._held[loop], lie[loop])]
+        gaps = self._gaps(moved)
+        fitting = [loop for loop, gap in zip(moved, gaps, strict=True) if gap.chi2 <= self._config.agree_chi2]
+        self._held = {x: lie[x] if x in moved else self._held[x] for x in inside if x not in fitting}
         self._believe(fitting)
         return tuple(fitting)
 
@@ -114,7 +124,7 @@ class Judge:
         """The map has drifted, if another loop elsewhere says so too."""
         story = self._same_story(loop, self.waiting)
         if not story:
-            self._wait(loop)
+            self._wait(self._survey.looked_at(loop))
             return Decision(False, f"{why}: waits for a witness")
         return self._accept([*story, loop], f"{why}: agrees with {story[-1]}")
 
@@ -125,14 +135,18 @@ class Judge:
         if a == b:
             self._alike.update(self._chart.ends(loop))
             return Decision(False, f"{why}: two places look alike")
+        loop = self._survey.looked_at(loop)
         story = [*self._same_story(loop, self.rebels), loop]
         self.rebels = [*self.rebels, loop][-self._config.max_pending :]
+        c, have = self._config, self._weigh(story)
+        why = f"{why}; {have} say so"
+        if have.places < c.rebel_places:
+            return Decision(False, f"{why}, {c.rebel_places} places needed")
         against = self._ties_between(a, b)
-        standing = self._weigh([self._chart.ties.loops[n] for n in against])
-        c, have, need = self._config, self._weigh(story), self._config.rebel_places
-        why = f"{why}; {have} say so, {standing} do not"
-        if have.places < need or have.weight <= c.rebel_weight * standing.weight:
-            return Decision(False, f"{why}, {need} places and more weight needed")
+        standing = self._standing(against)
+        why = f"{why}, {standing} do not"
+        if have.weight <= c.rebel_weight * standing.weight:
+            return Decision(False, f"{why}, more weight needed")
         if denial := self._denial(loop):
             return Decision(False, why + denial)
         return self._overthrow(story, against, why)
@@ -146,6 +160,15 @@ class Judge:
         }
         numbers = list(loops)
         return [numbers[i] for i in fewest([(x, y) for x, y in loops.values()], a, b)]
+
+    def _standing(self, against: Sequence[int]) -> Evidence:
+        """What loops of a map, by their edges' numbers, are worth; a few of those that nobody has looked at
+        yet are looked at."""
+        loops = self._chart.ties.loops
+        unknown = [n for n in against if loops[n].found is None and near(loops[n], self._config)]
+        for n in unknown[:: 1 + len(unknown) // _LOOKED_AT]:
+            loops[n] = self._survey.looked_at(loops[n])
+        return self._weigh([loops[n] for n in against])
 
     def _overthrow(self, loops: list[Loop], against: list[int], why: str) -> Decision:
         dropped = self._chart.drop(against)
@@ -185,12 +208,9 @@ class Judge:
         if gone > c.overlap_gone:
             return f", but {gone:.0%} of the {len(looks)} views that overlap is gone: waits"
         doubts = itertools.accumulate(looks, lambda d, look: doubt(d, look, c.overlap_gone), initial=0.0)
-        worst = max(doubts)
-        return (
-            f", but views in a row show things gone (doubt {worst:.1f}): waits"
-            if worst > c.undo_doubt
-            else ""
-        )
+        if (worst := max(doubts)) > c.undo_doubt:
+            return f", but views in a row show things gone (doubt {worst:.1f}): waits"
+        return ""
 
     def _places_needed(self, loop: Loop) -> int:
         """Of a map that knows few places, all but one."""
@@ -284,6 +304,10 @@ class Judge:
 
     def _wait(self, loop: Loop) -> None:
         self.waiting = [*self.waiting, loop][-self._config.max_pending :]
+
+
+def _has_moved(before: F64, now: F64) -> bool:
+    return bool(np.abs(se3.log(se3.inverse(before) @ now)).max() > _MOVED)
 
 
 def taken_out(loops: Sequence[Loop]) -> str:

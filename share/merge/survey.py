@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from share.geometry import se3
 from share.merge.chart import Chart
 from share.merge.join import Loop
-from share.place.missing import Gone, gone
+from share.place.missing import Gone, gone, missing
 from share.place.verify import Sight
 from share.types import F64
 
@@ -45,6 +45,13 @@ class Survey:
         self._seen: dict[tuple[int, int], tuple[F64, Gone]] = {}
         self._probations: dict[tuple[int, int], Probation] = {}
 
+    def looked_at(self, loop: Loop) -> Loop:
+        """With what is found of it, if both its views are known."""
+        a, b = (self._sights.get(n) for n in self._chart.ends(loop))
+        if loop.found is not None or a is None or b is None:
+            return loop
+        return replace(loop, found=1 - missing(b, a, loop.T_a_b).share)
+
     def overlap(self, loop: Loop) -> list[Gone]:
         """Of two maps (in one map: two stretches), if they lay as the loop says: pairs of views from about
         one spot, each view in one of them, in the order of b's."""
@@ -54,7 +61,7 @@ class Survey:
             return []
         T_b = chart.poses[a] @ loop.T_a_b @ se3.inverse(chart.poses[b])  # map of b in that of a
         x, y = (np.array([chart.poses[n] for n in nodes]) for nodes in (ours, theirs))
-        pairs = _apart_pairs(x, T_b @ y)
+        pairs = _near_pairs(x, T_b @ y)
         looks = ((j, self._look(ours[i], theirs[j], T)) for i, j, T in pairs)
         return [look for _, look in sorted(_telling(looks, _PAIRS))]
 
@@ -100,7 +107,7 @@ class Survey:
         if not nodes or number not in self._sights:
             return None
         poses = self._chart.poses
-        pairs = _apart_pairs(np.array([poses[n] for n in nodes]), poses[number][None])
+        pairs = _near_pairs(np.array([poses[n] for n in nodes]), poses[number][None])
         looks = _telling(((j, self._look(nodes[i], number, T)) for i, j, T in pairs), 1)
         return looks[0][1] if looks else None
 
@@ -131,7 +138,7 @@ def _telling(looks: Iterator[tuple[int, Gone]], most: int) -> list[tuple[int, Go
     return list(itertools.islice((look for look in looks if look[1].visible >= _POINTS), most))
 
 
-def _apart_pairs(x: F64, y: F64) -> Iterator[tuple[int, int, F64]]:
+def _near_pairs(x: F64, y: F64) -> Iterator[tuple[int, int, F64]]:
     """Pairs of poses x (N, 4, 4), y (K, 4, 4) from about one spot, as i, j, T_x_y; nearest first, each pose
     in one of them."""
     a, b = x[:, :3, 3], y[:, :3, 3]

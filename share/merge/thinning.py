@@ -6,7 +6,6 @@ What is left covers the same views; odometry and loops of a keyframe that goes a
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -17,8 +16,6 @@ from share.graph.posegraph import Edge
 from share.merge.chart import Chart
 from share.merge.join import Key, Loop
 from share.types import F64
-
-Bonds = Counter[tuple[int, int]]  # loops by the two stretches that they tie: `Chart.tied`
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +62,7 @@ def redundant(poses: F64, may_go: Collection[int], count: int, apart_m: float, a
     return out
 
 
-def take_out(chart: Chart, number: int, bonds: Bonds, most_loops: int) -> TakenOut:
+def take_out(chart: Chart, number: int, most_loops: int) -> TakenOut:
     """Of a keyframe with an odometry neighbour; one without takes its loops along. No keyframe is given
     more than `most_loops` loops, but for the last between two stretches. `chart.find_maps` is due
     afterwards."""
@@ -74,9 +71,11 @@ def take_out(chart: Chart, number: int, bonds: Bonds, most_loops: int) -> TakenO
     touching = ties.touching(number)
     loops = [(ties.loops[n], ties.edges[n]) for n in touching if n in ties.loops]
     odometry = [ties.edges[n] for n in touching if n not in ties.loops]
-    bonds.subtract(_pair(chart, edge) for _, edge in loops)
     for n in touching:
-        ties.remove(n)
+        if n in ties.loops:
+            chart.unbind(n)
+        else:
+            ties.remove(n)
     chart.forget(number)
     if not odometry:
         return TakenOut(number, key, None, ())
@@ -85,7 +84,7 @@ def take_out(chart: Chart, number: int, bonds: Bonds, most_loops: int) -> TakenO
         ties.add(edge)
     link = None if after is None else _link(chart, before, after)
     pairs = [(old, edge) for (old, _), edge in zip(loops, left.loops, strict=True) if edge is not None]
-    moved = [_move(chart, old, edge, bonds, most_loops) for old, edge in pairs]
+    moved = [_move(chart, old, edge, most_loops) for old, edge in pairs]
     return TakenOut(number, key, link, tuple(loop for loop in moved if loop is not None))
 
 
@@ -106,18 +105,12 @@ def _link(chart: Chart, before: int | None, after: int) -> Link:
     return Link(node.key, chart.trails.nodes[before].key, edge.T_a_b, edge.cov)
 
 
-def _move(chart: Chart, old: Loop, edge: Edge, bonds: Bonds, most_loops: int) -> Loop | None:
+def _move(chart: Chart, old: Loop, edge: Edge, most_loops: int) -> Loop | None:
     """The loop at its new ends; None where there is one already, or enough."""
     ties, nodes = chart.ties, chart.trails.nodes
     at_a, at_b = ({n for n in ties.touching(end) if n in ties.loops} for end in (edge.a, edge.b))
-    if at_a & at_b or (max(len(at_a), len(at_b)) >= most_loops and bonds[_pair(chart, edge)] > 0):
+    if at_a & at_b or (max(len(at_a), len(at_b)) >= most_loops and chart.bonds[chart.bond(edge)]):
         return None
     loop = Loop(nodes[edge.a].key, nodes[edge.b].key, edge.T_a_b, edge.cov, old.inliers, old.found)
-    ties.add(edge, loop)
-    bonds[_pair(chart, edge)] += 1
+    chart.bind(edge, loop)
     return loop
-
-
-def _pair(chart: Chart, edge: Edge) -> tuple[int, int]:
-    a, b = (chart.trails.nodes[end].stretch for end in (edge.a, edge.b))
-    return (a, b) if a < b else (b, a)

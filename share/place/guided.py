@@ -22,14 +22,20 @@ def beside(pairs: Pairs, T_c_q: F64, y_q: F64, y_c: F64, radius: float) -> Pairs
     y_q (N, 3), y_c (K, 3): keypoints with inverse depth, NaN if unknown. Whichever of the two has a
     depth is moved; a pair without any depth is left out.
     """
-    there = _apart(move(T_c_q, y_q), y_q, y_c, pairs.rows, pairs.cols)
-    back = _apart(move(se3.inverse(T_c_q), y_c), y_c, y_q, pairs.cols, pairs.rows)
-    known = np.isfinite(y_q[pairs.rows, 2]) | np.isfinite(y_c[pairs.cols, 2])
-    return pairs.only((np.fmax(there, back) <= radius) & known)
+    there, back = _moved(T_c_q, y_q), _moved(se3.inverse(T_c_q), y_c)
+    for axis in (0, 1):  # by one coordinate after the other, since each leaves few pairs for the next
+        pairs = pairs.only(_near(there[axis][pairs.rows], y_c[:, axis][pairs.cols], radius))
+        pairs = pairs.only(_near(back[axis][pairs.cols], y_q[:, axis][pairs.rows], radius))
+    return pairs.only(np.isfinite(y_q[pairs.rows, 2]) | np.isfinite(y_c[pairs.cols, 2]))
 
 
-def _apart(moved: F64, source: F64, target: F64, rows: NDArray[np.int64], cols: NDArray[np.int64]) -> F64:
-    """Distance (M,) in the image; NaN where the depth is unknown, infinite where it is behind the camera."""
-    off: F64 = np.abs(moved[rows, :2] - target[cols, :2]).max(1)
-    off[np.isnan(off) & np.isfinite(source[rows, 2])] = np.inf
-    return off
+def _moved(T: F64, y: F64) -> F64:
+    """(3, N): NaN where the depth is unknown, infinite where it is behind the camera."""
+    out = move(T, y.T)
+    out[:, np.isnan(out[2]) & np.isfinite(y[:, 2])] = np.inf
+    return out
+
+
+def _near(a: F64, b: F64, radius: float) -> NDArray[np.bool_]:
+    """Not if they are known to be further apart."""
+    return np.asarray(~(np.abs(a - b) > radius))

@@ -20,7 +20,8 @@ class Pairs(NamedTuple):
     bits: NDArray[np.uint16]
 
     def only(self, keep: NDArray[np.bool_]) -> Pairs:
-        return Pairs(self.rows[keep], self.cols[keep], self.bits[keep])
+        at = np.flatnonzero(keep)
+        return Pairs(self.rows[at], self.cols[at], self.bits[at])
 
 
 def hamming(a: U8, b: U8) -> NDArray[np.uint16]:
@@ -52,11 +53,16 @@ def near(distance: NDArray[np.uint16], max_bits: int) -> Pairs:
 def mutual(pairs: Pairs) -> Pairs:
     """Those that are the best of their row and of their column, the most alike first."""
     order = np.argsort(pairs.bits, kind="stable")
-    sorted_pairs = Pairs(pairs.rows[order], pairs.cols[order], pairs.bits[order])
-    best = np.zeros(len(order), np.int8)
-    for one in (sorted_pairs.rows, sorted_pairs.cols):
-        best[np.unique(one, return_index=True)[1]] += 1
-    return sorted_pairs.only(best == 2)
+    ranked = Pairs(pairs.rows[order], pairs.cols[order], pairs.bits[order])
+    return ranked.only(_first(ranked.rows) & _first(ranked.cols))
+
+
+def _first(ids: I64) -> NDArray[np.bool_]:
+    """Which (M,) appear for the first time."""
+    number = np.arange(len(ids))
+    first = np.empty(ids.max(initial=-1) + 1, np.int64)
+    first[ids[::-1]] = number[::-1]  # of several, numpy keeps the last
+    return np.asarray(first[ids] == number)
 
 
 def match(query: U8, candidate: U8, max_distance: int, ratio: float) -> I64:

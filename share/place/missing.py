@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from share.geometry import se3
 from share.place.matching import apart
@@ -85,7 +86,7 @@ def _seen(T: F64, source: Sight, target: Sight, reach_px: float) -> _Seen:
     y = target.y
     if not len(source.view) or not len(y):
         return _Seen(np.zeros((0, 2)), np.zeros(0, bool))
-    moved = move(T, source.y)
+    moved = move(T, source.y.T).T
     inside = np.flatnonzero(_inside(moved, y))
     moved = moved[inside]
     rows, cols, px = _beside(target.focal * moved[:, :2], target.focal * y[:, :2])
@@ -121,8 +122,5 @@ def _inside(moved: F64, target: F64) -> NDArray[np.bool_]:
 
 def _beside(a: F64, b: F64) -> tuple[I64, I64, F64]:
     """Which of a (N, 2) and b (K, 2) are near, pixels: rows, columns, distances (M,)."""
-    square = (a[:, :1] - b[:, 0]) ** 2
-    square += (a[:, 1:] - b[:, 1]) ** 2
-    at = np.flatnonzero(square < _AROUND_PX**2)
-    rows, cols = np.divmod(at, len(b))
-    return rows, cols, np.sqrt(square.ravel()[at])
+    found = KDTree(a).sparse_distance_matrix(KDTree(b), _AROUND_PX, output_type="ndarray")
+    return found["i"], found["j"], found["v"]

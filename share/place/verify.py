@@ -26,6 +26,7 @@ _WIDEST = 10.0  # |u|, |v| of a keypoint that a lens can see (84 degrees off the
 
 
 MIN_ITERATIONS = 50  # of each consensus: one wrong place costs more than a millisecond
+CONFIDENCE = 0.99  # of each consensus; the two directions seldom err alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,15 +54,13 @@ class Sight:
 class Verified:
     """T_c_q (4, 4): body of the query in the body frame of the candidate; cov (6, 6) of it.
 
-    matches: descriptor pairs; inliers: those that agree with the pose. found: of the points that both
-    views should then show, the share that they do (`share.place.missing`); `verify` leaves it at a half.
+    matches: descriptor pairs; inliers: those that agree with the pose.
     """
 
     T_c_q: F64
     cov: F64
     matches: int
     inliers: int
-    found: float = 0.5
 
     @property
     def reason(self) -> str:
@@ -191,7 +190,9 @@ def _both_ways(
 
 def _depth(y_q: F64, y_c: F64) -> float:
     """Median, m."""
-    return float(np.nanmedian(1 / np.concatenate([y_q[:, 2], y_c[:, 2]])))
+    rho = np.concatenate([y_q[:, 2], y_c[:, 2]])
+    rho = rho[np.isfinite(rho)]
+    return float(1 / np.partition(rho, len(rho) // 2)[len(rho) // 2])  # a fourth of np.nanmedian's time
 
 
 def _differ(a: F64, b: F64, depth: float, config: PlaceConfig) -> bool:
@@ -216,7 +217,7 @@ def _absolute_pose(
     y = source[known]
     points, seen = rays(y[:, :2]) / y[:, 2:], target[known, :2]
     T, inliers = absolute_pose(
-        points, seen, focal, config.ransac_px, seed, MIN_ITERATIONS, iterations, best_first
+        points, seen, focal, config.ransac_px, seed, MIN_ITERATIONS, iterations, best_first, CONFIDENCE
     )
     _need(int(inliers.sum()), config.min_consensus, f"inliers of the {whose} points")
     if not np.isfinite(T).all():
@@ -226,7 +227,8 @@ def _absolute_pose(
 
 def _check_spread(y: F64, whose: str, config: PlaceConfig) -> None:
     """The narrow side of the cloud of inliers: a pose from one corner or one line is not to be trusted."""
-    narrow = float(np.sqrt(np.linalg.eigvalsh(np.cov(y[:, :2].T))[0]))
+    apart = y[:, :2] - y[:, :2].mean(0)
+    narrow = float(np.linalg.svd(apart, compute_uv=False)[-1] / np.sqrt(len(y) - 1))
     if narrow < config.min_spread:
         raise _RefusedError(
             f"inliers crowd in the {whose} image: spread {narrow:.3f} of {config.min_spread} needed"

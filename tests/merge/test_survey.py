@@ -66,7 +66,7 @@ class Room:
     def solve(self) -> None:
         job = self.atlas.snapshot("a/0")
         self.solver.update(job.change)
-        self.atlas.apply(job, self.solver.solve(job.anchor, job.last))
+        self.atlas.apply(job, self.solver.solve(job.anchor, job.wanted))
 
     def loops(self, at: range) -> list[Loop]:
         a, b = self.walkers

@@ -49,7 +49,7 @@ def test_only_what_may_go_goes() -> None:
 def test_a_keyframe_in_the_middle_leaves_its_neighbours_tied() -> None:
     ann = Walker("ann", 1)
     chart = chart_of(ann)
-    out = take_out(chart, 30, chart.tied(), most_loops=10)
+    out = take_out(chart, 30, most_loops=10)
     assert out.key == Key("ann", 30)
     assert out.link is not None
     assert (out.link.key, out.link.reference) == (Key("ann", 31), Key("ann", 29))
@@ -63,7 +63,7 @@ def test_a_keyframe_in_the_middle_leaves_its_neighbours_tied() -> None:
 def test_without_its_first_a_stretch_begins_with_the_next() -> None:
     ann = Walker("ann", 1)
     chart = chart_of(ann)
-    out = take_out(chart, 0, chart.tied(), most_loops=10)
+    out = take_out(chart, 0, most_loops=10)
     assert out.link is not None
     assert out.link.reference is None
     assert out.link.T_ref_body == pytest.approx(ann.T_odom_body[1], abs=1e-9)
@@ -73,7 +73,7 @@ def test_loops_move_to_the_neighbour() -> None:
     ann, bob = Walker("ann", 1), Walker("bob", 2, phase=0.7)
     chart = chart_of(ann, bob)
     chart.tie(loop(ann, 20, bob, 10, np.random.default_rng(0)))
-    out = take_out(chart, 20, chart.tied(), most_loops=10)
+    out = take_out(chart, 20, most_loops=10)
     (moved,) = out.moved
     assert moved.a in (Key("ann", 19), Key("ann", 21))
     assert moved.b == Key("bob", 10)
@@ -86,7 +86,7 @@ def test_the_last_loop_between_two_stretches_stays_whatever_the_limit() -> None:
     ann, bob = Walker("ann", 1), Walker("bob", 2, phase=0.7)
     chart = chart_of(ann, bob)
     chart.tie(loop(ann, 20, bob, 10, np.random.default_rng(0)))
-    out = take_out(chart, 20, chart.tied(), most_loops=0)
+    out = take_out(chart, 20, most_loops=0)
     assert len(out.moved) == 1
     chart.find_maps()
     assert chart.founder == [0, 0]
@@ -98,7 +98,7 @@ def settle(atlas: Atlas, solver: Solver) -> None:
         if job.anew:
             solver.clear()
         solver.update(job.change)
-        atlas.apply(job, solver.solve(job.anchor, job.last))
+        atlas.apply(job, solver.solve(job.anchor, job.wanted))
 
 
 def test_a_thinned_map_is_solved_as_well_and_goes_on() -> None:
@@ -145,7 +145,7 @@ def test_taken_out_and_joined_while_the_map_is_solved() -> None:
         atlas.propose(x)
     job = atlas.snapshot("bob/0")
     solver.update(job.change)
-    solution = solver.solve(job.anchor, job.last)
+    solution = solver.solve(job.anchor, job.wanted)
     (gone,) = atlas.take_out([atlas._chart.trails.number(Key("bob", 30))])
     for x in near_loops(*walkers, rng):
         if gone.key not in (x.a, x.b):

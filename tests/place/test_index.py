@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from share.place.index import PlaceIndex
+from share.place.page import joined, written
 from share.types import U8
 
 
@@ -57,7 +58,9 @@ def test_answer_does_not_depend_on_where_a_keyframe_is_written(n: int) -> None:
     index, places = filled(n, rng)
     query = noisy(places[11], rng, 0.1)
     held = [Counter(enumerate_words(index, p)) for p in places]
-    total = sum(held, Counter())
+    total = Counter[int]()
+    for words in held:
+        total.update(words)
     asked = enumerate_words(index, query)
     score = [sum(np.log((1 + n) / (1 + min(total[w], n))) * h[w] for w in asked) for h in held]
     found = {c.id - 1000: c.score for c in index.query(query, limit=n)}
@@ -97,6 +100,21 @@ def test_removed_ones_can_come_again() -> None:
     assert len(index) == 130
 
 
+def test_joined_pages_are_the_page_written_at_once_from_what_lives() -> None:
+    rng = np.random.default_rng(8)
+    vocabulary = 150_000  # joined in several blocks
+    common = rng.integers(0, vocabulary, 500, np.uint32)
+    views = [np.append(rng.choice(common, n), [0, vocabulary - 1]).astype(np.uint32) for n in range(120)]
+    pages = [written(range(i, j), views[i:j], vocabulary) for i, j in ((0, 70), (70, 80), (80, 120))]
+    dead = [0, 5, 69, *range(70, 80), 119]
+    for page in pages:
+        page.alive[np.isin(page.ids, dead)] = False
+    left = [i for i in range(120) if i not in dead]
+    one, whole = joined(pages), written(left, [views[i] for i in left], vocabulary)
+    for name in ("ids", "sizes", "alive", "starts", "slots"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(whole, name), name, strict=True)
+
+
 def test_words_that_are_everywhere_are_not_read() -> None:
     """Of a view whose every word is in every keyframe, nothing is left to find it by."""
     index = PlaceIndex(seed=0)
@@ -129,3 +147,19 @@ def test_empty_index_and_empty_view() -> None:
 def test_impossible_tables_are_refused(tables: int, bits: int) -> None:
     with pytest.raises(ValueError, match="bits"):
         PlaceIndex(0, tables, bits)
+
+
+def test_words_of_those_that_are_gone_are_held_no_longer() -> None:
+    """Otherwise they would count as common, and be read no more."""
+    rng = np.random.default_rng(8)
+    index, _ = filled(320, rng)
+    for i in rng.permutation(320)[:200]:
+        index.remove(1000 + int(i))
+    for i in range(256):
+        index.add(5000 + i, rng.integers(0, 256, (20, 32), np.uint8))
+    on_pages = sum(page.held() for page in index._pages)
+    fresh = np.bincount(
+        np.concatenate([np.zeros(0, np.uint32), *index._fresh.values()]), minlength=len(on_pages)
+    )
+    assert (index._held == on_pages + fresh).all()
+    assert len(index) == 376

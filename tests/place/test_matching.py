@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 
-from share.place.matching import hamming, match
+from share.place.matching import Pairs, hamming, match, mutual, near
 
 
 def test_hamming_agrees_with_opencv() -> None:
@@ -31,6 +31,15 @@ def test_is_symmetric_and_refuses_the_unlike() -> None:
     assert len(match(a, b, 64, 1.0)) == 0
     loose = match(a, b, 256, 1.0)
     assert {tuple(p) for p in loose} == {(j, i) for i, j in match(b, a, 256, 1.0)}
+
+
+def test_mutual_pairs_are_the_best_of_row_and_column() -> None:
+    """Of equals the first, and the most alike come first."""
+    distance = np.array([[9, 3, 9], [2, 1, 9], [9, 9, 5], [9, 9, 5]], np.uint16)
+    found = mutual(near(distance, 8))
+    assert [tuple(map(int, pair)) for pair in zip(*found, strict=True)] == [(1, 1, 1), (2, 2, 5)]
+    none = np.zeros(0, np.int64)
+    assert len(mutual(Pairs(none, none, none.astype(np.uint16))).rows) == 0
 
 
 def test_ratio_refuses_an_ambiguous_match() -> None:

@@ -17,7 +17,7 @@ def numerical(f, at: F64, step: float = 1e-6) -> F64:
 
 def matched(rng: np.random.Generator, T_c_q: F64, n: int, noise: float = 1.0) -> tuple[F64, F64]:
     y_q = np.column_stack([rng.uniform(-0.8, 0.8, n), rng.uniform(-0.5, 0.5, n), 1 / rng.uniform(1.5, 5, n)])
-    y_c = move(T_c_q, y_q)
+    y_c = move(T_c_q, y_q.T).T
     sigma = noise * np.sqrt(NOISE.variances)
     y_q, y_c = (y + rng.normal(size=y.shape) * sigma for y in (y_q, y_c))
     y_q[: n // 4, 2] = NAN
@@ -28,16 +28,29 @@ def matched(rng: np.random.Generator, T_c_q: F64, n: int, noise: float = 1.0) ->
 def test_jacobians_against_differences() -> None:
     rng = np.random.default_rng(0)
     T = se3.exp(rng.normal(0, 0.3, 6))
-    y = np.column_stack([rng.uniform(-0.5, 0.5, (20, 2)), rng.uniform(0.2, 0.6, 20)])
+    y = np.vstack([rng.uniform(-0.5, 0.5, (2, 20)), rng.uniform(0.2, 0.6, 20)])
     moved = move(T, y)
     assert np.isfinite(moved).all()
-    assert by_pose(moved) == pytest.approx(
-        numerical(lambda xi: move(se3.exp(xi) @ T, y), np.zeros(6)), abs=1e-6
-    )
+    by_xi = numerical(lambda xi: move(se3.exp(xi) @ T, y), np.zeros(6))
+    assert by_pose(moved) == pytest.approx(np.moveaxis(by_xi, 2, 0), abs=1e-6)
     by_y = by_keypoint(T, y, moved)
     for i in range(20):
-        expected = numerical(lambda v: move(T, v[None])[0], y[i])
-        assert by_y[i] == pytest.approx(expected, abs=1e-6)
+        expected = numerical(lambda v: move(T, v[:, None])[:, 0], y[:, i])
+        assert by_y[:, :, i] == pytest.approx(expected, abs=1e-6)
+
+
+def test_each_point_may_be_moved_by_a_transform_of_its_own() -> None:
+    rng = np.random.default_rng(3)
+    T = se3.exp(rng.normal(0, 0.3, (2, 6)))
+    y = np.vstack([rng.uniform(-0.5, 0.5, (2, 2)), rng.uniform(0.2, 0.6, 2)])
+    own = np.moveaxis(T, 0, 2)
+    moved = move(own, y)
+    for i in range(2):
+        alone = y[:, i : i + 1]
+        assert moved[:, i : i + 1] == pytest.approx(move(T[i], alone))
+        assert by_keypoint(own, y, moved)[:, :, i : i + 1] == pytest.approx(
+            by_keypoint(T[i], alone, move(T[i], alone))
+        )
 
 
 def test_exact_matches_give_the_exact_pose() -> None:

@@ -10,8 +10,8 @@ import re
 from dataclasses import dataclass, fields
 from typing import TypeAlias
 
-from share.config import from_mapping
 from share.errors import UsageError
+from share.strict import from_mapping
 from share.types import AgentKind
 
 LOOKS = ("person", "robot", "drone")

@@ -81,7 +81,7 @@ def _next(db: sqlite3.Connection, run: str) -> int:
 
 def _loop(db: sqlite3.Connection, change: KeepLoop) -> None:
     row = rows.of_loop(change.loop)
-    same = " AND ".join(f"{name} = ?" for name in COLUMNS["loop"])
+    same = " AND ".join(f"{name} IS ?" for name in COLUMNS["loop"])
     if not _one(db, f"SELECT 1 FROM loop WHERE {same}", *row):
         insert(db, "loop", row)
 

@@ -75,7 +75,7 @@ def of_link(link: KeepLink) -> Row:
 
 def of_loop(loop: Loop) -> Row:
     T_a_b, cov = _bytes(loop.T_a_b), _bytes(loop.cov)
-    return (*loop.a, *loop.b, T_a_b, cov, int(loop.inliers), float(loop.found))
+    return (*loop.a, *loop.b, T_a_b, cov, int(loop.inliers), loop.found)
 
 
 def of_poses(poses: KeepPoses) -> Row:
