@@ -1,23 +1,14 @@
-"""Every tunable of SHARE, its unit and its default; and the strict reading of a YAML file of them.
-
-An unknown key is refused by its full name, with the nearest known one. The effective
-configuration is written beside the results of every run.
+"""Every tunable of SHARE, its unit and its default. The effective configuration is written beside the
+results of every run.
 """
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
-import difflib
-import types as _types
-import typing
 from dataclasses import dataclass, field, fields
-from typing import Any, TypeVar
+from typing import Any
 
 from share.errors import ConfigError
-
-T = TypeVar("T")
-_MOST = 1e9  # no setting means anything beyond; NaN and infinity are refused with it
+from share.strict import from_mapping
 
 
 @dataclass(frozen=True)
@@ -141,19 +132,9 @@ class PlaceConfig:
     floor_m: float = 0.005  # the same, for the position
 
     def __post_init__(self) -> None:
-        _require_positive(
-            self,
-            "candidates",
-            "enough",
-            "tables",
-            "hash_bits",
-            "ransac_px",
-            "ransac_iterations",
-            "reverse_iterations",
-        )
-        _require_positive(
-            self, "sigma_px", "sigma_inverse_depth", "inlier_chi2", "guided_px", "reverse_iterations"
-        )
+        _require_positive(self, "candidates", "enough", "tables", "hash_bits", "ransac_px")
+        _require_positive(self, "ransac_iterations", "reverse_iterations", "guided_px")
+        _require_positive(self, "sigma_px", "sigma_inverse_depth", "inlier_chi2")
         if self.tables << self.hash_bits > 1 << 22:
             raise ValueError(f"hash_bits: {self.tables} tables of {self.hash_bits} bits are too many words")
 
@@ -165,6 +146,7 @@ class AgentConfig:
     keep_keyframes: int = 600  # that an agent remembers, sent ones too: a restarted edge is given them again
     late_ms: float = 0.0  # a frame that is later when its turn comes is left out; 0: none is
     rate_burst: float = 2.0  # keyframes that may be saved up under a rate limit
+    wait_ms: float = 100.0  # a keyframe that finds no token waits no longer: it would be answered too late
     blend_jump_m: float = 0.05  # a correction that moves the body further, or turns it more,
     blend_jump_rad: float = 0.02  # is blended in
     blend_s: float = 0.5  # over this time
@@ -174,6 +156,8 @@ class AgentConfig:
         _require_positive(self, "keep_keyframes", "blend_s")
         if not self.late_ms >= 0:
             raise ValueError(f"late_ms: {self.late_ms} must not be negative")
+        if not self.wait_ms >= 0:
+            raise ValueError(f"wait_ms: {self.wait_ms} must not be negative")
         if self.rate_burst < 1:
             raise ValueError(f"rate_burst: {self.rate_burst} must be at least 1")
 
@@ -247,16 +231,16 @@ class MergeConfig:
     near_rad: float = 0.8  # or turned by more, are no witnesses for a join
     join_places: int = 2  # at so many places maps must fit to be joined; of a smaller map, at all but one
     join_found: float = 0.3  # of the points that two views should share, so many must be found, on average
-    overlap_pairs: int = 0  # so many views of both maps must be near enough to show whether they look alike
-    overlap_gone: float = 0.06  # the same, wherever both maps should show the same, recognised or not
-    undo_doubt: float = 0.6  # more than that, summed over the views after a join, undoes it
+    overlap_pairs: int = 0  # so many pairs of views from one spot must tell whether two maps look alike
+    overlap_gone: float = 0.06  # of what they should share, no more may be things that are gone
+    undo_doubt: float = 0.6  # what is gone beyond that, summed over views: more forbids or undoes a join
     rival_weight: float = 0.5  # no contradicting story may weigh more than this part of the one that joins
     rebel_places: int = 4  # so many places at least, that weigh more than what stands, take a map apart
     rebel_weight: float = 1.4  # by how many times they have to weigh more
     drop_chi2: float = 1000.0  # a solved graph at odds with a loop by more than this drops it
 
 
-POLICIES = ("covins-g",)  # every keyframe is sent, every verified loop is merged
+POLICIES = ("covins-g", "share", "linear", "equal", "random")  # `share.control.policies` has what each does
 
 
 @dataclass(frozen=True)
@@ -281,6 +265,60 @@ class EdgeConfig:
 
 
 @dataclass(frozen=True)
+class AgentNeeds:
+    """What one agent needs, under its name in `control.agents`; None is what its form has."""
+
+    form: str | None = None  # ar or robot; None: its kind
+    beta: float | None = None
+    gamma: float | None = None
+    theta_ms: float | None = None
+    target: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.form not in (None, "ar", "robot"):
+            raise ValueError(f"form: '{self.form}' is not known; known: ar, robot")
+        _require_positive(self, *(name for name in ("gamma", "theta_ms") if getattr(self, name) is not None))
+
+
+@dataclass(frozen=True)
+class ControlConfig:
+    """How agents are rated, what they may send, what is merged (docs/scheduling.md)."""
+
+    ar_beta: float = 0.015  # 1/ms, of delay beyond 20 ms
+    ar_gamma: float = 1.2  # cm, of accuracy
+    ar_target: float = 0.9  # QoE that is aimed at
+    robot_beta: float = 3.0  # cm, of accuracy short of 1/cm
+    robot_gamma: float = 400.0  # ms, of 1 / (delay + theta)
+    robot_theta_ms: float = 20.0  # a delay well below this is as good as none
+    robot_target: float = 0.9  # QoE that is aimed at
+    signed_penalty: bool = False  # what is better than asked for raises QoE beyond 1, as the paper prints it
+    agents: dict[str, AgentNeeds] = field(default_factory=dict)  # NAME: {form, beta, gamma, theta_ms, target}
+    attribution: bool = False  # a QoE that is short because of delay lowers the rate, as the paper's does not
+    kp: float = 0.8  # Hz per evaluation, of an error of 1 in QoE
+    ki: float = 0.15  # the same, of an error of 1 for a second
+    kd: float = 0.2  # the same, of an error that grows by 1 in a second
+    alpha: float = 0.3  # weight of the newest slope of the error, of 1
+    integral_max_hz: float = 0.1  # the integral's part of a step, at most
+    rate_min_hz: float = 0.5  # keyframes an agent may always send
+    rate_max_hz: float = 10.0  # and the most it may; its rate to begin with
+    gap_s: float = 5.0  # no evaluation for longer: the error's slope is forgotten, its integral held
+    random_seed: int = 1  # of policy random
+    gate_seed: int = 1  # of which merges are skipped
+    horizontal_deg: float = 87.0  # field of view that overlap is reckoned with,
+    vertical_deg: float = 58.0  # the same, upright,
+    near_m: float = 0.3  # from here
+    far_m: float = 5.0  # to here
+    interval_m: float = 0.5  # between points at which overlap is sampled
+    merges: int = 20  # completed ones, with whose mean overlap a new one is compared
+    eagerness: float = 0.75  # a merge of mean overlap is done with this chance, less overlap with less
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "ar_gamma", "robot_gamma", "robot_theta_ms", "rate_min_hz", "merges")
+        if not (self.rate_min_hz <= self.rate_max_hz <= 1000 and self.alpha <= 1):
+            raise ValueError("rate_min_hz, rate_max_hz, 1000 must rise, and alpha be at most 1")
+
+
+@dataclass(frozen=True)
 class Config:
     """The whole; one section per part."""
 
@@ -291,6 +329,7 @@ class Config:
     graph: GraphConfig = field(default_factory=GraphConfig)
     merge: MergeConfig = field(default_factory=MergeConfig)
     edge: EdgeConfig = field(default_factory=EdgeConfig)
+    control: ControlConfig = field(default_factory=ControlConfig)
     agent: AgentConfig = field(default_factory=AgentConfig)
     link: LinkConfig = field(default_factory=LinkConfig)
     clock: ClockConfig = field(default_factory=ClockConfig)
@@ -311,46 +350,3 @@ def load(text: str, where: str = "configuration") -> Config:
     except yaml.YAMLError as error:
         raise ConfigError(f"{where}: not valid YAML: {str(error).splitlines()[0]}") from None
     return from_mapping(Config, {} if data is None else data, where)
-
-
-def from_mapping(cls: type[T], data: Any, where: str) -> T:
-    """The dataclass `cls` from a mapping, recursively; absent keys keep their defaults."""
-    if not isinstance(data, dict):
-        raise ConfigError(f"{where}: expected a mapping of settings, found {type(data).__name__}")
-    hints = typing.get_type_hints(cls)
-    values = {}
-    for key, value in data.items():
-        if key not in hints:
-            near = difflib.get_close_matches(str(key), hints, n=1)
-            hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(hints)}"
-            raise ConfigError(f"{where}: unknown key '{key}'{hint}")
-        values[key] = _convert(hints[key], value, f"{where}: {key}")
-    try:
-        return cls(**values)
-    except ValueError as error:
-        raise ConfigError(f"{where}: {error}") from None
-
-
-def to_mapping(config: Any) -> dict[str, Any]:
-    """Plain data of a configuration, for a report."""
-    return dataclasses.asdict(config)
-
-
-def _convert(hint: Any, value: Any, where: str) -> Any:
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        return from_mapping(hint, value, where)
-    accepted = typing.get_args(hint) if isinstance(hint, _types.UnionType) else (hint,)
-    if value is None and type(None) in accepted:
-        return None
-    if float in accepted and isinstance(value, str):  # PyYAML reads 1e-3 as text
-        with contextlib.suppress(ValueError):
-            value = float(value)
-    if type(value) in (int, float) and not 0 <= value <= _MOST:
-        raise ConfigError(f"{where}: expected a number from 0 to {_MOST:g}, found {value}")
-    if float in accepted and type(value) is int:
-        return float(value)
-    for kind in accepted:
-        if isinstance(kind, type) and type(value) is kind:
-            return value
-    names = " or ".join(getattr(kind, "__name__", str(kind)) for kind in accepted)
-    raise ConfigError(f"{where}: expected {names}, found {value!r}")

@@ -32,6 +32,7 @@ UNITS = {
     "_m": "m",
     "_bits": "bit",
     "_ppm": "ppm",
+    "_hz": "Hz",
 }
 
 
@@ -79,7 +80,8 @@ def _settings(node: ast.ClassDef, comments: dict[int, str]) -> Iterator[Setting]
         if isinstance(field, ast.AnnAssign) and field.value is not None:
             name = ast.unparse(field.target)
             unit = next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
-            yield Setting(name, ast.unparse(field.value), unit, comments.get(field.lineno, ""))
+            default = ast.unparse(field.value).replace("field(default_factory=dict)", "{}")
+            yield Setting(name, default, unit, comments.get(field.lineno, ""))
 
 
 def _comments(text: str) -> dict[int, str]:

@@ -1,9 +1,9 @@
-"""The end of a tool: an error of SHARE's is one line and an exit code."""
+"""What tools share: an error of SHARE's is one line and an exit code; lines of Markdown tables."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from share.errors import ShareError
 
@@ -16,3 +16,8 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
         print(f"{name}: {error}", file=sys.stderr)
         return error.exit_code
     return 0
+
+
+def line(cells: Iterable[str]) -> str:
+    """Of a Markdown table."""
+    return "| " + " | ".join(cells) + " |"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,9 @@ from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
     from share.io.keys import AgentKeys
+    from share.io.source import Source
+    from share.io.transport import AgentLink
+    from share.metrics.local_error import LocalError
     from share.run.agent import AgentRun, Status
 
 
@@ -29,6 +33,11 @@ if TYPE_CHECKING:
     metavar="FILE|KEY",
     help="Public key of the edge; needed for an edge on another machine. Turns on encryption.",
 )
+@click.option(
+    "--link", metavar="NAME|FILE", help="Talk through an emulated network: wifi5, wifi-busy, a file."
+)
+@click.option("--link-seed", type=int, default=0, show_default=True, help="Of what that network does.")
+@click.option("--true-error", is_flag=True, help="Tell the edge the true error of tracking, for experiments.")
 @options.calib
 @options.frames
 @click.option("--out", metavar="DIR", help="Write odom.tum, map.tum, latency.csv and report.json here.")
@@ -42,6 +51,9 @@ def agent(
     address: str,
     keys: str | None,
     server_key: str | None,
+    link: str | None,
+    link_seed: int,
+    true_error: bool,
     calib: str | None,
     frames: slice | None,
     out: str | None,
@@ -65,17 +77,20 @@ def agent(
     from share.types import AgentKind
     from share.wire.messages import Hello
 
+    shaped = None if link is None else _shaped(link, link_seed)
     with_keys = _keys(keys, server_key)
     check_keys(parse_address(address), with_keys)
     opened = open_source(source, calib, frames)
     options.say_notes(opened)
+    error = _by_truth(opened) if true_error else None
     run_id = secrets.randbits(63)
     rig = opened.rig
     hello = Hello(options.agent_name(name), AgentKind(kind), run_id, rig.cam0.focal, rig.T_body_cam0)
     live = _LiveLine(opened.images_count)
     folder = None if out is None else Path(out)
-    link = partial(connect, address, run_id, with_keys)
-    run = AgentRun(opened, hello, settings, link, folder, live.say, live.show, verbose)
+    dial = partial(connect, address, run_id, with_keys)
+    through = dial if shaped is None else lambda: shaped(dial())
+    run = AgentRun(opened, hello, settings, through, folder, live.say, live.show, verbose, error)
     with on_stop(run.stop):
         run.go()
     live.end()
@@ -101,6 +116,26 @@ def _keys(folder: str | None, server_key: str | None) -> AgentKeys | None:
             raise UsageError("--keys: goes with --server-key, the public key of the edge")
         return None
     return agent_keys(None if folder is None else Path(folder), server_key)
+
+
+def _by_truth(source: Source) -> LocalError:
+    """Raises UsageError where nobody knows it."""
+    from share.metrics.local_error import LocalError
+
+    truth = source.truth()
+    if truth is None:
+        raise UsageError(
+            "--true-error: this source comes without a truth; SESSION/NAME has one in truth/NAME.tum"
+        )
+    return LocalError(truth)
+
+
+def _shaped(name: str, seed: int) -> Callable[[AgentLink], AgentLink]:
+    """What puts an emulated network around a link. Raises UsageError, ConfigError."""
+    from share.io.transport.shaped import ShapedLink, network
+
+    found = network(name)
+    return lambda link: ShapedLink(link, found, seed)
 
 
 class _LiveLine(LiveLine):

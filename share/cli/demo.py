@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from share.cli import options
 from share.cli.progress import LiveLine, Stages
 from share.config import POLICIES
 
@@ -32,10 +33,22 @@ class _Seconds(click.FloatRange):
 @click.command()
 @click.option("--seconds", type=_Seconds(3, 600), default=20, show_default=True)
 @click.option("--policy", type=click.Choice(POLICIES), default=POLICIES[0], show_default=True)
+@click.option("--link", metavar="NAME|FILE", help="Through an emulated network, as share agent --link.")
+@click.option("--true-error", is_flag=True, help="Agents tell the edge their true error, as share agent.")
+@options.config
 @click.option("--out", metavar="DIR", default="share-demo", show_default=True, help="Everything it leaves.")
 @click.option("--scene", help="Which kind of room (see share emulate --help).  [default: warehouse]")
 @click.option("--seed", type=click.IntRange(0), default=_SEED, show_default=True, help="Which room.")
-def demo(seconds: float, policy: str, out: str, scene: str | None, seed: int) -> None:
+def demo(
+    seconds: float,
+    policy: str,
+    link: str | None,
+    true_error: bool,
+    config_file: str | None,
+    out: str,
+    scene: str | None,
+    seed: int,
+) -> None:
     """The whole system on this machine, nothing else needed.
 
     Makes a room with two headset wearers and a robot (kept for the next time), plays it in real
@@ -46,18 +59,24 @@ def demo(seconds: float, policy: str, out: str, scene: str | None, seed: int) ->
     Example:  share demo --seconds 30 --out /tmp/demo
     """
     folder = Path(out)
+    options.load_config(config_file)  # what is wrong with this and the link is said before anything is made
+    if link is not None:
+        from share.io.transport.shaped import network
+
+        network(link)
     from share.emulate.demo import recipe
     from share.emulate.session import cached_session
     from share.io.files import writable_dir
     from share.io.session import read_session
-    from share.run.demo import play
+    from share.run.demo import Terms, play
     from share.run.score import score
 
     writable_dir(folder)
     with Stages() as stages:
         session = read_session(cached_session(recipe(_drawable(scene), seconds, seed), progress=stages))
     live = LiveLine()
-    folders = play(session, seconds, policy, folder, lambda now: live.write(_line(now)))
+    terms = Terms(policy, link, seed, true_error, config_file)
+    folders = play(session, seconds, terms, folder, lambda now: live.write(_line(now)))
     live.end()
     result = score(session, folders)
     click.echo(_table(result))

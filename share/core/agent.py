@@ -136,8 +136,12 @@ class Agent:
         return m.PoseUpdate(frame.stamp_ns, frame.state, last.keyframe.id, T_keyframe_body)
 
     def _spend(self, now_ns: int) -> None:
-        """Makes a keyframe of the waiting candidate if the rate allows."""
-        if self._waiting is None or not self._bucket.take(now_ns):
+        """Makes a keyframe of the waiting candidate if the rate allows; one that has waited too long goes."""
+        if self._waiting is None:
+            return
+        if not self._bucket.take(now_ns):
+            if now_ns - self._waiting.frame.done_ns > self._config.agent.wait_ms * 1e6:
+                self._drop_waiting()
             return
         frame, candidate = self._waiting.frame, self._waiting.candidate
         self._waiting = None

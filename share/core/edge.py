@@ -13,13 +13,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from share import __version__
-from share.config import Config, to_mapping
+from share.config import Config
 from share.core.finding import Finding
 from share.core.inorder import InOrder
 from share.core.keeping import Change, KeepKeyframe, KeepRun
 from share.core.peer import Known, Peer
 from share.core.rate import seconds
+from share.core.schedule import Schedule
 from share.errors import WireError
+from share.strict import to_mapping
 from share.types import Keyframe
 from share.wire import messages as wire
 from share.wire.codec import Bytes, decode, encode
@@ -119,6 +121,7 @@ class Edge:
         self._peers: dict[bytes, Peer] = {}
         self._by_key: dict[str, bytes] = {}
         self._began_ns = began_ns
+        self._schedule = Schedule(config.control, config.edge.policy)
         self._strangers: Counter[str] = Counter()
         self._ticket = 0
         self._unsafe: deque[tuple[int, Peer, int]] = deque()  # ticket, and what is safe once it is kept
@@ -171,7 +174,7 @@ class Edge:
                 counts["poses"] += 1
                 peer.state = message.state
             case wire.Evaluation() if peer:
-                counts["evaluations"] += 1
+                self._evaluated(event.peer, peer, message, now_ns)
             case _:  # from a stranger, or not an agent's word
                 counts["unexpected"] += 1
 
@@ -206,6 +209,7 @@ class Edge:
             key = self._key(hello)
             self._enter(peer_id, Peer(hello, key, now_ns))
             self._keep(KeepRun(key, hello))
+            self._schedule.begin(hello.name)
             self._record(now_ns, "joined the edge", self._peers[peer_id], f"{hello.kind} '{hello.name}'")
         peer = self._peers[peer_id]
         peer.greeted = True
@@ -291,6 +295,13 @@ class Edge:
     def _acknowledge(self, peer: Peer) -> None:
         self._send(self._by_key[peer.key], peer.inorder.ack(peer.safe))
 
+    def _evaluated(self, peer_id: bytes, peer: Peer, told: wire.Evaluation, now_ns: int) -> None:
+        peer.counts["evaluations"] += 1
+        hello, t_s = peer.hello, self._since_began_s(now_ns)
+        rate_hz = self._schedule.evaluated(hello.name, hello.kind, told, now_ns, t_s)
+        if rate_hz is not None:
+            self._send(peer_id, wire.Rate(rate_hz))
+
     # ------------------------------------------------------------------ the map
 
     def _found(self, finding: Finding, now_ns: int) -> None:
@@ -324,13 +335,21 @@ class Edge:
         return peer.counts if peer else self._strangers
 
     def _record(self, now_ns: int, what: str, peer: Peer | None, reason: str, **fields: Any) -> None:
-        assert self._began_ns is not None
-        t_s = round((now_ns - self._began_ns) * 1e-9, 6)
         agent = peer.hello.name if peer else None
-        self._effects.append(Record({"t_s": t_s, "event": what, "agent": agent, "reason": reason, **fields}))
+        head = {"t_s": self._since_began_s(now_ns), "event": what, "agent": agent, "reason": reason}
+        self._effects.append(Record(head | fields))
+
+    def _since_began_s(self, now_ns: int) -> float:
+        assert self._began_ns is not None
+        return round((now_ns - self._began_ns) * 1e-9, 6)
+
+    def series(self) -> dict[str, Any]:
+        """Of every agent, its evaluations and what came of them (`share.core.schedule`)."""
+        return {peer.hello.name: self._schedule.series(peer.hello.name) for peer in self._peers.values()}
 
     def report(self, mapped: dict[str, Any]) -> dict[str, Any]:
-        """edge.json: per agent and in all. mapped: the mapper's report, whose `agents` are by run.
+        """edge.json: per agent and in all, but for `series`. mapped: the mapper's report, whose `agents` are
+        by run.
 
         An agent's earlier runs stand under their run's own key.
         """
@@ -342,6 +361,7 @@ class Edge:
             **mapped,
             "agents": {
                 peer.hello.name if newest[peer.hello.name] is peer else peer.key: peer.report()
+                | self._schedule.report(peer.hello.name)
                 | of_agents.get(peer.key, {})
                 for peer in self._peers.values()
             },

@@ -8,12 +8,13 @@ solved together, once.
 from __future__ import annotations
 
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from share.config import Config
 from share.core.concern import Concern
 from share.core.finding import Finding, in_map
+from share.core.gating import Gating
 from share.core.keeping import (
     Change,
     DropLoop,
@@ -27,6 +28,7 @@ from share.core.keeping import (
 )
 from share.core.lookups import Lookups
 from share.core.steps import Look, Query, Solve, Step, Verify
+from share.geometry import se3
 from share.graph.change import Solution
 from share.merge.atlas import Applied, Atlas, Placed
 from share.merge.join import Loop
@@ -48,8 +50,16 @@ class _Account:
     """Of one agent."""
 
     loops_tried: int = 0
-    loops_accepted: int = 0
-    merges: int = 0
+    merges: Counter[str] = field(default_factory=Counter)  # requested, skipped, done
+
+
+@dataclass
+class _Search:
+    """For the place of a keyframe. left: candidates, best first; wanted: so many that are it, and no more."""
+
+    query: Query
+    left: deque[int]
+    wanted: int
 
 
 class Mapper:
@@ -64,8 +74,9 @@ class Mapper:
         self._atlas = Atlas(config.merge, self._sights)
         self._unseen: list[tuple[int, KeptKeyframe]] = []  # restored
         self._lookups = Lookups(config.edge.max_waiting, config.edge.each_waiting)
+        self._gating = Gating(config.control, config.edge.policy)
         self._concern = Concern()
-        self._verify: Verify | None = None
+        self._search: _Search | None = None
         self._looking = self._solving = False
         self._leaving: list[int] = []  # keyframes that go next
         self._changes: list[Change] = []
@@ -122,8 +133,7 @@ class Mapper:
         if self._looking:
             return None
         self._see_restored()
-        step: Look | None = self._verify
-        self._verify = None
+        step: Look | None = self._next_verify()
         while step is None and (number := self._lookups.next()) is not None:
             if number in self._sights:
                 step = self._query(number)
@@ -155,10 +165,10 @@ class Mapper:
         """What the result leads to. Raises what the step raised."""
         match step:
             case Query() if isinstance(result, list):
-                self._verify = self._verification(step, [c.id for c in result])
+                self._search = self._search_among(step, [c.id for c in result])
                 return self._review(step.number)
-            case Verify() if isinstance(result, dict):
-                return [f for n, outcome in result.items() for f in self._judge(step.number, n, outcome)]
+            case Verify() if isinstance(result, Verified | Refusal):
+                return self._judge(step, result)
             case Solve() if isinstance(result, Solution):
                 return self._solved(step, result)
             case Solve():
@@ -196,31 +206,48 @@ class Mapper:
         near = self._atlas.neighbours(number)
         return Query(self._index, number, self._sights[number], self._config.place.candidates, near)
 
-    def _verification(self, query: Query, found: list[int]) -> Verify | None:
+    def _search_among(self, query: Query, found: list[int]) -> _Search:
         place, edge = self._config.place, self._config.edge
-        found, enough = [n for n in found if n in self._sights], place.enough
-        if len(self._lookups) >= edge.hurry_waiting:
-            found = self._atlas.promising_first(query.number, found)[: edge.hurry_candidates]
-            enough = 1
-        candidates = {n: self._sights[n] for n in found}
-        return Verify(query.number, query.sight, candidates, enough, place) if candidates else None
+        if len(self._lookups) < edge.hurry_waiting:
+            return _Search(query, deque(found), place.enough)
+        known = [n for n in found if n in self._sights]
+        most = self._atlas.promising_first(query.number, known)[: edge.hurry_candidates]
+        return _Search(query, deque(most), 1)
 
-    def _judge(self, query: int, candidate: int, outcome: Verified | Refusal) -> list[Finding]:
-        if not {query, candidate} <= self._sights.keys():
+    def _next_verify(self) -> Verify | None:
+        """Those that have been taken out meanwhile are passed over."""
+        search = self._search
+        while search is not None and search.left and search.wanted:
+            query, candidate = search.query, search.left.popleft()
+            if {query.number, candidate} <= self._sights.keys():
+                seen = self._sights[candidate]
+                return Verify(query.number, query.sight, candidate, seen, self._config.place)
+        self._search = None
+        return None
+
+    def _judge(self, step: Verify, outcome: Verified | Refusal) -> list[Finding]:
+        if not {step.number, step.candidate} <= self._sights.keys():
             return []  # taken out meanwhile
-        a, b = self._atlas.key(candidate), self._atlas.key(query)
+        a, b = self._atlas.key(step.candidate), self._atlas.key(step.number)
         account = self._accounts[b.agent]
         account.loops_tried += 1
         if isinstance(outcome, Refusal):
             return [Finding(b.agent, "loop refused", f"{a} - {b}: {outcome.reason}")]
-        loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers, outcome.found)
+        if self._search is not None:
+            self._search.wanted -= 1
+        loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers)
+        account.merges["requested"] += 1
+        volume = self._gating.volume(se3.inverse(step.seen.T_body_cam0) @ loop.T_a_b @ step.sight.T_body_cam0)
+        if objection := self._gating.refuses(volume, self._atlas.map_of(a) == self._atlas.map_of(b)):
+            account.merges["skipped"] += 1
+            return [Finding(b.agent, "merge skipped", f"loop {loop}: {objection}")]
         decision = self._atlas.propose(loop)
         reason = f"{decision.reason} ({outcome.reason})"
         self._note(decision)
         if not decision.accepted:
             return [Finding(b.agent, "loop not taken", reason)]
-        account.loops_accepted += 1
-        account.merges += 1
+        account.merges["done"] += 1
+        self._gating.completed(volume)
         what = "merge undone" if decision.dropped else "maps joined" if decision.joined else "loop accepted"
         return [Finding(b.agent, what, reason)]
 
@@ -266,16 +293,16 @@ class Mapper:
     def report(self) -> dict[str, Any]:
         """edge.json's fields of the whole, and under `agents` those of each run."""
         accounts = self._accounts.values()
-        merges = sum(a.merges for a in accounts)
+        merges = _told(sum((a.merges for a in accounts), Counter()))
         return {
             "agents": {agent: self._report_of(agent) for agent in self._accounts},
             "loops": {
                 "tried": sum(a.loops_tried for a in accounts),
-                "accepted": sum(a.loops_accepted for a in accounts),
+                "accepted": merges["done"],
                 "waiting": len(self._atlas.pending),
                 "in_map": len(self._atlas.loops),
             },
-            "merges": {"requested": merges, "skipped": 0, "done": merges},
+            "merges": merges,
             "maps": self._atlas.sizes(),
             "taken_out": self._counts["taken_out"],
             "waiting": len(self._lookups),
@@ -286,11 +313,15 @@ class Mapper:
     def _report_of(self, agent: str) -> dict[str, Any]:
         account = self._accounts[agent]
         return {
-            "loops": {"tried": account.loops_tried, "accepted": account.loops_accepted},
-            "merges": {"requested": account.merges, "skipped": 0, "done": account.merges},
+            "loops": {"tried": account.loops_tried, "accepted": account.merges["done"]},
+            "merges": _told(account.merges),
             "queries_skipped": self._lookups.skipped[agent],
             "map_id": self._atlas.current_map(agent),
         }
+
+
+def _told(merges: Counter[str]) -> dict[str, int]:
+    return {what: merges[what] for what in ("requested", "skipped", "done")}
 
 
 def _placed(found: KeptKeyframe, edge: KeepLink, linked: bool) -> Placed:

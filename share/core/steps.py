@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from share.config import PlaceConfig
 from share.graph.change import Solution
 from share.graph.solver import Solver
 from share.merge.solving import SolveJob
 from share.place.index import Candidate, PlaceIndex
-from share.place.missing import missing
 from share.place.verify import Refusal, Sight, Verified, verify
 
 
@@ -31,25 +29,17 @@ class Query:
 
 @dataclass(frozen=True, eq=False)
 class Verify:
-    """Are they the same place? Best candidates first; `enough` that are make the rest needless."""
+    """Is this the place of that candidate?"""
 
     number: int
     sight: Sight
-    candidates: Mapping[int, Sight]
-    enough: int
+    candidate: int
+    seen: Sight
     config: PlaceConfig
     kind: str = "verify"
 
-    def run(self) -> dict[int, Verified | Refusal]:
-        outcomes: dict[int, Verified | Refusal] = {}
-        for number, sight in self.candidates.items():
-            outcome = verify(self.sight, sight, self.config)
-            if isinstance(outcome, Verified):
-                outcome = replace(outcome, found=1 - missing(self.sight, sight, outcome.T_c_q).share)
-            outcomes[number] = outcome
-            if sum(isinstance(found, Verified) for found in outcomes.values()) >= self.enough:
-                break
-        return outcomes
+    def run(self) -> Verified | Refusal:
+        return verify(self.sight, self.seen, self.config)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +53,7 @@ class Solve:
         if self.job.anew:
             solver.clear()
         solver.update(self.job.change)
-        return solver.solve(self.job.anchor, self.job.last)
+        return solver.solve(self.job.anchor, self.job.wanted)
 
 
 Look = Query | Verify

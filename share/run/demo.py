@@ -31,8 +31,34 @@ class Progress:
     corrections: int
 
 
+@dataclass(frozen=True)
+class Terms:
+    """On which a session is played. link: an emulated network, by name or file; seed: of what it does.
+    true_error: agents tell the edge how wrong they are by the truth. config: a file, for all."""
+
+    policy: str
+    link: str | None = None
+    seed: int = 0
+    true_error: bool = False
+    config: str | None = None
+
+    def of_edge(self) -> tuple[str, ...]:
+        """What `share edge` is told."""
+        return ("--policy", self.policy, *self._settings())
+
+    def of_agent(self, number: int) -> tuple[str, ...]:
+        """What `share agent` is told, each another seed."""
+        link = (
+            () if self.link is None else ("--link", self.link, "--link-seed", str(1000 * self.seed + number))
+        )
+        return (*link, *(("--true-error",) if self.true_error else ()), *self._settings())
+
+    def _settings(self) -> tuple[str, ...]:
+        return () if self.config is None else ("--config", self.config)
+
+
 def play(
-    session: Session, seconds: float, policy: str, out: Path, show: Callable[[Progress], None]
+    session: Session, seconds: float, terms: Terms, out: Path, show: Callable[[Progress], None]
 ) -> dict[str, Path]:
     """Runs `session` in real time. The folder of each agent's files, by name.
 
@@ -42,14 +68,16 @@ def play(
     logs = {name: out / f"{name}.log" for name in (*folders, "edge")}
     writable_dir(out)
     with ExitStack() as stack:
-        bind = ("--bind", "tcp://127.0.0.1:0", "--policy", policy, "--out", str(out / "edge"))
+        bind = ("--bind", "tcp://127.0.0.1:0", "--out", str(out / "edge"), *terms.of_edge())
         edge = stack.enter_context(child(logs["edge"], "edge", *bind))
         address = _address(edge, logs["edge"])
         agents: Processes = {}
-        for name, agent in session.agents.items():
+        for number, (name, agent) in enumerate(session.agents.items()):
             who = (f"{session.folder}/{name}", "--name", name, "--kind", str(agent.kind))
             where = ("--edge", address, "--out", str(folders[name]))
-            agents[name] = stack.enter_context(child(logs[name], "agent", *who, *where))
+            agents[name] = stack.enter_context(
+                child(logs[name], "agent", *who, *where, *terms.of_agent(number))
+            )
         _watch(agents, folders, out / "edge" / "events.jsonl", seconds + PATIENCE_S, show)
         for name, process in {**agents, "edge": edge}.items():
             if end(process) != 0:

@@ -96,6 +96,7 @@ class EdgeRun:
                 self._keeper.close()
             self._link.close()
             self._note()
+            self._report["series"] = self._machine.series()
             self._finish(self._report)
         return self._report
 

@@ -18,6 +18,7 @@ from share.io.trajectory import Trajectory
 from share.metrics.ate import Ate, ate
 from share.metrics.runlog import RunLog
 from share.run.pipeline import frames_of, tracker_for
+from share.strict import to_mapping
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +59,7 @@ def report_of(log: RunLog, counters: SequencerCounters, settings: config.Config)
         "bytes_down": 0,
         "sequencer": dataclasses.asdict(counters),
         "version": __version__,
-        "config": config.to_mapping(settings),
+        "config": to_mapping(settings),
     }
 
 

@@ -630,3 +630,21 @@ def test_an_agent_whose_disk_is_full_tracks_on(room, tmp_path):
     assert odom.read_text().endswith("\n")
     ann = json.loads((tmp_path / "edge" / "edge.json").read_text())["agents"]["ann"]
     assert ann["poses"] > FRAMES / 2
+
+
+@pytest.mark.parametrize(
+    "command", [("demo",), ("agent", "x", "--name", "a", "--kind", "ar", "--edge", "tcp://127.0.0.1:1")]
+)
+def test_a_network_that_nobody_knows(command: tuple[str, ...]) -> None:
+    done = subprocess.run([*SHARE, *command, "--link", "nowhere"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr == "share: --link: 'nowhere' is no file and none of wifi5, wifi-busy\n"
+
+
+def test_a_frustum_that_is_none_ends_the_edge_before_it_begins(tmp_path: Path) -> None:
+    config = tmp_path / "flat.yaml"
+    config.write_text("control: {near_m: 5, far_m: 1}\n")
+    command = [*SHARE, "edge", "--bind", "tcp://127.0.0.1:0", "--policy", "share", "--config", str(config)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr == "share: control: frustum: from 5.0 to 1.0 m is no depth\n"

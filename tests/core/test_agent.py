@@ -231,12 +231,25 @@ def test_a_rate_is_spent_as_a_token_bucket_and_the_newest_candidate_waits() -> N
 
 def test_a_waiting_candidate_goes_when_its_token_comes_without_another_frame() -> None:
     agent = welcomed()
+    tell(agent, m.Rate(5.0), 0)
+    for k in range(3):
+        handle(agent, tracked(k, candidate=True), k * 50 * MS)
+    tell(agent, m.Ack(2), 150 * MS)
+    assert not only(Keyframe, handle(agent, ev.Tick(), 190 * MS), messages=True)
+    assert [k.id for k in only(Keyframe, handle(agent, ev.Tick(), 200 * MS), messages=True)] == [2]
+
+
+def test_a_candidate_does_not_wait_until_it_would_be_answered_too_late() -> None:
+    agent = welcomed()
     tell(agent, m.Rate(1.0), 0)
     for k in range(3):
         handle(agent, tracked(k, candidate=True), k * 50 * MS)
-    tell(agent, m.Ack(2), 200 * MS)
-    assert not only(Keyframe, handle(agent, ev.Tick(), 900 * MS), messages=True)
-    assert [k.id for k in only(Keyframe, handle(agent, ev.Tick(), 1000 * MS), messages=True)] == [2]
+    tell(agent, m.Ack(2), 150 * MS)
+    limit = Config().agent.wait_ms
+    dropped = only(ev.FrameDone, handle(agent, ev.Tick(), round((110 + limit) * MS)))
+    assert [(done.keyframe, done.sent) for done in dropped] == [(True, False)]
+    assert not only(Keyframe, handle(agent, ev.Tick(), 1000 * MS), messages=True)
+    assert agent.report()["drop_rate"] == 1
 
 
 # ---------------------------------------------------------------- corrections

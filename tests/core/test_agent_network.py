@@ -6,7 +6,7 @@ import dataclasses
 from itertools import pairwise
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from model_edge import HELLO, MS, ModelEdge, Network, S, World, tracked
 
@@ -110,6 +110,12 @@ def test_an_outage_that_overflows_the_ledger_leaves_a_sound_chain(
     check_applied(edge.applied, walk)
 
 
+@example(  # a keyframe of before the restart arrives after it, and is never sent again
+    seed=246,
+    network={"loss": 0.012345321315789186, "twice": 0.2556000252531316, "delay_ms": 260.0},
+    keep=34,
+    kills=[(1, True), (195, False), (226, False)],
+)
 @given(
     seeds,
     networks,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from dataclasses import replace
 
@@ -13,7 +14,9 @@ from share.config import Config, EdgeConfig
 from share.core import edge as ed
 from share.core import events as ev
 from share.core.mapper import Mapper
+from share.core.steps import Verify
 from share.geometry import se3
+from share.place.verify import Refusal, Verified
 from share.types import AgentKind
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -243,8 +246,8 @@ def test_in_a_hurry_fewer_candidates_are_tried_and_one_is_enough():
     both = town()
     both.walk(40)
     config = Config(edge=EdgeConfig(each_waiting=12))
-    tried = {}
-    for waiting in (0, config.edge.hurry_waiting):
+    tried, same = {}, Verified(np.eye(4), 1e-4 * np.eye(6), 40, 30)
+    for waiting, refuse in itertools.product((0, config.edge.hurry_waiting), (True, False)):
         mapper = Mapper(config)
         mapper.join("ann-000b", hello(run_id=11))
         keyframes = both.keyframes("ann")
@@ -256,7 +259,26 @@ def test_in_a_hurry_fewer_candidates_are_tried_and_one_is_enough():
             mapper.add("ann-000b", keyframe)
         query = mapper.next_look()
         mapper.done(query, query.run(), 1.0)
-        verify = mapper.next_look()
-        tried[waiting] = len(verify.candidates), verify.enough
-    assert tried[0] == (config.place.candidates, config.place.enough)
-    assert tried[config.edge.hurry_waiting] == (config.edge.hurry_candidates, 1)
+        tried[waiting, refuse] = 0
+        while isinstance(verify := mapper.next_look(), Verify):
+            tried[waiting, refuse] += 1
+            mapper.done(verify, Refusal("not it") if refuse else same, 1.0)
+    assert [tried[0, True], tried[0, False]] == [config.place.candidates, config.place.enough]
+    assert [tried[config.edge.hurry_waiting, True], tried[config.edge.hurry_waiting, False]] == [
+        config.edge.hurry_candidates,
+        1,
+    ]
+
+
+def test_by_policy_share_agents_hear_their_rate_and_merges_are_skipped():
+    both = town(config=Config(edge=EdgeConfig(policy="share")))
+    both.walk(40)
+    both.run(500)
+    report = both.edge.report()
+    merges = report["merges"]
+    assert 0 < merges["skipped"] < merges["requested"]
+    assert merges["done"] <= merges["requested"] - merges["skipped"]
+    assert report["agents"]["ann"]["map_id"] == report["agents"]["bob"]["map_id"]
+    for name in ("ann", "bob"):
+        heard = both.agents[both.peer(name)].report()["rate_hz"]
+        assert heard == pytest.approx(report["agents"][name]["rate_hz"], abs=1e-3)

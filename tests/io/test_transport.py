@@ -13,10 +13,12 @@ from typing import Any
 import pytest
 import zmq
 
-from share.errors import TransportError, UsageError
+from share.core.channel import Network, Way
+from share.errors import ConfigError, TransportError, UsageError
 from share.io.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate
 from share.io.transport import LINGER_MS, QUEUE_MESSAGES, AgentLink, EdgeLink, bind, connect, parse_address
 from share.io.transport.memory import MemoryNetwork
+from share.io.transport.shaped import ShapedLink, network
 from share.wire.codec import MAX_FRAME_BYTES, encode
 from share.wire.messages import Bye, Ping, peer_id
 
@@ -258,3 +260,42 @@ def test_bytes_that_are_not_zeromq_harm_nobody() -> None:
         eventually(lambda: agent.send([b"fine"]))
         assert eventually(lambda: edge.receive(100)) == (peer_id(2), [b"fine"])
         raw.close()
+
+
+def test_an_emulated_network_delays_both_ways_and_wakes_still_come_through() -> None:
+    memory = MemoryNetwork()
+    edge = memory.bind("edge")
+    link = ShapedLink(memory.connect("edge", 1), Network(Way(delay_ms=30.0), Way(delay_ms=20.0)), 0)
+    took = []
+    for i in range(5):
+        sent = time.monotonic()
+        assert link.send(encode(Ping(i, 0)))
+        assert edge.receive(0) is None
+        assert link.receive(25) is None
+        while (got := edge.receive(0)) is None:
+            link.receive(5)
+        there = time.monotonic()
+        edge.send(got[0], got[1])
+        while link.receive(50) is None:
+            pass
+        took.append((1e3 * (there - sent), 1e3 * (time.monotonic() - there)))
+    up, down = zip(*took, strict=True)
+    assert min(up) >= 30 and sorted(up)[2] < 40
+    assert min(down) >= 20 and sorted(down)[2] < 30
+    threading.Timer(0.05, link.wake).start()
+    began = time.monotonic()
+    assert link.receive(2000) is None
+    assert time.monotonic() - began < 1.0
+    link.close()
+
+
+def test_a_network_of_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "far.yaml"
+    file.write_text("up: {mbps: 5, delay_ms: 40}\ndown: {delay_ms: 35, jitter_ms: 2}\n")
+    assert network(str(file)) == Network(Way(5.0, 40.0), Way(0.0, 35.0, 2.0))
+    assert network("wifi5").round_trip_ms == pytest.approx(3.4)
+    with pytest.raises(UsageError, match="no file and none of wifi5, wifi-busy"):
+        network("wifi6")
+    file.write_text("up: {speed: 5}\n")
+    with pytest.raises(ConfigError, match=r"far.yaml: up: unknown key 'speed'"):
+        network(str(file))

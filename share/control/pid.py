@@ -1,0 +1,62 @@
+"""The controller of an agent's keyframe rate, one step per evaluation.
+
+    e = Q* - Q;  P = Kp e;  I = clip(I + Ki e dt, +-I_max)
+    d = alpha (e - e_prev)/dt + (1 - alpha) d_prev;  D = Kd d
+    R = clip(R_prev + P + I + D, R_min, R_max)
+
+Source: SHARE, IMWUT 10(3) 97, 2026. Filtered derivative and bounded integral: Astrom and Hagglund,
+*Advanced PID Control* (2006). Every step adds to R, so an error that stays takes the rate to a bound.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from share.config import ControlConfig
+
+
+@dataclass(frozen=True)
+class Gains:
+    """kp Hz, ki Hz/s, kd Hz s, per unit of QoE; alpha 0 .. 1; a dt beyond gap_s is a gap."""
+
+    kp: float
+    ki: float
+    kd: float
+    alpha: float
+    integral_max_hz: float
+    rate_min_hz: float
+    rate_max_hz: float
+    gap_s: float
+
+    @classmethod
+    def of(cls, config: ControlConfig) -> Gains:
+        return cls(**{name: getattr(config, name) for name in cls.__dataclass_fields__})
+
+
+@dataclass(frozen=True)
+class State:
+    """Of one agent after an evaluation. integral_hz: I; slope: d, 1/s; seen_ns: when; None: none so far."""
+
+    rate_hz: float
+    error: float = 0.0
+    integral_hz: float = 0.0
+    slope: float = 0.0
+    seen_ns: int | None = None
+
+
+def step(state: State, error: float, now_ns: int, gains: Gains) -> State:
+    """After an evaluation at `now_ns` whose QoE is short of the target by `error` (finite).
+
+    The first evaluation, one that is not after the last, and one after a gap tell no slope: d = 0, I is held.
+    """
+    dt = 0.0 if state.seen_ns is None else (now_ns - state.seen_ns) / 1e9
+    integral, slope = state.integral_hz, 0.0
+    if 0 < dt <= gains.gap_s:
+        integral = _clip(integral + gains.ki * error * dt, -gains.integral_max_hz, gains.integral_max_hz)
+        slope = gains.alpha * (error - state.error) / dt + (1 - gains.alpha) * state.slope
+    rate = state.rate_hz + gains.kp * error + integral + gains.kd * slope
+    return State(_clip(rate, gains.rate_min_hz, gains.rate_max_hz), error, integral, slope, now_ns)
+
+
+def _clip(value: float, least: float, most: float) -> float:
+    return min(most, max(least, value))

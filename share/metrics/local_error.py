@@ -1,0 +1,45 @@
+"""How wrong an agent's odometry is of late, by its truth: what the error model is to tell without one.
+
+The causal poses of the last seconds are laid over the truth (SE3, positions alone), and the error is their
+rms: what a wearer sees slip, not what has been lost since the beginning.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from share.geometry.align import umeyama
+from share.geometry.se3 import transform
+from share.metrics.association import Trajectory, interpolate
+from share.types import F64
+
+WINDOW_S = 5.0
+_LEAST = 10  # poses; and no less than half the window
+
+
+class LocalError:
+    """Of one agent; truth: poses of its body in a room, at stamps of its clock."""
+
+    def __init__(self, truth: Trajectory, window_s: float = WINDOW_S) -> None:
+        self._truth, self._window_ns = truth, round(window_s * 1e9)
+        self._seen: deque[tuple[int, F64, F64]] = deque()  # stamp, position told, position in truth
+
+    def after(self, stamp_ns: int, T_odom_body: F64 | None, new_stretch: bool = False) -> float | None:
+        """cm, after another frame. None without a pose or a truth now, or where there are too few of late."""
+        if new_stretch:
+            self._seen.clear()
+        while self._seen and self._seen[0][0] < stamp_ns - self._window_ns:
+            self._seen.popleft()
+        if T_odom_body is None:
+            return None
+        known, T_truth = interpolate(*self._truth, np.array([stamp_ns]))
+        if not known[0]:
+            return None
+        self._seen.append((stamp_ns, T_odom_body[:3, 3], T_truth[0, :3, 3]))
+        if len(self._seen) < _LEAST or stamp_ns - self._seen[0][0] < self._window_ns // 2:
+            return None
+        told, true = (np.array([seen[i] for seen in self._seen]) for i in (1, 2))
+        off = transform(umeyama(told, true), told) - true
+        return 100 * float(np.sqrt((off**2).sum(1).mean()))

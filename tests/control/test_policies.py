@@ -1,0 +1,167 @@
+"""What each policy lets an agent send."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from share import config as settings
+from share.config import ControlConfig
+from share.control.policies import POLICIES, Policy
+from share.types import AgentKind
+
+S = 1_000_000_000
+CONFIG = ControlConfig()
+KINDS = {"ar": AgentKind.AR, "robot": AgentKind.ROBOT}
+Plant = Callable[[dict[str, float], str], tuple[float, float]]  # rates, agent -> delay ms, error cm
+
+
+def made(name: str, config: ControlConfig = CONFIG) -> Policy:
+    return POLICIES[name](config)
+
+
+def settled(plant: Plant, seconds: float = 90) -> dict[str, float]:
+    """Mean rates under `share` in the last third; each agent is evaluated as often as it sends."""
+    policy, rng = made("share"), np.random.default_rng(1)
+    rates, due = dict.fromkeys(KINDS, 5.0), dict.fromkeys(KINDS, 0.0)
+    late: dict[str, list[float]] = {agent: [] for agent in KINDS}
+    while (now := min(due.values())) < seconds:
+        agent = min(due, key=lambda a: due[a])
+        delay_ms, error_cm = plant(rates, agent)
+        noisy = delay_ms * np.exp(rng.normal(0, 0.1)), error_cm * np.exp(rng.normal(0, 0.1))
+        rates[agent] = policy.rate(agent, KINDS[agent], *noisy, round(now * S)) or 0.0
+        due[agent] = now + 1 / rates[agent]
+        if now > seconds * 2 / 3:
+            late[agent].append(rates[agent])
+    return {agent: float(np.mean(values)) for agent, values in late.items()}
+
+
+def test_every_policy_that_may_be_set_is_here() -> None:
+    assert set(settings.POLICIES) <= set(POLICIES)
+    assert list(POLICIES) == ["share", "covins-g", "linear", "equal", "random", "streamed"]
+
+
+@pytest.mark.parametrize(
+    ("name", "gated", "alike", "raw"),
+    [
+        ("share", True, False, False),
+        ("covins-g", False, True, False),
+        ("linear", True, True, False),
+        ("equal", True, True, False),
+        ("random", True, False, False),
+        ("streamed", False, True, True),
+    ],
+)
+def test_what_policies_say_of_themselves(name: str, gated: bool, alike: bool, raw: bool) -> None:
+    policy = made(name)
+    assert (policy.gated, policy.alike, policy.raw) == (gated, alike, raw)
+
+
+@pytest.mark.parametrize("name", ["covins-g", "streamed"])
+def test_some_set_no_limit(name: str) -> None:
+    assert made(name).rate("ann", AgentKind.AR, 500, 3, 0) is None
+
+
+@pytest.mark.parametrize(
+    ("delay_ms", "hz"), [(0, 10), (20, 10), (265, 7.5), (510, 5), (755, 2.5), (990, 0.5), (1e9, 0.5)]
+)
+def test_linear_drops_by_delay_alone(delay_ms: float, hz: float) -> None:
+    policy = made("linear")
+    for kind in AgentKind:
+        assert policy.rate("ann", kind, delay_ms, None, 0) == pytest.approx(hz, abs=1e-12)
+
+
+def test_equal_takes_a_robot_for_a_headset() -> None:
+    equal, share = made("equal"), made("share")
+    for t in range(5):
+        at = (60.0, 0.3, t * S)
+        assert equal.rate("robot", AgentKind.ROBOT, *at) == share.rate("ann", AgentKind.AR, *at)
+
+
+def test_a_robot_gets_the_form_of_a_headset_by_settings_alone() -> None:
+    policy = made("share", settings.load("control: {agents: {bob: {form: ar}}}").control)
+    for t in range(3):
+        at = (60.0, 0.3, t * S)
+        assert policy.rate("bob", AgentKind.ROBOT, *at) == policy.rate("ann", AgentKind.AR, *at)
+    assert policy.rate("carl", AgentKind.ROBOT, 60, 0.3, 0) != policy.rate("bob", AgentKind.ROBOT, 60, 0.3, 0)
+
+
+def test_random_is_its_seed() -> None:
+    def rates(seed: int) -> list[float | None]:
+        policy = made("random", ControlConfig(random_seed=seed))
+        return [policy.rate("ann", AgentKind.AR, 20, 0.1 * t, t * S // 2) for t in range(1, 9)]
+
+    assert rates(1) == rates(1) != rates(2)
+
+
+def test_agents_do_not_touch_each_other_and_are_forgotten() -> None:
+    policy, alone = made("share"), made("share")
+    for t in range(6):
+        policy.rate("bob", AgentKind.ROBOT, 900, 5, t * S)
+        assert policy.rate("ann", AgentKind.AR, 20, 0.1, t * S) == alone.rate(
+            "ann", AgentKind.AR, 20, 0.1, t * S
+        )
+    policy.forget("ann")
+    policy.forget("nobody")
+    assert policy.rate("ann", AgentKind.AR, 20, 0.1, 9 * S) == made("share").rate(
+        "ann", AgentKind.AR, 20, 0.1, 0
+    )
+
+
+@given(
+    st.sampled_from(["share", "linear", "equal", "random"]),
+    st.lists(
+        st.tuples(
+            st.sampled_from(["ann", "bob"]),
+            st.floats(0, 1e6),
+            st.none() | st.floats(0, 1e6),
+            st.floats(-1, 9),
+        ),
+        max_size=20,
+    ),
+    st.booleans(),
+)
+def test_rates_stay_within_bounds(
+    name: str, said: list[tuple[str, float, float | None, float]], signed: bool
+) -> None:
+    policy, now = made(name, ControlConfig(signed_penalty=signed)), 0.0
+    for agent, delay_ms, error_cm, passed in said:
+        now += passed
+        rate = policy.rate(
+            agent, AgentKind.AR if agent == "ann" else AgentKind.ROBOT, delay_ms, error_cm, round(now * S)
+        )
+        assert rate is not None and CONFIG.rate_min_hz <= rate <= CONFIG.rate_max_hz
+
+
+def test_rates_settle_where_more_keyframes_mean_less_error() -> None:
+    rates = settled(lambda rates, agent: (20 if agent == "ar" else 100, 0.3 + 0.6 / rates[agent]))
+    assert 2 < rates["ar"] < 4.5 and 0.7 < rates["robot"] < 1.5
+
+
+def test_a_robot_makes_room_for_a_headset_at_an_edge_that_is_busy() -> None:
+    rates = settled(lambda rates, agent: (20 + 300 / (40 - sum(rates.values())), 0.4 + 0.4 / rates[agent]))
+    assert rates["ar"] > 9 and rates["robot"] < 1
+
+
+def test_where_keyframes_alone_make_the_delay_all_rates_rise() -> None:
+    """As the paper has it, who is worse off sends more: docs/scheduling.md says what that means."""
+    rates = settled(lambda rates, agent: (20 + 2000 / (26 - sum(rates.values())), 0.4))
+    assert min(rates.values()) > 9
+
+
+def test_by_attribution_delay_lowers_the_rate_and_error_raises_it() -> None:
+    def last(delay_ms: float, error_cm: float, kind: AgentKind, attribution: bool) -> float:
+        policy = made("share", replace(CONFIG, attribution=attribution))
+        for t in range(30):
+            rate = policy.rate("ann", kind, delay_ms, error_cm, t * S)
+        assert rate is not None
+        return rate
+
+    for kind, delay_ms in ((AgentKind.AR, 60.0), (AgentKind.ROBOT, 800.0)):
+        assert last(delay_ms, 0.3, kind, attribution=False) == CONFIG.rate_max_hz
+        assert last(delay_ms, 0.3, kind, attribution=True) == CONFIG.rate_min_hz
+        assert last(15.0, 3.0, kind, attribution=True) == CONFIG.rate_max_hz
+        assert last(15.0, 0.1, kind, attribution=True) == last(15.0, 0.1, kind, attribution=False) < 6

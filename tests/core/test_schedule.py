@@ -1,0 +1,85 @@
+"""Evaluations in, rates out: what an edge tells its agents to send, by policy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from share.config import Config, ControlConfig, EdgeConfig
+from share.control.policies import POLICIES
+from share.control.qoe import Needs, qoe
+from share.core import edge as ed
+from share.core.gating import Gating
+from share.geometry import se3
+from share.types import AgentKind
+from share.wire import messages as m
+from share.wire.codec import decode, encode
+
+MS = 1_000_000
+CONTROL = ControlConfig(ar_target=0.8)
+
+
+def welcomed(policy: str, kind: AgentKind = AgentKind.AR) -> ed.Edge:
+    edge = ed.Edge(Config(edge=EdgeConfig(policy=policy), control=CONTROL), session=7)
+    edge.handle(ed.Received(b"a", encode(m.Hello("ann", kind, 5, 400.0, np.eye(4)))), 0)
+    return edge
+
+
+def rates(edge: ed.Edge, delay_ms: float, error_cm: float | None, now_ms: int) -> list[float]:
+    told = encode(m.Evaluation(0, delay_ms, error_cm))
+    effects = edge.handle(ed.Received(b"a", told), now_ms * MS)
+    said = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.Send)]
+    return [message.hz for message in said if isinstance(message, m.Rate)]
+
+
+def test_without_a_limit_nothing_is_told_but_quality_is_written_down() -> None:
+    edge = welcomed("covins-g")
+    assert rates(edge, 50.0, 0.5, 10) == []
+    told = edge.report({})["agents"]["ann"]
+    assert told["rate_hz"] is None
+    assert told["qoe"] == pytest.approx(qoe(50.0, 0.5, Needs.of(CONTROL, AgentKind.AR)), abs=1e-4)
+
+
+def test_each_evaluation_is_answered_and_none_is_forgotten() -> None:
+    edge = welcomed("share")
+    told = [rates(edge, 15.0, error, 200 * i) for i, error in enumerate((0.3, 0.3, 0.3, 2.0, 2.0))]
+    assert [len(each) for each in told] == [1] * 5
+    content, wanting = [hz for (hz,) in told[:3]], [hz for (hz,) in told[3:]]
+    assert content == sorted(content, reverse=True) and content[-1] < CONTROL.rate_max_hz
+    assert wanting[0] > content[-1]
+    series = edge.series()["ann"]
+    assert series["t_s"] == [0.0, 0.2, 0.4, 0.6, 0.8]
+    assert series["error_cm"] == [0.3, 0.3, 0.3, 2.0, 2.0]
+    assert series["rate_hz"] == pytest.approx([hz for (hz,) in told], abs=1e-4)
+
+
+def test_a_new_run_begins_anew() -> None:
+    edge = welcomed("share")
+    for i in range(20):
+        (last,) = rates(edge, 15.0, 0.1, 200 * i)
+    edge.handle(ed.Received(b"a", encode(m.Bye())), 4000 * MS)
+    edge.handle(ed.Received(b"b", encode(m.Hello("ann", AgentKind.AR, 6, 400.0, np.eye(4)))), 4001 * MS)
+    effects = edge.handle(ed.Received(b"b", encode(m.Evaluation(0, 15.0, 0.1))), 4100 * MS)
+    (first,) = [decode([bytes(f) for f in e.frames]).hz for e in effects if isinstance(e, ed.Send)]
+    assert first > last
+
+
+def test_what_adds_little_is_skipped_once_there_is_something_to_compare_with() -> None:
+    gating = Gating(CONTROL, "share")
+    same = gating.volume(np.eye(4))
+    away = gating.volume(se3.exp(np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])))
+    assert 0 < away < same
+    assert not any(gating.refuses(away, joined=True) for _ in range(50))
+    for _ in range(CONTROL.merges):
+        gating.completed(same)
+    skipped = sum(bool(gating.refuses(away, joined=True)) for _ in range(1000))
+    chance = 1 - CONTROL.eagerness * away / same
+    assert skipped == pytest.approx(1000 * chance, abs=4 * np.sqrt(1000 * chance * (1 - chance)))
+    assert not any(gating.refuses(away, joined=False) for _ in range(50))
+
+
+@pytest.mark.parametrize("policy", [name for name, kind in POLICIES.items() if not kind.gated])
+def test_who_gates_nothing_skips_nothing(policy: str) -> None:
+    gating = Gating(CONTROL, policy)
+    gating.completed(100.0)
+    assert not any(gating.refuses(0.0, joined=True) for _ in range(50))

@@ -1,0 +1,94 @@
+"""Real agents and a real edge in virtual time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from edge_sim import Person, walls
+
+from share.config import Config, EdgeConfig
+from share.core.channel import NETWORKS, Network
+from share.core.world import Cost, Costs, Seen, World
+from share.geometry import se3
+from share.types import Candidate
+
+MS = 1_000_000
+ROOM = walls(1)
+
+
+def seen(person: Person, seconds: float) -> Iterator[Seen]:
+    """20 frames a second, every fifth a keyframe."""
+    T_before = None
+    for k in range(round(20 * seconds)):
+        if k % 5:
+            yield Seen(50 * k * MS, person.T_odom_body[-1], 0.5)
+            continue
+        T, view = person.step()
+        T_last_body = T if T_before is None else se3.inverse(T_before) @ T
+        candidate = Candidate(T, T_last_body, person.cov, np.zeros(3), 0.0, view, T_before is None)
+        T_before = T
+        yield Seen(50 * k * MS, T, 0.5, candidate)
+
+
+def world(policy: str = "covins-g", seed: int = 0, seconds: float = 6.0, **costs: Cost) -> World:
+    people = [Person("ann", ROOM, 0.0, 11), Person("bob", ROOM, 0.5, 22)]
+    agents = [(person.hello, seen(person, seconds)) for person in people]
+    made = World(Config(edge=EdgeConfig(policy=policy)), agents, NETWORKS["wifi5"], Costs(**costs), seed)
+    made.run(seconds + 1.0)
+    return made
+
+
+def track_ms(room: World, name: str) -> list[float]:
+    return [row.track_ms for row in room.logs[name].rows]
+
+
+def corrected_ms(room: World, name: str) -> list[float]:
+    """Of the frames that were corrected."""
+    late = [row.corrected_ms for row in room.logs[name].rows]
+    return [ms for ms in late if not np.isnan(ms)]
+
+
+def test_a_cost_is_drawn_as_it_is_said() -> None:
+    rng = np.random.default_rng(0)
+    drawn = np.array([Cost(4.0, 9.0).draw_ns(rng) for _ in range(20_000)]) / MS
+    assert np.percentile(drawn, [50, 95]) == pytest.approx([4.0, 9.0], rel=0.03)
+
+
+def test_everybody_is_tracked_joined_and_corrected() -> None:
+    room = world()
+    report = room.edge.report(room.mapper.report())
+    assert {name: agent["keyframes"] for name, agent in report["agents"].items()} == {"ann": 24, "bob": 24}
+    assert report["failed_jobs"] == 0
+    assert len(set(room.mapper.poses().maps)) == 1
+    for name, log in room.logs.items():
+        assert len(track_ms(room, name)) == 120
+        assert np.median(track_ms(room, name)) == pytest.approx(10.0, abs=1.0)
+        assert corrected_ms(room, name)
+        # tracked, sent, looked up, solved
+        assert min(corrected_ms(room, name)) > 10 + 5 + 2 * 1.0 + 3 + 4 + 14 - 15
+        both = [*track_ms(room, name), *corrected_ms(room, name)]
+        assert log.report()["latency_ms"]["mean"] == pytest.approx(np.mean(both))
+
+
+def test_the_same_seed_is_the_same_run_and_another_is_not() -> None:
+    first, again, other = (track_ms(world(seed=seed, seconds=3.0), "ann") for seed in (1, 1, 2))
+    assert first == again != other
+
+
+def test_a_slow_tracker_makes_frames_wait_and_a_slow_edge_corrections() -> None:
+    usual = world(seconds=3.0)
+    slow = world(seconds=3.0, frame=Cost(70.0, 70.0))
+    waits = np.diff(track_ms(slow, "ann"))
+    assert np.median(waits) == pytest.approx(20.0, abs=3.0)  # 70 ms each, every 50 ms
+    late = world(seconds=3.0, solve=Cost(300.0, 300.0))
+    assert min(corrected_ms(late, "bob")) > 300 > np.median(corrected_ms(usual, "bob"))
+    assert np.mean(track_ms(late, "bob")) == pytest.approx(np.mean(track_ms(usual, "bob")), rel=0.1)
+
+
+def test_an_agent_hears_its_rate() -> None:
+    room = world("share")
+    report = room.edge.report(room.mapper.report())["agents"]
+    assert all(agent["rate_hz"] is not None for agent in report.values())
+    assert Network().round_trip_ms == 0
