@@ -8,13 +8,14 @@ from share.types import AgentKind
 
 _FRESH = 4  # so many newest keyframes are looked up before others: who waits too long is answered too late
 _WEIGHT = {AgentKind.AR: 4, AgentKind.ROBOT: 1}  # a robot waits four times as many turns as a headset
+_LATE = 100  # passed over, the newest: those that may still be looked up when nothing else waits
 
 
 class Lookups:
     """Keyframes that wait to be looked up, at most `most`, and `each` of an agent: what waits longer is
     answered when nobody asks any more.
 
-    One too many: the oldest, of this agent or of the one with most of them, is left out (policy
+    One too many: the oldest, of this agent or of the one with most of them, is passed over (policy
     skip_oldest_query).
     """
 
@@ -25,6 +26,7 @@ class Lookups:
         self._weight: dict[str, int] = {}
         self._served: dict[str, int] = {}  # when, in turns
         self._turn = 0
+        self._late = deque[int](maxlen=_LATE)
 
     def __len__(self) -> int:
         return sum(map(len, self._waiting.values()))
@@ -48,8 +50,12 @@ class Lookups:
         self._served[agent] = self._turn
         return self._take(agent, oldest=False)
 
+    def next_late(self) -> int | None:
+        """Of those that were passed over, the newest; None without."""
+        return self._late.pop() if self._late else None
+
     def _skip(self, agent: str) -> None:
-        self._take(agent, oldest=True)
+        self._late.append(self._take(agent, oldest=True))
         self.skipped[agent] += 1
 
     def _take(self, agent: str, oldest: bool) -> int:

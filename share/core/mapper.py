@@ -134,11 +134,16 @@ class Mapper:
             return None
         self._see_restored()
         step: Look | None = self._next_verify()
-        while step is None and (number := self._lookups.next()) is not None:
+        while step is None and (number := self._next_number()) is not None:
             if number in self._sights:
                 step = self._query(number)
         self._looking = step is not None
         return step
+
+    def _next_number(self) -> int | None:
+        """One that was passed over is looked up only where it may join maps: its answer would come too late."""
+        number = self._lookups.next()
+        return self._lookups.next_late() if number is None and len(self._atlas.sizes()) > 1 else number
 
     def next_solve(self) -> Solve | None:
         """The next map to be solved; None if there is none, or one is under way."""

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from edge_sim import MS, ModelRun, Person, Town, walls
 
-from share.config import Config, EdgeConfig
+from share.config import Config, EdgeConfig, GraphConfig
 from share.core import edge as ed
 from share.core import events as ev
 from share.core.mapper import Mapper
-from share.core.steps import Verify
+from share.core.steps import Query, Solve, Verify
 from share.geometry import se3
+from share.graph.solver import Solver
 from share.place.verify import Refusal, Verified
 from share.types import AgentKind
 from share.wire import messages as m
@@ -240,6 +241,23 @@ def test_under_load_keyframes_are_kept_but_not_looked_up():
     assert skipped > 0
     assert skipped + report["place_ms"]["n"] <= 80
     assert 80 - skipped - report["place_ms"]["n"] <= slow.config.edge.max_waiting + 2
+
+
+def test_maps_that_came_all_at_once_are_joined_at_leisure():
+    """As after an outage: most is passed over when it comes, and looked up later."""
+    both, mapper = town(), Mapper(Config())
+    both.walk(16)
+    for run_id, name in enumerate(("ann", "bob"), start=11):
+        mapper.join(name, hello(name, run_id=run_id))
+        for keyframe in both.keyframes(name):
+            mapper.add(name, keyframe)
+    looked, solver = 0, Solver(GraphConfig())
+    assert len(mapper.report()["maps"]) == 2
+    while (step := mapper.next_look() or mapper.next_solve()) is not None:
+        mapper.done(step, step.run(solver) if isinstance(step, Solve) else step.run(), 1.0)
+        looked += isinstance(step, Query)
+    assert len(mapper.report()["maps"]) == 1
+    assert looked < 32  # once they are joined, what was passed over is left alone
 
 
 def test_in_a_hurry_fewer_candidates_are_tried_and_one_is_enough():

@@ -72,3 +72,12 @@ def test_of_many_agents_the_newest_are_answered_and_nobody_starves() -> None:
             age.append(number - found)
     assert max(age[20:]) <= 6
     assert min(served.values()) >= 30 and len(served) == 20
+
+
+def test_those_passed_over_are_there_for_later_newest_first() -> None:
+    queue = Lookups(12, 3)
+    for number in range(300):
+        queue.add("ann", AR, number)
+    assert [queue.next() for _ in range(4)] == [299, 298, 297, None]
+    late = [queue.next_late() for _ in range(101)]
+    assert late == [*range(296, 196, -1), None]
