@@ -141,7 +141,7 @@ class Mapper:
         return step
 
     def _next_number(self) -> int | None:
-        """One that was passed over is looked up only where it may join maps: its answer would come too late."""
+        """One that was passed over is looked up only where it may join maps: it is late for an answer."""
         number = self._lookups.next()
         return self._lookups.next_late() if number is None and len(self._atlas.sizes()) > 1 else number
 
