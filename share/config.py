@@ -146,7 +146,6 @@ class AgentConfig:
     keep_keyframes: int = 600  # that an agent remembers, sent ones too: a restarted edge is given them again
     late_ms: float = 0.0  # a frame that is later when its turn comes is left out; 0: none is
     rate_burst: float = 2.0  # keyframes that may be saved up under a rate limit
-    wait_ms: float = 100.0  # a keyframe that finds no token waits no longer: it would be answered too late
     blend_jump_m: float = 0.05  # a correction that moves the body further, or turns it more,
     blend_jump_rad: float = 0.02  # is blended in
     blend_s: float = 0.5  # over this time
@@ -156,8 +155,6 @@ class AgentConfig:
         _require_positive(self, "keep_keyframes", "blend_s")
         if not self.late_ms >= 0:
             raise ValueError(f"late_ms: {self.late_ms} must not be negative")
-        if not self.wait_ms >= 0:
-            raise ValueError(f"wait_ms: {self.wait_ms} must not be negative")
         if self.rate_burst < 1:
             raise ValueError(f"rate_burst: {self.rate_burst} must be at least 1")
 

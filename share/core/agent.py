@@ -13,12 +13,14 @@ from share.config import Config
 from share.core import events as ev
 from share.core.chain import Chain
 from share.core.clock import ClockFilter
+from share.core.drift import Drift
 from share.core.ledger import Entry, Ledger
 from share.core.map_frame import MapFrame
 from share.core.rate import Every, TokenBucket, seconds
+from share.core.worth import Worth
 from share.errors import UsageError, WireError
 from share.geometry.se3 import inverse
-from share.types import F64, Correction
+from share.types import F64, Correction, Keyframe
 from share.wire import messages as m
 from share.wire.codec import decode, encode, size
 
@@ -41,10 +43,11 @@ class Agent:
         self._chain = Chain()
         self._ledger = Ledger(config.agent, link)
         self._bucket = TokenBucket(config.agent.rate_burst)
+        self._worth = Worth()
         self._map = MapFrame(config.agent)
+        self._drift = Drift()
         self._clock = ClockFilter(config.clock)
         self._hello_timer, self._ping_timer = Every(link.hello_s), Every(link.ping_s)
-        self._waiting: ev.KeyframeMade | None = None  # waits for a token
         self._T_odom_body: F64 | None = None
         self._connected = False
         self._session: int | None = None
@@ -70,7 +73,7 @@ class Agent:
             case ev.FrameTracked():
                 self._frame_tracked(event, now_ns)
             case ev.KeyframeMade():
-                self._offer(event)
+                self._offer(event, now_ns)
             case ev.Received():
                 self._received(event, now_ns)
             case ev.Finished():
@@ -102,7 +105,6 @@ class Agent:
 
     def _frame_tracked(self, frame: ev.FrameTracked, now_ns: int) -> None:
         if frame.new_stretch:
-            self._drop_waiting()
             self._chain.break_off()
             self._map.forget()
         if frame.T_odom_body is not None and frame.state.has_pose:
@@ -110,12 +112,25 @@ class Agent:
         if not frame.keyframe:
             self._frame_done(frame, sent=False)
 
-    def _offer(self, made: ev.KeyframeMade) -> None:
-        """Queues a candidate for a token; the one that has waited so far is dropped (drop_rate)."""
+    def _offer(self, made: ev.KeyframeMade, now_ns: int) -> None:
+        """Makes a keyframe of a candidate, if the rate allows (drop_rate)."""
         self._counts["candidates"] += 1
-        self._drop_waiting()
-        self._chain.extend(made.candidate)
-        self._waiting = made
+        frame, candidate = made.frame, made.candidate
+        self._chain.extend(candidate)
+        sent = self._bucket.take(now_ns, self._worth.is_rather_high(candidate.view))
+        if sent:
+            self._add(self._chain.keyframe(candidate, frame.stamp_ns), frame, now_ns)
+        else:
+            self._counts["drop_rate"] += 1
+        self._frame_done(frame, sent)
+
+    def _add(self, keyframe: Keyframe, frame: ev.FrameTracked, now_ns: int) -> None:
+        self._ledger.add(Entry(keyframe, frame.index, frame.arrived_ns))
+        self._drift.sent(keyframe, frame.arrived_ns)
+        if self._connected and self._clock.rtt_ms is not None:
+            delay_ms = self._clock.rtt_ms + max(0.0, frame.track_ms)
+            error_cm = self._drift.expected_cm(frame.error_cm, now_ns)
+            self._send(m.Evaluation(keyframe.id, delay_ms, error_cm))
 
     def _localised(self, frame: ev.FrameTracked, T_odom_body: F64, now_ns: int) -> None:
         self._T_odom_body = T_odom_body
@@ -134,29 +149,6 @@ class Agent:
             return m.PoseUpdate(frame.stamp_ns, frame.state, -1, T_odom_body)
         T_keyframe_body = inverse(last.keyframe.T_odom_body) @ T_odom_body
         return m.PoseUpdate(frame.stamp_ns, frame.state, last.keyframe.id, T_keyframe_body)
-
-    def _spend(self, now_ns: int) -> None:
-        """Makes a keyframe of the waiting candidate if the rate allows; one that has waited too long goes."""
-        if self._waiting is None:
-            return
-        if not self._bucket.take(now_ns):
-            if now_ns - self._waiting.frame.done_ns > self._config.agent.wait_ms * 1e6:
-                self._drop_waiting()
-            return
-        frame, candidate = self._waiting.frame, self._waiting.candidate
-        self._waiting = None
-        keyframe = self._chain.keyframe(candidate, frame.stamp_ns)
-        self._ledger.add(Entry(keyframe, frame.index, frame.arrived_ns))
-        self._frame_done(frame, sent=True)
-        if self._connected and self._clock.rtt_ms is not None:
-            delay_ms = self._clock.rtt_ms + max(0.0, frame.track_ms)
-            self._send(m.Evaluation(keyframe.id, delay_ms, frame.error_cm))
-
-    def _drop_waiting(self) -> None:
-        if self._waiting is not None:
-            self._counts["drop_rate"] += 1
-            self._frame_done(self._waiting.frame, sent=False)
-            self._waiting = None
 
     def _frame_done(self, frame: ev.FrameTracked, sent: bool) -> None:
         self._effects.append(ev.FrameDone(frame.stamp_ns, frame.track_ms, frame.state, frame.keyframe, sent))
@@ -234,6 +226,7 @@ class Agent:
         self._counts["corrections"] += 1
         T_odom_body = correction.T_map_odom if self._T_odom_body is None else self._T_odom_body
         new_map = self._map.correct(correction.T_map_odom, correction.map_id, T_odom_body, now_ns)
+        self._drift.answered(correction.answers)
         entry = self._ledger.find(correction.answers)
         corrected_ms = None
         if entry is not None and not (entry.answered or entry.replayed):
@@ -270,7 +263,6 @@ class Agent:
     # ------------------------------------------------------------ what is due
 
     def _keep_up(self, now_ns: int) -> None:
-        self._spend(now_ns)
         self._watch_silence(now_ns)
         if self._connected:
             self._ping(now_ns)
@@ -306,7 +298,6 @@ class Agent:
             self._send(entry.keyframe)
 
     def _finished(self, now_ns: int) -> None:
-        self._drop_waiting()
         self._finish_by_ns = now_ns + seconds(self._config.agent.finish_s)
 
     def _end(self) -> None:

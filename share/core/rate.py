@@ -29,7 +29,10 @@ class Every:
 
 
 class TokenBucket:
-    """Lets `hz` a second through on average, at most `burst` at once; everything while hz is None."""
+    """Lets `hz` a second through on average, at most `burst` at once; everything while hz is None.
+
+    What is not preferred passes only where a token would be lost otherwise: when `burst` have been saved up.
+    """
 
     def __init__(self, burst: float) -> None:
         self.hz: float | None = None
@@ -42,12 +45,12 @@ class TokenBucket:
         self._refill(now_ns)
         self.hz = hz
 
-    def take(self, now_ns: int) -> bool:
+    def take(self, now_ns: int, preferred: bool = True) -> bool:
         """Whether one may pass now."""
         self._refill(now_ns)
         if self.hz is None:
             return True
-        if self._tokens < 1 - 1e-9:
+        if self._tokens < (1 if preferred else self._burst) - 1e-9:
             return False
         self._tokens -= 1
         return True

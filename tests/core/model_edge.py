@@ -37,7 +37,7 @@ def tracked(
 _T_LAST: WeakKeyDictionary[Agent, np.ndarray] = WeakKeyDictionary()  # of its last candidate
 
 
-def handle(agent: Agent, event: ev.AgentEvent, now_ns: int) -> list[ev.AgentEffect]:
+def handle(agent: Agent, event: ev.AgentEvent, now_ns: int, view: View = EMPTY) -> list[ev.AgentEffect]:
     """Gives the agent the event, and after a keyframe's pose the keyframe, as a tracker does."""
     effects = agent.handle(event, now_ns)
     if isinstance(event, ev.FrameTracked) and event.keyframe:
@@ -45,7 +45,7 @@ def handle(agent: Agent, event: ev.AgentEvent, now_ns: int) -> list[ev.AgentEffe
         T = event.T_odom_body
         T_last_body = se3.inverse(_T_LAST.get(agent, np.eye(4))) @ T
         _T_LAST[agent] = T
-        candidate = Candidate(T, T_last_body, COV, UP, 0.01, EMPTY, event.new_stretch)
+        candidate = Candidate(T, T_last_body, COV, UP, 0.01, view, event.new_stretch)
         effects = effects + agent.handle(ev.KeyframeMade(event, candidate), now_ns)
     return effects
 

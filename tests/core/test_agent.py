@@ -14,7 +14,7 @@ from share.core import events as ev
 from share.core.agent import Agent
 from share.errors import UsageError
 from share.geometry import se3
-from share.types import Correction, Keyframe, TrackState
+from share.types import Correction, Keyframe, TrackState, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 
@@ -48,6 +48,12 @@ def welcomed(config: Config | None = None) -> Agent:
 
 def pose(x: float = 0.0, yaw: float = 0.0) -> np.ndarray:
     return se3.compose(se3.so3_exp(np.array([0, 0, yaw])), np.array([x, 0, 0.0]))
+
+
+def seen_at(depth: float) -> View:
+    """Three points at this depth, m."""
+    uv = np.array([[-0.1, 0.0], [0.0, 0.1], [0.1, 0.0]])
+    return View(uv, depth * np.c_[uv, np.ones(3)], np.zeros((3, 32), np.uint8))
 
 
 def correction(T: np.ndarray, revision: int, answers: int = -1, map_id: str = "a") -> Correction:
@@ -193,7 +199,7 @@ def test_keyframes_are_numbered_sent_and_evaluated() -> None:
     effects = handle(agent, tracked(11, pose(1), candidate=True, ms=5), 560 * MS)
     [keyframe] = only(Keyframe, effects, messages=True)
     assert (keyframe.id, keyframe.reference, keyframe.stamp_ns) == (0, -1, 10**15 + 550 * MS)
-    assert only(m.Evaluation, effects, messages=True) == [m.Evaluation(0, 8.0, None)]
+    assert only(m.Evaluation, effects, messages=True) == [m.Evaluation(0, 8.0, 0.0)]
     assert only(ev.FrameDone, effects)[0].sent
 
 
@@ -209,7 +215,7 @@ def test_keyframes_made_without_an_edge_are_sent_when_one_comes() -> None:
 # ---------------------------------------------------------------- rate
 
 
-def test_a_rate_is_spent_as_a_token_bucket_and_the_newest_candidate_waits() -> None:
+def test_a_rate_is_spent_as_a_token_bucket() -> None:
     agent = welcomed()
     tell(agent, m.Rate(2.0), 0)
     done, keyframes = [], []
@@ -220,8 +226,8 @@ def test_a_rate_is_spent_as_a_token_bucket_and_the_newest_candidate_waits() -> N
         tell(agent, m.Ack(len(keyframes)), k * 50 * MS)
     assert len(keyframes) == pytest.approx(2 + 2 * 5, abs=1)
     report = agent.report()
-    assert report["candidates"] == 100 == report["keyframes"] + report["drop_rate"] + 1  # one still waits
-    assert [d.stamp_ns for d in done] == sorted({d.stamp_ns for d in done})
+    assert report["candidates"] == 100 == report["keyframes"] + report["drop_rate"]
+    assert [d.stamp_ns for d in done] == [10**15 + k * 50 * MS for k in range(100)]
     assert [d.stamp_ns for d in done if d.sent] == [k.stamp_ns for k in keyframes]
     T = np.eye(4)
     for keyframe in keyframes:  # the chain still leads to where the body was
@@ -229,27 +235,34 @@ def test_a_rate_is_spent_as_a_token_bucket_and_the_newest_candidate_waits() -> N
         assert T[0, 3] == pytest.approx((keyframe.stamp_ns - 10**15) / (50 * MS))
 
 
-def test_a_waiting_candidate_goes_when_its_token_comes_without_another_frame() -> None:
-    agent = welcomed()
-    tell(agent, m.Rate(5.0), 0)
-    for k in range(3):
-        handle(agent, tracked(k, candidate=True), k * 50 * MS)
-    tell(agent, m.Ack(2), 150 * MS)
-    assert not only(Keyframe, handle(agent, ev.Tick(), 190 * MS), messages=True)
-    assert [k.id for k in only(Keyframe, handle(agent, ev.Tick(), 200 * MS), messages=True)] == [2]
+def test_views_that_see_far_are_preferred_and_the_rate_is_kept() -> None:
+    agent, depths = welcomed(), np.random.default_rng(3).uniform(1.0, 9.0, 200)
+    tell(agent, m.Rate(2.0), 0)
+    taken = []
+    for k, depth in enumerate(depths):  # 40 s, five candidates a second
+        at_ns = 200 * k * MS
+        effects = handle(agent, tracked(4 * k, pose(k), candidate=True), at_ns, seen_at(depth))
+        if only(ev.FrameDone, effects)[0].sent:
+            taken.append(depth)
+            tell(agent, m.Ack(len(taken)), at_ns)
+    assert len(taken) == pytest.approx(2 + 2 * 40, abs=4)
+    assert np.mean(taken) > np.mean(depths) + 0.8  # m
 
 
-def test_a_candidate_does_not_wait_until_it_would_be_answered_too_late() -> None:
-    agent = welcomed()
-    tell(agent, m.Rate(1.0), 0)
-    for k in range(3):
-        handle(agent, tracked(k, candidate=True), k * 50 * MS)
-    tell(agent, m.Ack(2), 150 * MS)
-    limit = Config().agent.wait_ms
-    dropped = only(ev.FrameDone, handle(agent, ev.Tick(), round((110 + limit) * MS)))
-    assert [(done.keyframe, done.sent) for done in dropped] == [(True, False)]
-    assert not only(Keyframe, handle(agent, ev.Tick(), 1000 * MS), messages=True)
-    assert agent.report()["drop_rate"] == 1
+def test_a_correction_sets_back_what_odometry_may_have_lost() -> None:
+    agent, errors_cm = welcomed(), []
+    [ping] = only(m.Ping, handle(agent, ev.Tick(), 500 * MS), messages=True)
+    tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
+    for k in range(12):
+        now_ns = (550 + 50 * k) * MS
+        if k == 6:
+            tell(agent, correction(pose(), 1, answers=4), now_ns)
+        effects = handle(agent, tracked(11 + k, candidate=True), now_ns)
+        errors_cm += [e.error_cm for e in only(m.Evaluation, effects, messages=True)]
+        tell(agent, m.Ack(k + 1), now_ns)
+    sigma_cm = 100 * np.sqrt(np.trace(COV[3:, 3:]))
+    since = np.array([0, 1, 2, 3, 4, 5, 2, 3, 4, 5, 6, 7])
+    np.testing.assert_allclose(errors_cm, sigma_cm * np.sqrt(since))
 
 
 # ---------------------------------------------------------------- corrections
@@ -367,15 +380,6 @@ def test_with_nothing_open_the_end_is_now() -> None:
     effects = Agent(HELLO, Config()).handle(ev.Finished(), 0)
     assert isinstance(effects[-1], ev.Stop)
     assert not only(m.Bye, effects, messages=True)
-
-
-def test_a_candidate_that_waits_at_the_end_is_done_but_not_sent() -> None:
-    agent = welcomed()
-    tell(agent, m.Rate(0.0), 0)
-    for k in range(3):
-        handle(agent, tracked(k, candidate=True), k * 50 * MS)
-    [done] = only(ev.FrameDone, handle(agent, ev.Finished(), S))
-    assert (done.keyframe, done.sent) == (True, False)
 
 
 def test_the_report_is_plain_data() -> None:
