@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from edge_sim import MS, ModelRun, Person, Town, walls
 
-from share.config import Config, EdgeConfig, GraphConfig
+from share.config import AgentNeeds, Config, ControlConfig, EdgeConfig, GraphConfig
 from share.core import edge as ed
 from share.core import events as ev
 from share.core.mapper import Mapper
@@ -258,6 +258,33 @@ def test_maps_that_came_all_at_once_are_joined_at_leisure():
         looked += isinstance(step, Query)
     assert len(mapper.report()["maps"]) == 1
     assert looked < 32  # once they are joined, what was passed over is left alone
+
+
+@pytest.mark.parametrize(
+    ("policy", "needs", "turns"),
+    [
+        ("covins-g", {}, "ababab"),
+        ("equal", {}, "ababab"),
+        ("share", {}, "aaaaba"),
+        ("share", {"bob": AgentNeeds(form="ar")}, "ababab"),
+    ],
+)
+def test_headsets_and_who_needs_the_same_go_first_unless_all_are_alike(policy, needs, turns):
+    both = town()
+    both.walk(10)
+    config = Config(edge=EdgeConfig(policy=policy, each_waiting=10), control=ControlConfig(agents=needs))
+    mapper, kinds = Mapper(config), {"ann": AgentKind.AR, "bob": AgentKind.ROBOT}
+    for run_id, (name, kind) in enumerate(kinds.items()):
+        mapper.join(name, replace(hello(name, run_id), kind=kind))
+    for keyframes in zip(*(both.keyframes(name) for name in kinds), strict=True):
+        for name, keyframe in zip(kinds, keyframes, strict=True):
+            mapper.add(name, keyframe)
+    looked = ""
+    for _ in range(6):
+        query = mapper.next_look()
+        mapper.done(query, [], 1.0)
+        looked += mapper._atlas.key(query.number).agent[0]
+    assert looked == turns
 
 
 def test_in_a_hurry_fewer_candidates_are_tried_and_one_is_enough():
