@@ -301,16 +301,17 @@ class ControlConfig:
     gap_s: float = 5.0  # no evaluation for longer: the error's slope is forgotten, its integral held
     random_seed: int = 1  # of policy random
     gate_seed: int = 1  # of which merges are skipped
-    horizontal_deg: float = 87.0  # field of view that overlap is reckoned with,
-    vertical_deg: float = 58.0  # the same, upright,
-    near_m: float = 0.3  # from here
-    far_m: float = 5.0  # to here
+    near_m: float = 0.3  # what a camera sees is reckoned from here
+    far_m: float = 5.0  # to here, its field of view as calibrated
     interval_m: float = 0.5  # between points at which overlap is sampled
     merges: int = 20  # completed ones, with whose mean overlap a new one is compared
     eagerness: float = 0.75  # a merge of mean overlap is done with this chance, less overlap with less
 
     def __post_init__(self) -> None:
         _require_positive(self, "ar_gamma", "robot_gamma", "robot_theta_ms", "rate_min_hz", "merges")
+        _require_positive(self, "interval_m")
+        if not self.near_m < self.far_m:
+            raise ValueError(f"near_m: {self.near_m} m is not nearer than far_m, {self.far_m} m")
         if not (self.rate_min_hz <= self.rate_max_hz <= 1000 and self.alpha <= 1):
             raise ValueError("rate_min_hz, rate_max_hz, 1000 must rise, and alpha be at most 1")
 

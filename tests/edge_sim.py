@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from hellos import hello_of
 
 from share.config import Config
 from share.core import edge as ed
@@ -100,7 +101,7 @@ class Person:
 
     @property
     def hello(self) -> Hello:
-        return Hello(self.name, self.kind, self.run_id, FOCAL, np.eye(4))
+        return hello_of(self.name, self.run_id, self.kind, focal=FOCAL)
 
     def stamp_ns(self, now_ns: int) -> int:
         return now_ns

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from hellos import hello_of
 
 from share.core.keeping import Change, KeepKeyframe, KeepLoop, KeepPoses, KeepRun, Kept, KeptKeyframe
 from share.geometry import se3
 from share.merge.join import Key, Loop
-from share.types import F64, AgentKind, Keyframe, View
-from share.wire.messages import Hello
+from share.types import F64, Keyframe, View
 
 ANN, BOB = "ann-0001", "bob-0002"
 
@@ -19,7 +19,7 @@ def pose(i: int) -> F64:
 
 def run(key: str) -> KeepRun:
     name, _, number = key.rpartition("-")
-    return KeepRun(key, Hello(name, AgentKind.AR, int(number, 16), 400.0, pose(3)))
+    return KeepRun(key, hello_of(name, int(number, 16), T=pose(3)))
 
 
 def keyframe(key: str, i: int, points: int = 40, first: bool = False) -> KeepKeyframe:
@@ -61,7 +61,7 @@ def small_map(count: int = 20, points: int = 40) -> list[Change]:
 def told(kept: Kept) -> dict[str, object]:
     """All of it in a form that can be compared to the last bit."""
     return {
-        "runs": [(r.key, r.hello.name, r.hello.run_id, r.hello.T_body_cam0.tobytes()) for r in kept.runs],
+        "runs": [(r.key, r.hello.name, r.hello.run_id, r.hello.rig.T_body_cam0.tobytes()) for r in kept.runs],
         "stretches": kept.stretches,
         "keyframes": [_keyframe(k) for k in kept.keyframes],
         "links": {k: (x.reference, x.T_ref_body.tobytes(), x.cov.tobytes()) for k, x in kept.links.items()},

@@ -22,12 +22,14 @@ process.prepare()
 import numpy as np  # noqa: E402
 
 from share.core.keeping import Change, KeepKeyframe, KeepPoses, KeepRun, Retire  # noqa: E402
+from share.geometry.camera import Camera, Rig  # noqa: E402
 from share.io.map_store import MapStore  # noqa: E402
 from share.merge.join import Key  # noqa: E402
 from share.types import AgentKind, Keyframe, View  # noqa: E402
 from share.wire.messages import Hello  # noqa: E402
 
 RUN = "ann-0001"
+RIG = Rig(Camera(640, 480, 400.0, 400.0, 319.5, 239.5), np.eye(4))
 
 
 def main() -> None:
@@ -67,7 +69,7 @@ def keyframes() -> Callable[[int], KeepKeyframe]:
 
 def opened(path: Path, power_cut: bool = False) -> MapStore:
     store = MapStore.open(path, power_cut)
-    store.write([KeepRun(RUN, Hello("ann", AgentKind.AR, 1, 400.0, np.eye(4)))])
+    store.write([KeepRun(RUN, Hello("ann", AgentKind.AR, 1, RIG))])
     return store
 
 

@@ -63,7 +63,7 @@ def _chosen(actor: Actor, every: Spacing) -> tuple[I64, Trajectory]:
 
 def _agent(actor: Actor, truth: Trajectory, seen: list[View], rng: np.random.Generator) -> AgentKeyframes:
     run_id = int(rng.integers(2**63))
-    hello = Hello(actor.name, actor.kind, run_id, actor.rig.cam0.focal, actor.rig.T_body_cam0)
+    hello = Hello(actor.name, actor.kind, run_id, actor.rig)
     T_odom_body, cov = odometry(truth.T, truth.stamps_ns, rng, Drift())
     return AgentKeyframes(hello, _chained(T_odom_body, cov, truth.stamps_ns, seen), truth.T, T_odom_body)
 

@@ -25,7 +25,7 @@ from share.io.files import writable_dir
 
 __all__ = ["AgentKeyframes", "KeyframeSet", "Spacing", "keyframe_set", "place"]
 
-VERSION = 2  # raise it when any keyframe changes (ORB, depth, odometry); emulation has its own in the recipe
+VERSION = 3  # raise it when any keyframe changes (ORB, depth, odometry); emulation has its own in the recipe
 
 
 def place(recipe: Recipe, every: Spacing, cache: Path | None = None) -> Path:

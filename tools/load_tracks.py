@@ -33,9 +33,7 @@ class Walker:
         self._track: AgentKeyframes = tracks[index % len(tracks)]
         self._rng = np.random.default_rng((index, 6))
         hello = self._track.hello
-        self.hello = Hello(
-            f"agent{index}", hello.kind, int(self._rng.integers(2**63)), hello.focal, hello.T_body_cam0
-        )
+        self.hello = Hello(f"agent{index}", hello.kind, int(self._rng.integers(2**63)), hello.rig)
 
     def keyframes(self) -> Iterator[Keyframe]:
         """One after the other, at `RATE_HZ`."""
@@ -65,7 +63,7 @@ class Walker:
 
     def _seen_anew(self, view: View) -> View:
         n, rng = len(view), self._rng
-        uv = view.uv + rng.normal(0, _PIXELS / self.hello.focal, (n, 2)).astype(np.float32)
+        uv = view.uv + rng.normal(0, _PIXELS / self.hello.rig.cam0.focal, (n, 2)).astype(np.float32)
         rho = np.maximum(1 / view.points[:, 2] + rng.normal(0, _INVERSE_DEPTH, n), 1e-3)
         points = np.column_stack([uv, np.ones(n)]) / rho[:, None]
         return replace(view, uv=uv, points=points, descriptors=view.descriptors ^ self._flips(n))

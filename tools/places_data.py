@@ -70,7 +70,7 @@ def emulated(recipe: Recipe, every: Spacing, step: int) -> Views:
     made = keyframe_set(recipe, every)
     agents = [(a, slice(None, None, step)) for a in made.agents.values()]
     sights = [
-        Sight(k.view, a.hello.focal, a.hello.T_body_cam0, k.up)
+        Sight(k.view, a.hello.rig.cam0.focal, a.hello.rig.T_body_cam0, k.up)
         for a, some in agents
         for k in a.keyframes[some]
     ]

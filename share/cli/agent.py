@@ -84,8 +84,7 @@ def agent(
     options.say_notes(opened)
     error = _by_truth(opened) if true_error else None
     run_id = secrets.randbits(63)
-    rig = opened.rig
-    hello = Hello(options.agent_name(name), AgentKind(kind), run_id, rig.cam0.focal, rig.T_body_cam0)
+    hello = Hello(options.agent_name(name), AgentKind(kind), run_id, opened.rig)
     live = _LiveLine(opened.images_count)
     folder = None if out is None else Path(out)
     dial = partial(connect, address, run_id, with_keys)

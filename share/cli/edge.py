@@ -55,7 +55,6 @@ def edge(
     from contextlib import ExitStack, closing
     from dataclasses import replace
 
-    from share.core.gating import Gating
     from share.io.transport import bind as bind_link
     from share.io.transport import parse_address
     from share.run.edge import EdgeRun
@@ -66,7 +65,6 @@ def edge(
     if policy is not None:
         settings = replace(settings, edge=replace(settings.edge, policy=policy))
     folder = None if out is None else Path(out)
-    Gating(settings.control, settings.edge.policy)  # a frustum that is none is said here, not by the mapper
     with ExitStack() as stack:
         link = stack.enter_context(closing(bind_link(bind, with_keys)))
         store = None if map_file is None else stack.enter_context(_open_map(Path(map_file)))

@@ -1,4 +1,4 @@
-"""How much two views have in common, from their poses alone: frusta on a grid of points.
+"""How much two views have in common, from poses and fields of view alone: frusta on grids of points.
 
 The grid belongs to the frustum and moves with the camera: points ((i + 1/2) delta, (j + 1/2) delta) in layers
 of equal depth, delta or a little less, from near to far; those that lie in the frustum count, each for an
@@ -14,12 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from share.config import ControlConfig
-from share.errors import ConfigError
+from share.geometry.camera import Camera
 from share.geometry.se3 import inverse
 from share.types import F64, I64
 
-_MOST_POINTS = 2_000_000  # before those outside are taken out
+_WIDEST_RAD = math.radians(160)  # beyond, it is no pinhole
+_LEAST, _MOST = 3, 80  # points along half a side and along the depth, whatever their interval
 _SLACK_M = 1e-9  # a point on the border is inside, on whatever side rounding puts it
 
 
@@ -40,6 +40,12 @@ class Frustum:
             raise ValueError("frustum: fields of view must be between 0 and pi")
         if not 0 <= self.near_m < self.far_m:
             raise ValueError(f"frustum: from {self.near_m} to {self.far_m} m is no depth")
+
+    @classmethod
+    def of(cls, camera: Camera, near_m: float, far_m: float) -> Frustum:
+        """By its focal lengths and the size of its image, as if centred and without distortion."""
+        horizontal, vertical = camera.field_rad
+        return cls(min(horizontal, _WIDEST_RAD), min(vertical, _WIDEST_RAD), near_m, far_m)
 
     @property
     def slopes(self) -> tuple[float, float]:
@@ -69,73 +75,53 @@ class Frustum:
         return z, math.hypot(self.far_m * sx, self.far_m * sy, self.far_m - z)
 
 
-class Overlap:
-    """Between views with one frustum, sampled `interval_m` apart. Poses are T_w_cam, z forward, in one frame.
-
-    Raises ValueError if the interval is so wide that no point lies in the frustum, or so narrow that there
-    would be more than two million.
-    """
+class Seen:
+    """What views of one camera see: a frustum, sampled about `interval_m` apart."""
 
     def __init__(self, frustum: Frustum, interval_m: float) -> None:
         self.frustum = frustum
-        self._planes = frustum.planes
-        self._points = _grid(frustum, interval_m)
-        self._centre, self._radius = frustum.sphere
+        self.planes = frustum.planes
+        self.points = _grid(frustum, interval_m)
+        self.centre, self.radius = frustum.sphere
 
-    @classmethod
-    def of(cls, config: ControlConfig) -> Overlap:
-        """As set. Raises ConfigError for what is no frustum or no grid."""
-        fields = math.radians(config.horizontal_deg), math.radians(config.vertical_deg)
-        try:
-            return cls(Frustum(*fields, config.near_m, config.far_m), config.interval_m)
-        except ValueError as error:
-            raise ConfigError(f"control: {error}") from None
-
-    @property
-    def points(self) -> int:
-        """Of the grid."""
-        return len(self._points.T)
-
-    def volumes(self, T_w_cam: F64, others: F64) -> F64:
-        """V_overlap, m^3, of one view (4, 4) with each of others (N, 4, 4): (N,)."""
-        return self.frustum.volume * self._shares(T_w_cam, others)
-
-    def iou(self, T_w_cam: F64, others: F64) -> F64:
-        """V_overlap / V_union, 0 to 1, of one view (4, 4) with each of others (N, 4, 4): (N,)."""
-        shared = self._shares(T_w_cam, others)
-        iou: F64 = shared / (2 - shared)
-        return iou
-
-    def _shares(self, T_w_cam: F64, others: F64) -> F64:
-        """Parts of a frustum that lie in the other (N,)."""
-        out = np.zeros(len(others))
-        away = (others - T_w_cam) @ [0.0, 0.0, self._centre, 1.0]
-        (near,) = np.nonzero((away**2).sum(-1) < (2 * self._radius) ** 2)
-        if len(near):
-            T_other_cam = inverse(others[near]) @ T_w_cam
-            inside = self._inside(T_other_cam) + self._inside(inverse(T_other_cam))
-            out[near] = inside / (2 * self.points)
-        return out
-
-    def _inside(self, T_b_a: F64) -> I64:
-        """How many of a's points lie in b (N,)."""
-        distances = (self._planes @ T_b_a) @ self._points
+    def inside(self, other: Seen, T_other_self: F64) -> F64:
+        """How much of it, m^3, lies in `other`, from where it stands at T_other_self (N, 4, 4): (N,)."""
+        distances = (other.planes @ T_other_self) @ self.points
         count: I64 = (distances.min(axis=1) >= -_SLACK_M).sum(axis=-1)
-        return count
+        volume: F64 = count * (self.frustum.volume / self.points.shape[1])
+        return volume
+
+
+def volumes(a: Seen, T_w_a: F64, b: Seen, T_w_b: F64) -> F64:
+    """V_overlap, m^3, of one view T_w_a (4, 4) of camera a with each view T_w_b (N, 4, 4) of b: (N,).
+
+    Poses are of cameras, z forward, in one frame.
+    """
+    out = np.zeros(len(T_w_b))
+    away = T_w_b @ [0.0, 0.0, b.centre, 1.0] - T_w_a @ [0.0, 0.0, a.centre, 1.0]
+    (near,) = np.nonzero((away**2).sum(-1) < (a.radius + b.radius) ** 2)
+    if len(near):
+        T_b_a = inverse(T_w_b[near]) @ T_w_a
+        out[near] = (a.inside(b, T_b_a) + b.inside(a, inverse(T_b_a))) / 2
+    return out
+
+
+def ious(a: Seen, T_w_a: F64, b: Seen, T_w_b: F64) -> F64:
+    """V_overlap / V_union, 0 to 1, for the same: (N,)."""
+    shared = volumes(a, T_w_a, b, T_w_b)
+    iou: F64 = shared / (a.frustum.volume + b.frustum.volume - shared)
+    return iou
 
 
 def _grid(frustum: Frustum, interval_m: float) -> F64:
-    """Homogeneous points (4, M)."""
+    """Homogeneous points (4, M), M > 0. Where the interval is too wide or too narrow for the frustum, it is
+    changed: whatever an agent's calibration says, there are some points, and not too many."""
     depth = frustum.far_m - frustum.near_m
     sizes = np.array([s * frustum.far_m for s in frustum.slopes] + [depth])
-    if not (interval_m > 0 and 4 * np.prod(sizes / interval_m + 1) <= _MOST_POINTS):
-        raise ValueError(f"overlap: points {interval_m} m apart are too many")
-    across_x, across_y, layers = np.ceil(sizes / interval_m).astype(int)
-    x, y = ((np.arange(-n, n) + 0.5) * interval_m for n in (across_x, across_y))
+    steps = np.clip(interval_m, sizes / _MOST, sizes / _LEAST)
+    across_x, across_y, layers = np.ceil(sizes / steps).astype(int)
+    x, y = ((np.arange(-n, n) + 0.5) * step for n, step in ((across_x, steps[0]), (across_y, steps[1])))
     z = frustum.near_m + (np.arange(layers) + 0.5) * depth / layers
     grid = np.stack(np.meshgrid(x, y, z), axis=-1).reshape(-1, 3)
-    points = np.vstack([grid.T, np.ones(len(grid))])
-    points = points[:, (frustum.planes @ points >= -_SLACK_M).all(axis=0)]
-    if not points.shape[1]:
-        raise ValueError(f"overlap: points {interval_m} m apart miss the frustum")
-    return points
+    points: F64 = np.vstack([grid.T, np.ones(len(grid))])
+    return points[:, (frustum.planes @ points >= -_SLACK_M).all(axis=0)]

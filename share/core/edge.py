@@ -221,6 +221,8 @@ class Edge:
     def _objection(self, peer_id: bytes, hello: wire.Hello, now_ns: int) -> str | None:
         """Why this run cannot be taken in, if it cannot."""
         edge, known = self._config.edge, self._peers.get(peer_id)
+        if hello.streams:
+            return "this edge tracks nobody: the agent has to track itself"
         if known is not None:
             same = known.hello.name == hello.name
             return None if same else f"this run's number is in use by '{known.hello.name}'; start again"

@@ -30,7 +30,6 @@ from share.core.keeping import (
 )
 from share.core.lookups import Lookups
 from share.core.steps import Look, Query, Solve, Step, Verify
-from share.geometry import se3
 from share.graph.change import Solution
 from share.merge.atlas import Applied, Atlas, Placed
 from share.merge.join import Loop
@@ -127,7 +126,7 @@ class Mapper:
 
     def _see(self, number: int, agent: str, keyframe: Keyframe) -> None:
         hello = self._hellos[agent]
-        self._sights[number] = Sight(keyframe.view, hello.focal, hello.T_body_cam0, keyframe.up)
+        self._sights[number] = Sight(keyframe.view, hello.rig.cam0.focal, hello.rig.T_body_cam0, keyframe.up)
         self._index.add(number, keyframe.view.descriptors)
 
     def _founding(self, agent: str) -> Finding:
@@ -251,7 +250,7 @@ class Mapper:
             self._search.wanted -= 1
         loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers)
         account.merges["requested"] += 1
-        volume = self._gating.volume(se3.inverse(step.seen.T_body_cam0) @ loop.T_a_b @ step.sight.T_body_cam0)
+        volume = self._gating.volume(self._hellos[a.agent].rig, self._hellos[b.agent].rig, loop.T_a_b)
         if objection := self._gating.refuses(volume, self._atlas.map_of(a) == self._atlas.map_of(b)):
             account.merges["skipped"] += 1
             return [Finding(b.agent, "merge skipped", f"loop {loop}: {objection}")]

@@ -6,6 +6,7 @@ plumb-bob model k1 k2 p1 p2 [k3] (Brown 1966), Kalibr's `radtan` and EuRoC's `ra
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,6 +47,11 @@ class Camera:
     def K(self) -> F64:
         """The 3x3 matrix of intrinsics."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    @property
+    def field_rad(self) -> tuple[float, float]:
+        """Across and upright, as without distortion: 2 atan(size / 2 f)."""
+        return 2 * math.atan(self.width / (2 * self.fx)), 2 * math.atan(self.height / (2 * self.fy))
 
     @property
     def focal(self) -> float:
@@ -132,6 +138,11 @@ class ImuNoise:
     gyro_walk: float
     accel_walk: float
     rate_hz: float
+
+    def __post_init__(self) -> None:
+        told = (self.gyro_density, self.accel_density, self.gyro_walk, self.accel_walk, self.rate_hz)
+        if not all(0 <= value < np.inf for value in told):
+            raise ValueError("IMU: has noise or a rate that is negative or not finite")
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,7 +95,9 @@ def _clouds(
     kept: Kept, keyframes: list[KeptKeyframe], T: dict[Key, F64], progress: Callable[[int], None]
 ) -> Iterator[tuple[F64, Colour]]:
     """The points that each keyframe saw, in the map, in its agent's colour."""
-    runs = {run.key: (run.hello.T_body_cam0, COLOURS[i % len(COLOURS)]) for i, run in enumerate(kept.runs)}
+    runs = {
+        run.key: (run.hello.rig.T_body_cam0, COLOURS[i % len(COLOURS)]) for i, run in enumerate(kept.runs)
+    }
     for keyframe in keyframes:
         T_body_cam0, colour = runs[keyframe.key]
         points = keyframe.keyframe.view.points.astype(np.float64)

@@ -19,10 +19,11 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from share.errors import WireError
+from share.geometry.camera import Camera, ImuNoise, Rig
 from share.types import DESCRIPTOR_BYTES, MAX_KEYPOINTS, AgentKind, Correction, Keyframe, TrackState, View
 from share.wire import messages as m
 
-VERSION = 2
+VERSION = 3
 MAX_HEADER_BYTES = 4096
 MAX_ARRAYS = 8
 MAX_FRAME_BYTES = MAX_KEYPOINTS * DESCRIPTOR_BYTES  # the largest array of any message
@@ -56,9 +57,9 @@ _read_header = msgspec.msgpack.Decoder(_Header).decode
 
 @dataclass(frozen=True)
 class _Scalars:
-    """Named scalar fields, checked alike on the way out and in."""
+    """Scalar fields by their paths, checked alike on the way out and in."""
 
-    names: tuple[str, ...]
+    paths: tuple[str, ...]
     decoder: msgspec.msgpack.Decoder[Any]
 
     @staticmethod
@@ -66,7 +67,7 @@ class _Scalars:
         return _Scalars(tuple(fields), msgspec.msgpack.Decoder(tuple[tuple(fields.values())]))  # type: ignore[misc]
 
     def encode(self, message: object) -> bytes:
-        raw = _encoder.encode([getattr(message, name) for name in self.names])
+        raw = _encoder.encode([attrgetter(path)(message) for path in self.paths])
         self.decode(raw)
         return raw
 
@@ -74,21 +75,26 @@ class _Scalars:
         values = self.decoder.decode(raw)
         if not all(isfinite(value) for value in values if isinstance(value, float)):
             raise ValueError("a number is not finite")
-        return dict(zip(self.names, values, strict=True))
+        return dict(zip(map(_name, self.paths), values, strict=True))
 
 
 @dataclass(frozen=True)
 class _Array:
-    """One array field; `None` in the shape is a length that the message chooses, up to MAX_KEYPOINTS."""
+    """One array field; `None` in the shape is a length that the message chooses, up to `most`. One that is
+    optional and not there has the shape (0,)."""
 
     path: str
     dtype: str
     shape: tuple[int | None, ...]
+    optional: bool = False
+    most: int = MAX_KEYPOINTS
 
     def get(self, message: object) -> NDArray[Any]:
-        return np.ascontiguousarray(attrgetter(self.path)(message), _DTYPES[self.dtype])
+        value = attrgetter(self.path)(message)
+        absent = self.optional and value is None
+        return np.ascontiguousarray(() if absent else value, _DTYPES[self.dtype])
 
-    def decode(self, dtype: str, shape: tuple[int, ...], frame: Bytes) -> NDArray[Any]:
+    def decode(self, dtype: str, shape: tuple[int, ...], frame: Bytes) -> NDArray[Any] | None:
         if dtype not in _DTYPES:
             raise ValueError(f"{self.path}: unknown dtype '{dtype[:8]}'")
         if dtype != self.dtype or not self._admits(shape):
@@ -98,15 +104,21 @@ class _Array:
         if data.nbytes != size:
             raise ValueError(f"{self.path}: {data.nbytes} bytes, its shape needs {size}")
         if not size:
-            return np.empty(shape, _DTYPES[dtype])
+            return None if self._is_absent(shape) else np.empty(shape, _DTYPES[dtype])
         # a short frame lies unaligned in its message: only then is it copied
         return np.require(np.frombuffer(data, _DTYPES[dtype]).reshape(shape), requirements="A")
 
     def _admits(self, shape: tuple[int, ...]) -> bool:
-        return len(shape) == len(self.shape) and all(
-            0 <= have <= MAX_KEYPOINTS if want is None else have == want
-            for want, have in zip(self.shape, shape, strict=True)
+        return self._is_absent(shape) or (
+            len(shape) == len(self.shape)
+            and all(
+                0 <= have <= self.most if want is None else have == want
+                for want, have in zip(self.shape, shape, strict=True)
+            )
         )
+
+    def _is_absent(self, shape: tuple[int, ...]) -> bool:
+        return self.optional and shape == (0,)
 
 
 @dataclass(frozen=True)
@@ -119,20 +131,39 @@ class _Layout:
     arrays: tuple[_Array, ...] = ()
 
 
-def _pose(path: str) -> _Array:
-    return _Array(path, "<f8", (4, 4))
+def _name(path: str) -> str:
+    return path.rpartition(".")[2]
+
+
+def _pose(path: str, optional: bool = False) -> _Array:
+    return _Array(path, "<f8", (4, 4), optional)
+
+
+def _hello(*, name: str, kind: AgentKind, run_id: int, streams: bool, **rig: Any) -> m.Hello:
+    return m.Hello(name, kind, run_id, Rig(**rig), streams)
 
 
 def _keyframe(*, uv: Any, points: Any, descriptors: Any, **fields: Any) -> Keyframe:
     return Keyframe(**fields, view=View(uv, points, descriptors))
 
 
+_RIG: dict[str, Any] = {  # as maps by the names of their fields, checked by their own types
+    "rig.cam0": Camera,
+    "rig.cam1": Camera | None,
+    "rig.depth": Camera | None,
+    "rig.imu": ImuNoise | None,
+    "rig.timeshift_s": float,
+}
 _LAYOUTS: dict[type, _Layout] = {
     m.Hello: _Layout(
         1,
-        m.Hello,
-        _Scalars.of(name=Name, kind=AgentKind, run_id=Int64, focal=float),
-        (_pose("T_body_cam0"),),
+        _hello,
+        _Scalars.of(name=Name, kind=AgentKind, run_id=Int64, streams=bool, **_RIG),
+        (
+            _pose("rig.T_body_cam0"),
+            _pose("rig.T_cam1_cam0", optional=True),
+            _pose("rig.T_depth_cam0", optional=True),
+        ),
     ),
     m.PoseUpdate: _Layout(
         2,
@@ -233,12 +264,12 @@ def _check_version(version: int) -> None:
         raise ValueError(f"peer speaks version {version}, this is {VERSION}; update the older one")
 
 
-def _arrays(layout: _Layout, header: _Header, frames: Sequence[Bytes]) -> dict[str, NDArray[Any]]:
+def _arrays(layout: _Layout, header: _Header, frames: Sequence[Bytes]) -> dict[str, NDArray[Any] | None]:
     if not len(header.arrays) == len(layout.arrays) == len(frames) - 1:
         raise ValueError(
             f"{len(frames) - 1} array frames, {len(header.arrays)} declared, {len(layout.arrays)} expected"
         )
     return {
-        spec.path.rpartition(".")[2]: spec.decode(dtype, shape, frame)
+        _name(spec.path): spec.decode(dtype, shape, frame)
         for spec, (dtype, shape), frame in zip(layout.arrays, header.arrays, frames[1:], strict=True)
     }

@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from share.geometry.camera import Camera, Rig
 from share.types import F64, AgentKind, Correction, Keyframe, TrackState, checked_pose
 
 MAX_RATE_HZ = 1000.0
 MAX_HELD = 256  # ids in one Ack: the most keyframes that may wait at the edge for a gap to close
 MAX_TEXT = 512  # characters of anything a person reads
+MAX_SIDE = 8192  # px, of an image
 PEER_BYTES = 8
 
 
@@ -27,25 +29,33 @@ def _check_ids(*ids: int) -> None:
         raise ValueError(f"keyframe ids: {min(ids)} is negative")
 
 
+def _check_camera(camera: Camera) -> None:
+    if not 1.0 <= min(camera.fx, camera.fy) <= max(camera.fx, camera.fy) <= 1e5:
+        raise ValueError(f"focal: {camera.fx}, {camera.fy} px are outside 1 .. 1e5")
+    if max(camera.width, camera.height) > MAX_SIDE:
+        raise ValueError(f"image: {camera.width}x{camera.height} px is more than {MAX_SIDE} a side")
+
+
 # ---------------------------------------------------------------- up: agent -> edge
 
 
 @dataclass(frozen=True, eq=False)
 class Hello:
-    """First message of a run, repeated until welcomed. T_body_cam0 (4, 4), focal of cam0 in px."""
+    """First message of a run, repeated until welcomed. rig: the agent's calibration, by which the edge knows
+    what it sees. streams: it does not track itself but sends what its sensors see."""
 
     name: str
     kind: AgentKind
     run_id: int
-    focal: float
-    T_body_cam0: F64
+    rig: Rig
+    streams: bool = False
 
     def __post_init__(self) -> None:
         if not (0 < len(self.name) <= 64 and self.name.isprintable() and "/" not in self.name):
             raise ValueError("name: 1 to 64 printable characters without '/'")
-        if not 1.0 <= self.focal <= 1e5:
-            raise ValueError(f"focal: {self.focal} px is outside 1 .. 1e5")
-        object.__setattr__(self, "T_body_cam0", checked_pose("T_body_cam0", self.T_body_cam0))
+        for camera in (self.rig.cam0, self.rig.cam1, self.rig.depth):
+            if camera is not None:
+                _check_camera(camera)
 
 
 @dataclass(frozen=True, eq=False)

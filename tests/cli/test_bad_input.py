@@ -647,4 +647,4 @@ def test_a_frustum_that_is_none_ends_the_edge_before_it_begins(tmp_path: Path) -
     command = [*SHARE, "edge", "--bind", "tcp://127.0.0.1:0", "--policy", "share", "--config", str(config)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert done.stderr == "share: control: frustum: from 5.0 to 1.0 m is no depth\n"
+    assert done.stderr == f"share: {config}: control: near_m: 5.0 m is not nearer than far_m, 1.0 m\n"

@@ -8,14 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from share.config import ControlConfig
-from share.control.overlap import Frustum, Overlap
+from share.control.overlap import Frustum, Seen, ious, volumes
 from share.errors import ConfigError
+from share.geometry.camera import Camera
 from share.geometry.se3 import exp, transform
+from share.strict import from_mapping
 from share.types import F64
 
 WIDE = Frustum(math.radians(87), math.radians(58), 0.3, 5.0)
-USUAL = Overlap.of(ControlConfig())
-FINE = Overlap(WIDE, 0.12)
+NARROW = Frustum(math.radians(50), math.radians(40), 0.5, 3.0)
+USUAL, OTHER = Seen(WIDE, 0.5), Seen(NARROW, 0.5)
+FINE, OTHER_FINE = Seen(WIDE, 0.12), Seen(NARROW, 0.12)
 seeds = st.integers(0, 10_000)
 
 
@@ -29,6 +32,12 @@ def shifted(x: float = 0, y: float = 0, z: float = 0) -> F64:
     return exp(np.array([0, 0, 0, x, y, z], dtype=float))
 
 
+def test_a_frustum_follows_from_a_calibration() -> None:
+    frustum = Frustum.of(Camera(640, 480, 320.0, 240.0, 319.5, 239.5), 0.3, 5.0)
+    assert frustum.slopes == (pytest.approx(1.0), pytest.approx(1.0))
+    assert Frustum.of(Camera(8192, 480, 1.0, 240.0, 0, 0), 0.3, 5.0).horizontal_rad < math.pi
+
+
 def test_volume_by_hand() -> None:
     half = math.pi / 2  # 1 to 4 m, 90 degrees each way: 4/3 (64 - 1) = 84
     assert Frustum(half, half, 1, 4).volume == pytest.approx(84, abs=1e-12)
@@ -36,8 +45,8 @@ def test_volume_by_hand() -> None:
 
 def test_a_view_overlaps_itself_wholly() -> None:
     for T in poses(0, 20):
-        assert USUAL.iou(T, T[None])[0] == 1
-        assert USUAL.volumes(T, T[None])[0] == WIDE.volume
+        assert ious(USUAL, T, USUAL, T[None])[0] == 1
+        assert volumes(USUAL, T, USUAL, T[None])[0] == WIDE.volume
 
 
 @pytest.mark.parametrize("step", [0.25, 1.0, 2.2, 4.0, 4.7, 5.5])
@@ -45,10 +54,11 @@ def test_a_step_forward_is_as_worked_out(step: float) -> None:
     """Of the rear frustum there remains what is within the front one, from its near end on."""
     sx, sy = WIDE.slopes
     expected = 4 / 3 * sx * sy * max(0.0, (WIDE.far_m - step) ** 3 - WIDE.near_m**3)
-    got = FINE.volumes(np.eye(4), shifted(z=step)[None])[0]
+    got = volumes(FINE, np.eye(4), FINE, shifted(z=step)[None])[0]
     assert got == pytest.approx(expected, abs=0.015 * WIDE.volume)
     assert (
-        FINE.volumes(np.eye(4), shifted(z=step)[None])[0] == FINE.volumes(shifted(z=step), np.eye(4)[None])[0]
+        volumes(FINE, np.eye(4), FINE, shifted(z=step)[None])[0]
+        == volumes(FINE, shifted(z=step), FINE, np.eye(4)[None])[0]
     )
 
 
@@ -57,15 +67,17 @@ def test_a_step_aside_is_as_worked_out() -> None:
     sx, sy = WIDE.slopes
     depth = np.linspace(WIDE.near_m, WIDE.far_m, 20_001)
     expected = np.trapezoid(np.maximum(0, 2 * sx * depth - 1.5) * 2 * sy * depth, depth)
-    assert FINE.volumes(np.eye(4), shifted(x=1.5)[None])[0] == pytest.approx(expected, abs=0.01 * WIDE.volume)
+    assert volumes(FINE, np.eye(4), FINE, shifted(x=1.5)[None])[0] == pytest.approx(
+        expected, abs=0.01 * WIDE.volume
+    )
 
 
 def test_who_look_away_from_each_other_share_nothing() -> None:
     back = exp(np.array([0, math.pi, 0, 0, 0, 0]))
     others = np.array([back, shifted(z=50), shifted(x=20)])
-    assert USUAL.volumes(np.eye(4), others).tolist() == [0, 0, 0]
-    assert USUAL.iou(np.eye(4), others).tolist() == [0, 0, 0]
-    assert USUAL.volumes(np.eye(4), np.zeros((0, 4, 4))).shape == (0,)
+    assert volumes(USUAL, np.eye(4), USUAL, others).tolist() == [0, 0, 0]
+    assert ious(USUAL, np.eye(4), USUAL, others).tolist() == [0, 0, 0]
+    assert volumes(USUAL, np.eye(4), USUAL, np.zeros((0, 4, 4))).shape == (0,)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -84,36 +96,39 @@ def test_small_frusta_against_chance(seed: int) -> None:
         for p in (points, transform(np.linalg.inv(T_a_b), points))
     )
     expected = (in_a & in_b).mean() * 4 * top[0] * top[1] * 0.4
-    got = Overlap(frustum, 0.01).volumes(np.eye(4), T_a_b[None])[0]
+    one = Seen(frustum, 0.01)
+    got = volumes(one, np.eye(4), one, T_a_b[None])[0]
     assert got == pytest.approx(expected, abs=0.01 * frustum.volume)
 
 
 @given(seeds)
 def test_symmetric_and_between_nothing_and_all(seed: int) -> None:
     a, b = poses(seed, 2)
-    assert USUAL.volumes(a, b[None])[0] == USUAL.volumes(b, a[None])[0]
-    assert 0 <= USUAL.iou(a, b[None])[0] <= 1
-    assert 0 <= USUAL.volumes(a, b[None])[0] <= WIDE.volume * (1 + 1e-12)
+    assert volumes(USUAL, a, USUAL, b[None])[0] == volumes(USUAL, b, USUAL, a[None])[0]
+    assert 0 <= ious(USUAL, a, USUAL, b[None])[0] <= 1
+    assert 0 <= volumes(USUAL, a, USUAL, b[None])[0] <= WIDE.volume * (1 + 1e-12)
 
 
 @given(seeds)
 def test_where_the_world_begins_does_not_matter(seed: int) -> None:
     a, b, moved = poses(seed, 3, 10.0)
-    assert USUAL.iou(moved @ a, (moved @ b)[None])[0] == pytest.approx(USUAL.iou(a, b[None])[0], abs=1e-3)
+    assert ious(USUAL, moved @ a, USUAL, (moved @ b)[None])[0] == pytest.approx(
+        ious(USUAL, a, USUAL, b[None])[0], abs=1e-3
+    )
 
 
 @given(seeds)
 @settings(max_examples=30)
 def test_many_at_once_are_each_as_alone(seed: int) -> None:
     a, *others = poses(seed, 8, 12.0)
-    together = USUAL.volumes(a, np.array(others))
-    assert together.tolist() == [USUAL.volumes(a, other[None])[0] for other in others]
+    together = volumes(USUAL, a, USUAL, np.array(others))
+    assert together.tolist() == [volumes(USUAL, a, USUAL, other[None])[0] for other in others]
 
 
 def test_the_usual_grid_is_as_exact_as_documented() -> None:
     views = poses(5, 80)
     wrong = [
-        USUAL.iou(a, b[None])[0] - FINE.iou(a, b[None])[0]
+        ious(USUAL, a, USUAL, b[None])[0] - ious(FINE, a, FINE, b[None])[0]
         for a, b in zip(views[::2], views[1::2], strict=True)
     ]
     assert np.sqrt(np.mean(np.square(wrong))) < 0.01
@@ -129,16 +144,53 @@ def test_sphere_holds_all_corners(frustum: Frustum) -> None:
     assert max(far) == pytest.approx(radius)
 
 
+@given(seeds)
+def test_two_sorts_of_cameras(seed: int) -> None:
+    """Symmetric, within the smaller, and of many at once each as alone."""
+    a, *others = poses(seed, 6, 6.0)
+    together = volumes(USUAL, a, OTHER, np.array(others))
+    assert together.tolist() == [volumes(OTHER, b, USUAL, a[None])[0] for b in others]
+    assert (together <= NARROW.volume * 1.1).all()
+    union = WIDE.volume + NARROW.volume - together
+    assert ious(USUAL, a, OTHER, np.array(others)).tolist() == (together / union).tolist()
+
+
+def test_two_sorts_of_cameras_against_finer_points() -> None:
+    views = poses(7, 160, 2.0)
+    pairs = list(zip(views[::2], views[1::2], strict=True))
+    rough = np.array([volumes(USUAL, a, OTHER, b[None])[0] for a, b in pairs])
+    fine = np.array([volumes(FINE, a, OTHER_FINE, b[None])[0] for a, b in pairs])
+    assert (fine > 1).sum() >= 10
+    assert np.abs(rough - fine).max() < 0.1 * NARROW.volume
+
+
+def test_one_view_within_the_other() -> None:
+    """Looking the same way from the same place, the narrow one sees nothing that the wide one does not."""
+    got = volumes(FINE, np.eye(4), OTHER_FINE, np.eye(4)[None])[0]
+    assert got == pytest.approx(NARROW.volume, rel=0.02)
+
+
+@pytest.mark.parametrize("interval_m", [1e-3, 50.0])
+@pytest.mark.parametrize("frustum", [Frustum(3.0, 3.0, 0, 1), Frustum(0.01, 3.0, 0.3, 5)])
+def test_whatever_the_interval_there_are_some_points_and_not_too_many(
+    frustum: Frustum, interval_m: float
+) -> None:
+    assert 9 <= Seen(frustum, interval_m).points.shape[1] <= 2_048_000
+
+
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
-        ({"interval_m": 0.0}, "0.0 m apart are too many"),
-        ({"interval_m": 1e-3}, "0.001 m apart are too many"),
-        ({"interval_m": 50.0}, "50.0 m apart miss the frustum"),
-        ({"horizontal_deg": 180.0}, "between 0 and pi"),
-        ({"near_m": 6.0}, "from 6.0 to 5.0 m is no depth"),
+        ({"interval_m": 0.0}, "interval_m: 0.0 must be positive"),
+        ({"near_m": 6.0}, "near_m: 6.0 m is not nearer than far_m, 5.0 m"),
     ],
 )
-def test_what_is_no_frustum_or_no_grid_is_refused(setting: dict[str, float], said: str) -> None:
+def test_settings_that_are_no_frustum_are_refused(setting: dict[str, float], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
-        Overlap.of(ControlConfig(**setting))  # type: ignore[arg-type]
+        from_mapping(ControlConfig, setting, "control")
+
+
+@pytest.mark.parametrize("frustum", [(0.0, 1.0, 0.3, 5.0), (1.0, math.pi, 0.3, 5.0), (1.0, 1.0, 5.0, 5.0)])
+def test_what_is_no_frustum_is_refused(frustum: tuple[float, float, float, float]) -> None:
+    with pytest.raises(ValueError, match="frustum: "):
+        Frustum(*frustum)

@@ -24,7 +24,8 @@ class Miscalibrated(Person):
     @property
     def hello(self) -> Hello:
         T_body_cam0 = se3.compose(se3.so3_exp(np.array(self.tilt)), np.zeros(3))
-        return replace(super().hello, T_body_cam0=T_body_cam0)
+        hello = super().hello
+        return replace(hello, rig=replace(hello.rig, T_body_cam0=T_body_cam0))
 
     def step(self) -> tuple[F64, View]:
         T, view = super().step()

@@ -8,12 +8,13 @@ from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from hellos import hello_of
 
 from share.core import events as ev
 from share.core.agent import Agent
 from share.core.inorder import InOrder
 from share.geometry import se3
-from share.types import AgentKind, Candidate, Correction, Keyframe, TrackState, View
+from share.types import Candidate, Correction, Keyframe, TrackState, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 
@@ -22,7 +23,7 @@ MS = 1_000_000
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32)))
 UP = np.array([0, 0, 1.0])
 COV = np.eye(6) * 1e-6
-HELLO = m.Hello("ann", AgentKind.AR, 5, 460.0, np.eye(4))
+HELLO = hello_of("ann", 5, focal=460.0)
 
 
 def tracked(

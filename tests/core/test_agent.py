@@ -16,7 +16,7 @@ from share.errors import UsageError
 from share.geometry import se3
 from share.types import Correction, Keyframe, TrackState, View
 from share.wire import messages as m
-from share.wire.codec import decode, encode
+from share.wire.codec import VERSION, decode, encode
 
 T = TypeVar("T")
 SESSION = 77
@@ -121,10 +121,10 @@ def test_bad_messages_are_counted_and_said_once_a_kind() -> None:
 
 def test_another_wire_version_is_said_in_words() -> None:
     agent = Agent(HELLO, Config())
-    newer = b"\x94\x03\x01\x90\x90"
+    newer = b"\x94\x09\x01\x90\x90"
     assert said(handle(agent, ev.Received([newer]), 0)) == [
         "a message from the edge is not understood: "
-        "header: peer speaks version 3, this is 2; update the older one"
+        f"header: peer speaks version 9, this is {VERSION}; update the older one"
     ]
 
 

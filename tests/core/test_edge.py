@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from edge_sim import MS, ModelRun, Person, Town, walls
+from hellos import hello_of
 
 from share.config import AgentNeeds, Config, ControlConfig, EdgeConfig, GraphConfig
 from share.core import edge as ed
@@ -18,7 +19,6 @@ from share.core.steps import Query, Solve, Verify
 from share.geometry import se3
 from share.graph.solver import Solver
 from share.place.verify import Refusal, Verified
-from share.types import AgentKind
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 
@@ -153,7 +153,7 @@ def test_who_was_away_is_told_what_was_missed():
 
 
 def hello(name: str = "ann", run_id: int = 1) -> m.Hello:
-    return m.Hello(name, AgentKind.AR, run_id, 400.0, np.eye(4))
+    return hello_of(name, run_id)
 
 
 def tell(edge: ed.Edge, run_id: int, message: m.Message, now_ms: float = 0) -> list[ed.Effect]:
@@ -168,6 +168,13 @@ def test_a_name_in_use_is_refused_until_its_holder_is_silent():
     assert "in use" in sent(refused, m.Refused)[0].reason
     assert sent(tell(edge, 1, hello(), 200), m.Welcome)  # the holder itself is welcome again
     assert sent(tell(edge, 2, hello(run_id=2), 200 + 3100), m.Welcome)
+
+
+def test_who_streams_is_refused_by_an_edge_that_does_not_track():
+    edge = ed.Edge(Config(), 7)
+    effects = tell(edge, 1, replace(hello(), streams=True))
+    assert sent(effects, m.Refused)[0].reason == "this edge tracks nobody: the agent has to track itself"
+    assert not sent(effects, m.Welcome)
 
 
 def test_a_name_is_free_at_once_after_goodbye():

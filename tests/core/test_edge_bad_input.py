@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from edge_sim import Person, Town, walls
+from hellos import hello_of
 
 from share.config import Config, EdgeConfig
 from share.core import edge as ed
@@ -17,13 +18,13 @@ from share.core.peer import Known
 from share.core.steps import Query
 from share.errors import WireError
 from share.geometry import se3
-from share.types import AgentKind, Keyframe, View
+from share.types import Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
 AHEAD = se3.compose(np.eye(3), np.array([0.1, 0.0, 0.0]))
-HELLO = m.Hello("ann", AgentKind.AR, 0xA000B, 400.0, np.eye(4))
+HELLO = hello_of("ann", 0xA000B)
 
 
 def keyframe(id: int, cov: np.ndarray | None = None, view: View = EMPTY) -> Keyframe:

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
+from hellos import hello_of
 
 from share.config import Config
 from share.core import edge as ed
 from share.core.keeping import KeepKeyframe, KeepRun
 from share.core.peer import Foot, Known
 from share.geometry import se3
-from share.types import AgentKind, Keyframe, View
+from share.types import Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 
 MS = 1_000_000
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
-HELLO = m.Hello("ann", AgentKind.AR, 11, 400.0, np.eye(4))
+HELLO = hello_of("ann", 11)
 
 
 def keyframe(id: int, reference: int, forward_m: float = 0.2, stamp_ms: int | None = None) -> Keyframe:
@@ -113,7 +114,7 @@ def test_a_reference_that_is_not_the_last_is_said_and_left_out() -> None:
 def test_a_runs_number_is_not_shared_by_two_names() -> None:
     edge = ed.Edge(Config(), 7)
     tell(edge, HELLO)
-    effects = tell(edge, m.Hello("eve", AgentKind.AR, 11, 400.0, np.eye(4)))
+    effects = tell(edge, hello_of("eve", 11))
     (refused,) = [decode([bytes(f) for f in e.frames]) for e in of(effects, ed.Send)]
     assert isinstance(refused, m.Refused)
     assert "'ann'" in refused.reason

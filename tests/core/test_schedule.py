@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hellos import hello_of, rig_of
 
 from share.config import Config, ControlConfig, EdgeConfig
 from share.control.policies import POLICIES
@@ -21,7 +22,7 @@ CONTROL = ControlConfig(ar_target=0.8)
 
 def welcomed(policy: str, kind: AgentKind = AgentKind.AR) -> ed.Edge:
     edge = ed.Edge(Config(edge=EdgeConfig(policy=policy), control=CONTROL), session=7)
-    edge.handle(ed.Received(b"a", encode(m.Hello("ann", kind, 5, 400.0, np.eye(4)))), 0)
+    edge.handle(ed.Received(b"a", encode(hello_of("ann", 5, kind))), 0)
     return edge
 
 
@@ -58,16 +59,16 @@ def test_a_new_run_begins_anew() -> None:
     for i in range(20):
         (last,) = rates(edge, 15.0, 0.1, 200 * i)
     edge.handle(ed.Received(b"a", encode(m.Bye())), 4000 * MS)
-    edge.handle(ed.Received(b"b", encode(m.Hello("ann", AgentKind.AR, 6, 400.0, np.eye(4)))), 4001 * MS)
+    edge.handle(ed.Received(b"b", encode(hello_of("ann", 6))), 4001 * MS)
     effects = edge.handle(ed.Received(b"b", encode(m.Evaluation(0, 15.0, 0.1))), 4100 * MS)
     (first,) = [decode([bytes(f) for f in e.frames]).hz for e in effects if isinstance(e, ed.Send)]
     assert first > last
 
 
 def test_what_adds_little_is_skipped_once_there_is_something_to_compare_with() -> None:
-    gating = Gating(CONTROL, "share")
-    same = gating.volume(np.eye(4))
-    away = gating.volume(se3.exp(np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])))
+    gating, rig = Gating(CONTROL, "share"), rig_of()
+    same = gating.volume(rig, rig, np.eye(4))
+    away = gating.volume(rig, rig, se3.exp(np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])))
     assert 0 < away < same
     assert not any(gating.refuses(away, joined=True) for _ in range(50))
     for _ in range(CONTROL.merges):
@@ -78,8 +79,26 @@ def test_what_adds_little_is_skipped_once_there_is_something_to_compare_with() -
     assert not any(gating.refuses(away, joined=False) for _ in range(50))
 
 
+def test_each_is_judged_by_its_own_field_of_view_from_where_its_camera_is() -> None:
+    """One who sees half as far to the side sees a quarter, all of which the other sees too."""
+    gating, wide, narrow = Gating(CONTROL, "share"), rig_of(focal=400.0), rig_of(focal=800.0)
+    whole, part = gating.volume(wide, wide, np.eye(4)), gating.volume(narrow, narrow, np.eye(4))
+    assert part == pytest.approx(whole / 4)
+    assert gating.volume(wide, narrow, np.eye(4)) == pytest.approx(part, rel=0.1)
+    back = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
+    assert gating.volume(wide, rig_of(T_body_cam0=back), np.eye(4)) == 0
+    assert gating.volume(wide, rig_of(T_body_cam0=back), back) == pytest.approx(whole)
+
+
+@pytest.mark.parametrize("focal", [1.0, 1e5])
+def test_a_calibration_that_cannot_be_does_not_stop_the_edge(focal: float) -> None:
+    gating, rig = Gating(CONTROL, "share"), rig_of(focal)
+    assert 0 < gating.volume(rig, rig, np.eye(4)) < 1e5
+
+
 @pytest.mark.parametrize("policy", [name for name, kind in POLICIES.items() if not kind.gated])
 def test_who_gates_nothing_skips_nothing(policy: str) -> None:
     gating = Gating(CONTROL, policy)
     gating.completed(100.0)
+    assert gating.volume(rig_of(), rig_of(), np.eye(4)) == 0
     assert not any(gating.refuses(0.0, joined=True) for _ in range(50))

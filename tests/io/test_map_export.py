@@ -5,6 +5,7 @@ import os
 
 import numpy as np
 import pytest
+from hellos import hello_of
 from map_changes import ANN, BOB, keyframe, loop, pose, run, small_map, solution
 
 from share.core.keeping import KeepLoop, KeepRun, placed
@@ -15,7 +16,6 @@ from share.io.map_store import MapStore
 from share.io.trajectory import read_tum
 from share.merge.join import Key
 from share.types import AgentKind
-from share.wire.messages import Hello
 
 
 def nothing(done):
@@ -56,7 +56,7 @@ def test_one_map(tmp_path):
     assert len(points) == done[f"{ANN}/0"].points == 40 * 40
     assert sum(counted) == 40
     third = keyframe(ANN, 1).keyframe.view.points  # ann 0, bob 0, ann 1
-    expected = se3.transform(pose(7) @ pose(1) @ run(ANN).hello.T_body_cam0, third.astype(float))
+    expected = se3.transform(pose(7) @ pose(1) @ run(ANN).hello.rig.T_body_cam0, third.astype(float))
     assert np.allclose(points[80:120], expected, atol=1e-5)
     assert [tuple(c) for c in colours[[0, 40, 80]]] == [COLOURS[0], COLOURS[1], COLOURS[0]]
     rows = list(csv.DictReader((tmp_path / "out" / "loops.csv").read_text().splitlines()))
@@ -82,7 +82,7 @@ def test_points_of_unknown_depth_are_left_out(tmp_path):
 
 
 def test_several_maps_and_several_runs_of_one_name(tmp_path):
-    again = KeepRun("ann-0003", Hello("ann", AgentKind.ROBOT, 3, 400.0, np.eye(4)))
+    again = KeepRun("ann-0003", hello_of("ann", 3, AgentKind.ROBOT))
     changes = [run(ANN), run(BOB), again]
     changes += [keyframe(key, i) for i in range(3) for key in (ANN, BOB, "ann-0003")]
     kept = kept_of(tmp_path, [*changes, solution([Key(k, i) for k in (ANN, BOB) for i in range(3)])])
@@ -100,7 +100,7 @@ def test_several_maps_and_several_runs_of_one_name(tmp_path):
 
 
 def test_a_name_that_is_another_run_s_key(tmp_path):
-    sly = KeepRun("ann-0001-0009", Hello(ANN, AgentKind.AR, 9, 400.0, np.eye(4)))
+    sly = KeepRun("ann-0001-0009", hello_of(ANN, 9))
     kept = kept_of(tmp_path, [run(ANN), sly])
     assert file_names(kept) == {ANN: "ann", "ann-0001-0009": "ann-0001-0009"}
 

@@ -185,20 +185,22 @@ def schema_said(path, number):
     connection = sqlite3.connect(path, isolation_level=None)
     connection.execute("DELETE FROM about WHERE name = 'schema'")
     insert(connection, "about", ("schema", str(number)))
-    if number == 1:  # made up: loops did not count their inliers
+    if number < schema.SCHEMA:  # made up: loops did not count their inliers
         connection.execute("ALTER TABLE loop RENAME COLUMN inliers TO matches")
     connection.close()
 
 
+OLD = schema.SCHEMA - 1
 STEP = ("ALTER TABLE loop RENAME COLUMN matches TO inliers",)
 
 
 def test_a_newer_schema_is_left_alone(path):
     with MapStore.open(path) as store:
         store.write(small_map())
-    schema_said(path, 3)
+    schema_said(path, schema.SCHEMA + 1)
     before = path.read_bytes()
-    with pytest.raises(UsageError, match=r"newer SHARE \(schema 3, this one knows 2\)"):
+    ours = schema.SCHEMA
+    with pytest.raises(UsageError, match=rf"newer SHARE \(schema {ours + 1}, this one knows {ours}\)"):
         MapStore.open(path)
     assert path.read_bytes() == before
 
@@ -207,17 +209,17 @@ def test_an_older_schema_is_brought_up_to_date_and_kept_beside(path, monkeypatch
     with MapStore.open(path) as store:
         store.write(small_map())
         whole = told(store.load())
-    schema_said(path, 1)
+    schema_said(path, OLD)
     before = path.read_bytes()
-    with pytest.raises(UsageError, match="is of schema 1, from which no way leads to 2"):
+    with pytest.raises(UsageError, match=f"is of schema {OLD}, from which no way leads to {schema.SCHEMA}"):
         MapStore.open(path)
-    monkeypatch.setattr(schema, "STEPS", {1: STEP})
+    monkeypatch.setattr(schema, "STEPS", {OLD: STEP})
     with MapStore.read(path) as reader:
-        assert reader.schema == 1
+        assert reader.schema == OLD
         assert told(reader.load()) == whole
     assert path.read_bytes() == before
     assert told(again(path)) == whole
-    assert path.with_name("room.sqlite.schema-1").read_bytes() == before
+    assert path.with_name(f"room.sqlite.schema-{OLD}").read_bytes() == before
     assert told(again(path)) == whole
     assert [name for name in files(path) if "damaged" in name] == []
 
@@ -225,16 +227,16 @@ def test_an_older_schema_is_brought_up_to_date_and_kept_beside(path, monkeypatch
 def test_a_step_that_fails_leaves_the_old_file(path, monkeypatch):
     with MapStore.open(path) as store:
         store.write(small_map())
-    schema_said(path, 1)
+    schema_said(path, OLD)
     before = path.read_bytes()
-    monkeypatch.setattr(schema, "STEPS", {1: (*STEP, "ALTER TABLE nonsense RENAME TO sense")})
+    monkeypatch.setattr(schema, "STEPS", {OLD: (*STEP, "ALTER TABLE nonsense RENAME TO sense")})
     with pytest.raises(
-        StoreError, match="no such table: nonsense; it is of schema 1: use the SHARE that made it"
+        StoreError, match=f"no such table: nonsense; it is of schema {OLD}: use the SHARE that made it"
     ):
         MapStore.open(path)
-    monkeypatch.setattr(schema, "STEPS", {1: STEP})
+    monkeypatch.setattr(schema, "STEPS", {OLD: STEP})
     assert len(again(path).keyframes) == 40
-    assert path.with_name("room.sqlite.schema-1").read_bytes() == before
+    assert path.with_name(f"room.sqlite.schema-{OLD}").read_bytes() == before
 
 
 # ---------------------------------------------------------------- the disk

@@ -11,8 +11,8 @@ import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import numpy as np
 import pytest
+from hellos import hello_of
 from prometheus_client.parser import text_string_to_metric_families
 
 from share.config import Config
@@ -21,9 +21,8 @@ from share.core.mapper import Mapper
 from share.errors import TransportError, UsageError
 from share.run import status_metrics, web
 from share.run.status import KEPT_S, StatusServer
-from share.types import AgentKind
 from share.wire.codec import encode
-from share.wire.messages import Hello, peer_id
+from share.wire.messages import peer_id
 
 AGENT = {
     "kind": "ar",
@@ -84,7 +83,7 @@ def metrics(body):
 def real_report():
     """Of an edge that knows one agent and nothing more."""
     edge, mapper = Edge(Config(), session=5), Mapper(Config())
-    hello = Hello("ann", AgentKind.AR, 1, 400.0, np.eye(4))
+    hello = hello_of("ann", 1)
     for effect in edge.handle(Received(peer_id(1), encode(hello)), 10**9):
         if isinstance(effect, Join):
             mapper.join(effect.key, effect.hello)

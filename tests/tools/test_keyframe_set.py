@@ -58,8 +58,8 @@ def test_views_and_truth_are_the_recordings(made, recipe, tmp_path):
         truth, frames = source.truth(), frames_of(source, Config(), SequencerCounters())
         recorded = {frame.stamp_ns: frame for frame in frames}
         assert (agent.hello.name, agent.hello.kind) == (name, kind)
-        assert agent.hello.focal == source.rig.cam0.focal
-        assert np.allclose(agent.hello.T_body_cam0, source.rig.T_body_cam0, atol=1e-9)
+        assert agent.hello.rig.cam0.focal == source.rig.cam0.focal
+        assert np.allclose(agent.hello.rig.T_body_cam0, source.rig.T_body_cam0, atol=1e-9)
         assert len(agent.keyframes) == len(agent.T_world_body) == len(agent.T_odom_body) >= 3
         for keyframe, T in zip(agent.keyframes, agent.T_world_body, strict=True):
             view = make_view(recorded[keyframe.stamp_ns], source.rig)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import tracemalloc
 from collections import Counter
 
@@ -14,11 +15,15 @@ from hypothesis import strategies as st
 from wire_strategies import messages
 
 from share.errors import WireError
+from share.geometry.camera import Camera, ImuNoise, Rig
 from share.types import AgentKind, Correction, Keyframe, TrackState, View
 from share.wire import codec
 from share.wire import messages as m
 
 POSE = np.eye(4)
+V = codec.VERSION
+CAMERA = Camera(752, 480, 458.0, 457.0, 367.0, 248.0, (-0.28, 0.07, 2e-4, 1.8e-5))
+STEREO = Rig(CAMERA, POSE, CAMERA, POSE, imu=ImuNoise(1.7e-4, 2e-3, 2e-5, 3e-3, 200.0), timeshift_s=0.01)
 EVERY_CLASS = {*m.Up.__args__, *m.Down.__args__}
 
 
@@ -31,7 +36,7 @@ def keyframe(n: int, id_: int = 7) -> Keyframe:
 
 
 EXAMPLES: list[m.Message] = [
-    m.Hello("ann", AgentKind.AR, 2**62, 460.0, POSE),
+    m.Hello("ann", AgentKind.AR, 2**62, STEREO),
     m.PoseUpdate(1_700_000_000_123_456_789, TrackState.INERTIAL_ONLY, 2**31, POSE),
     keyframe(5),
     m.Evaluation(3, 12.5, None),
@@ -114,17 +119,18 @@ def test_what_could_not_be_decoded_is_not_encoded(message: m.Message) -> None:
         codec.encode(message)
 
 
-def header(version: object = 2, code: object = 5, scalars: object = (1, 2), arrays: object = ()) -> bytes:
+def header(version: object = V, code: object = 5, scalars: object = (1, 2), arrays: object = ()) -> bytes:
     return msgspec.msgpack.encode((version, code, scalars, arrays))
 
 
 T_FRAMES = [b"\0" * 128]
+OURS = bytes([0x94, V])  # how a header begins
 POSE_SCALARS = (1, "OK", -1)
 BAD = {
     "empty message": [],
     "header of 4097 bytes": [b"\0" * 4097],
     "header: ": [b""],
-    "peer speaks version 3, this is 2; update the older one": [header(version=3)],
+    "peer speaks version 2, this is 3; update the older one": [header(version=2)],
     "peer speaks version 9": [msgspec.msgpack.encode((9, "some", {"other": "layout"}))],
     "unknown message type 99": [header(code=99)],
     "Ping: Expected `int`": [header(scalars=("a", 2))],
@@ -132,21 +138,21 @@ BAD = {
     "Rate: a number is not finite": [header(code=20, scalars=(float("nan"),))],
     "Rate: rate: -1.0": [header(code=20, scalars=(-1.0,))],
     "Ping: 1 array frames, 0 declared, 0 expected": [header(), b""],
-    "PoseUpdate: 0 array frames, 1 declared": [header(2, 2, POSE_SCALARS, [("<f8", (4, 4))])],
-    "unknown dtype '|O'": [header(2, 2, POSE_SCALARS, [("|O", (4, 4))]), *T_FRAMES],
-    "T_keyframe_body: <f4 of shape": [header(2, 2, POSE_SCALARS, [("<f4", (4, 4))]), *T_FRAMES],
-    "T_keyframe_body: <f8 of shape (2, 8)": [header(2, 2, POSE_SCALARS, [("<f8", (2, 8))]), *T_FRAMES],
-    "T_keyframe_body: 127 bytes": [header(2, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\0" * 127],
-    "is not a rigid transform": [header(2, 2, POSE_SCALARS, [("<f8", (4, 4))]), *T_FRAMES],
-    "not finite": [header(2, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\xff" * 128],
-    "Invalid enum value 'LOSTER'": [header(2, 2, (1, "LOSTER", -1), [("<f8", (4, 4))]), *T_FRAMES],
-    "follows: 9": [header(2, 3, (7, -1, 0, 9, 0.0), codec_table := [
+    "PoseUpdate: 0 array frames, 1 declared": [header(V, 2, POSE_SCALARS, [("<f8", (4, 4))])],
+    "unknown dtype '|O'": [header(V, 2, POSE_SCALARS, [("|O", (4, 4))]), *T_FRAMES],
+    "T_keyframe_body: <f4 of shape": [header(V, 2, POSE_SCALARS, [("<f4", (4, 4))]), *T_FRAMES],
+    "T_keyframe_body: <f8 of shape (2, 8)": [header(V, 2, POSE_SCALARS, [("<f8", (2, 8))]), *T_FRAMES],
+    "T_keyframe_body: 127 bytes": [header(V, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\0" * 127],
+    "is not a rigid transform": [header(V, 2, POSE_SCALARS, [("<f8", (4, 4))]), *T_FRAMES],
+    "not finite": [header(V, 2, POSE_SCALARS, [("<f8", (4, 4))]), b"\xff" * 128],
+    "Invalid enum value 'LOSTER'": [header(V, 2, (1, "LOSTER", -1), [("<f8", (4, 4))]), *T_FRAMES],
+    "follows: 9": [header(V, 3, (7, -1, 0, 9, 0.0), codec_table := [
         ("<f8", (4, 4)), ("<f8", (6, 6)), ("<f8", (4, 4)), ("<f8", (3,)),
         ("<f4", (0, 2)), ("<f4", (0, 3)), ("|u1", (0, 32))]),
         POSE.tobytes(), np.eye(6).tobytes(), POSE.tobytes(), b"\0" * 24, b"", b"", b""],
-    "up_sigma: -0.1 is no standard deviation": [header(2, 3, (7, -1, 0, 6, -0.1), codec_table),
+    "up_sigma: -0.1 is no standard deviation": [header(V, 3, (7, -1, 0, 6, -0.1), codec_table),
         POSE.tobytes(), np.eye(6).tobytes(), POSE.tobytes(), b"\0" * 24, b"", b"", b""],
-    "view.uv: <f4 of shape (2001, 2)": [header(2, 3, (7, -1, 0, 6, 0.0), [
+    "view.uv: <f4 of shape (2001, 2)": [header(V, 3, (7, -1, 0, 6, 0.0), [
         *codec_table[:4], ("<f4", (2001, 2)), *codec_table[5:]]),
         POSE.tobytes(), np.eye(6).tobytes(), POSE.tobytes(), b"\0" * 24, b"\0" * 16008, b"", b""],
 }  # fmt: skip
@@ -162,8 +168,8 @@ def test_says_what_is_wrong(says: str) -> None:
 
 def test_a_peer_cannot_write_into_our_log() -> None:
     for text in ("a\nb", "\x1b[2J", "x" * 2000):
-        assert refused([header(1, 2, (1, text, -1), [(text, (4, 4))]), *T_FRAMES])
-        assert refused([header(2, 2, POSE_SCALARS, [(text, (4, 4))]), *T_FRAMES])
+        assert refused([header(V, 2, (1, text, -1), [(text, (4, 4))]), *T_FRAMES])
+        assert refused([header(V, 2, POSE_SCALARS, [(text, (4, 4))]), *T_FRAMES])
 
 
 def test_infinite_points_and_disagreeing_lengths_are_refused() -> None:
@@ -203,7 +209,7 @@ nested = st.recursive(
 
 
 def _message(code: int, scalars: object, table: list, frames: list[bytes]) -> list[bytes]:
-    return [header(1, min(max(code, -(2**63)), 2**64 - 1), scalars, table), *frames]
+    return [header(V, min(max(code, -(2**63)), 2**64 - 1), scalars, table), *frames]
 
 
 wrong_content = st.builds(
@@ -298,14 +304,14 @@ def test_injured_messages_leave_nothing_behind() -> None:
 def test_huge_declarations_allocate_nothing() -> None:
     huge = [
         b"\xdd\xff\xff\xff\xff" + b"\x01" * 100,
-        b"\x94\x01\x05\xdd\xff\xff\xff\xff\x01",
-        b"\x94\x01\x05\x90\xdd\xff\xff\xff\xff\x01",
-        b"\x94\x01\x12\x92\x01\xdd\xff\xff\xff\xff\x01\x90",
-        b"\x94\x01\x11\x91\xdb\xff\xff\xff\xff\x90",
-        b"\x94\x01\x05" + b"\x91" * 4000,
+        OURS + b"\x05\xdd\xff\xff\xff\xff\x01",
+        OURS + b"\x05\x90\xdd\xff\xff\xff\xff\x01",
+        OURS + b"\x12\x92\x01\xdd\xff\xff\xff\xff\x01\x90",
+        OURS + b"\x11\x91\xdb\xff\xff\xff\xff\x90",
+        OURS + b"\x05" + b"\x91" * 4000,
         b"\x91" * 4096,
-        header(1, 3, (1, 0, 0, 0), [("|u1", (2**40, 2**40))] * 6),
-        header(1, 3, (1, 0, 0, 0), [("|u1", (2000, 32))] * 400),
+        header(V, 3, (1, 0, 0, 0), [("|u1", (2**40, 2**40))] * 6),
+        header(V, 3, (1, 0, 0, 0), [("|u1", (2000, 32))] * 400),
     ]
     tracemalloc.start()
     try:
@@ -316,6 +322,33 @@ def test_huge_declarations_allocate_nothing() -> None:
             assert tracemalloc.get_traced_memory()[1] - before < 256 * 1024
     finally:
         tracemalloc.stop()
+
+
+def test_a_rig_that_is_none_is_refused() -> None:
+    frames = copied(codec.encode(EXAMPLES[0]))
+    version, code, scalars, table = msgspec.msgpack.decode(frames[0])
+    for wrong, said in (
+        ({**scalars[4], "fx": 0.5}, "focal: 0.5, 457.0 px are outside 1 .. 1e5"),
+        ({**scalars[4], "width": 8193}, "image: 8193x480 px is more than 8192 a side"),
+        ({**scalars[4], "fx": float("nan")}, "focal lengths nan"),
+        ({**scalars[4], "height": 0}, "resolution: 752x0 is not positive"),
+        ({"width": 3}, "missing required field"),
+        (None, "Expected `object`"),
+    ):
+        spoiled = [*scalars[:4], wrong, *scalars[5:]]
+        with pytest.raises(WireError, match=re.escape(said)):
+            codec.decode([header(version, code, spoiled, table), *frames[1:]])
+    loud = [*scalars[:7], {**scalars[7], "gyro_walk": float("inf")}, *scalars[8:]]
+    with pytest.raises(WireError, match="noise or a rate"):
+        codec.decode([header(version, code, loud, table), *frames[1:]])
+
+
+def test_a_second_camera_stands_somewhere() -> None:
+    frames = copied(codec.encode(EXAMPLES[0]))
+    version, code, scalars, table = msgspec.msgpack.decode(frames[0])
+    table[1] = ("<f8", (0,))
+    with pytest.raises(WireError, match="cam1: needs its extrinsics"):
+        codec.decode([header(version, code, scalars, table), frames[1], b"", frames[3]])
 
 
 @pytest.mark.parametrize("bad", [-np.eye(6), np.triu(np.ones((6, 6))), 1e300 * np.eye(6)])

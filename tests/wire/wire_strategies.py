@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from share.geometry import se3
+from share.geometry.camera import MOST_TIMESHIFT_S, Camera, ImuNoise, Rig
 from share.types import AgentKind, Correction, Keyframe, TrackState, View
 from share.wire import messages as m
 
@@ -47,9 +48,22 @@ def keyframes(draw: st.DrawFn) -> Keyframe:
     )
 
 
+focals, sides = st.floats(1, 1e5), st.integers(1, m.MAX_SIDE)
+distortions = st.sampled_from([0, 4, 5]).flatmap(lambda n: st.tuples(*[finite] * n))
+cameras = st.builds(Camera, sides, sides, focals, focals, finite, finite, distortions)
 amount = st.floats(0, 1e9)
+imus = st.builds(ImuNoise, amount, amount, amount, amount, amount)
+
+
+@st.composite
+def rigs(draw: st.DrawFn) -> Rig:
+    cam1, depth = (draw(st.none() | st.tuples(cameras, poses())) or (None, None) for _ in range(2))
+    shift_s = draw(st.floats(-MOST_TIMESHIFT_S, MOST_TIMESHIFT_S))
+    return Rig(draw(cameras), draw(poses()), *cam1, *depth, draw(st.none() | imus), shift_s)
+
+
 messages = st.one_of(
-    st.builds(m.Hello, names, st.sampled_from(AgentKind), int64, st.floats(1, 1e5), poses()),
+    st.builds(m.Hello, names, st.sampled_from(AgentKind), int64, rigs(), st.booleans()),
     st.builds(m.PoseUpdate, int64, st.sampled_from(TrackState), int64, poses()),
     keyframes(),
     st.builds(m.Evaluation, int64, amount, st.none() | amount),

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from share import __version__
 from share.io.map_store.rows import insert, is_whole
 
-SCHEMA = 2
+SCHEMA = 3
 PAGE_BYTES = 8192
 
 TABLES = """
@@ -33,7 +33,7 @@ CREATE TABLE poses(number INTEGER PRIMARY KEY, keys BLOB, T_map_body BLOB, crc I
 STATEMENTS = tuple(TABLES.strip().split(";\n"))
 
 # From each older schema to the next, in SQL. None leads on from schema 1: its keyframes do not say where
-# their agents took themselves to be.
+# their agents took themselves to be; nor from 2: its agents do not say how large their images are.
 STEPS: Mapping[int, tuple[str, ...]] = {}
 
 
