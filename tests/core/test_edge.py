@@ -19,6 +19,7 @@ from share.core.steps import Query, Solve, Verify
 from share.geometry import se3
 from share.graph.solver import Solver
 from share.place.verify import Refusal, Verified
+from share.types import AgentKind
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 
