@@ -12,8 +12,8 @@ from keyframe_types import AgentKeyframes, KeyframeSet, Spacing
 from keyframe_views import views
 
 from share.core.chain import Chain
-from share.emulate.preparation import keep_room, prepare
-from share.emulate.progress import Progress
+from share.emulate.preparation import Prepared, keep_room, prepare
+from share.emulate.progress import Progress, silent
 from share.emulate.recipe import Recipe
 from share.emulate.stage import Actor
 from share.emulate.takes import truth_of
@@ -22,6 +22,7 @@ from share.io.trajectory import Trajectory
 from share.types import F64, I64, Candidate, Keyframe, View
 from share.wire.messages import Hello
 
+_POINTS = 500  # of a view, as a tracker's
 _STREAM = 81  # of random numbers; the emulator has others
 
 
@@ -31,12 +32,30 @@ def make(recipe: Recipe, every: Spacing, workers: int, progress: Progress) -> Ke
     with TemporaryDirectory(prefix="keyframes-") as folder:
         prepared = prepare(recipe, Path(folder) / "room", progress)
         keep_room(prepared, progress)
-        actors = prepared.stage.actors
-        chosen = [_chosen(actor, every) for actor in actors]
+        chosen = [_chosen(actor, every) for actor in prepared.stage.actors]
         seen = views(prepared.stage, [at for at, _ in chosen], recipe.images, workers, progress)
+    return _set(recipe, every, prepared, [truth for _, truth in chosen], seen)
+
+
+def make_unseen(recipe: Recipe, every: Spacing) -> KeyframeSet:
+    """The same but for the views: as many bytes, of nothing; depths drawn from 1 to 8 m, one a view. Takes
+    seconds, and no OpenGL."""
+    rng = np.random.default_rng((recipe.seed, _STREAM))
+    with TemporaryDirectory(prefix="keyframes-") as folder:
+        prepared = prepare(recipe, Path(folder) / "room", silent)
+    truths = [_chosen(actor, every)[1] for actor in prepared.stage.actors]
+    uv = rng.uniform(-0.5, 0.5, (_POINTS, 2)).astype(np.float32)
+    rays, nothing = np.c_[uv, np.ones(len(uv), np.float32)], np.zeros((len(uv), 32), np.uint8)
+    seen = [[View(uv, rays * rng.uniform(1.0, 8.0), nothing) for _ in truth.stamps_ns] for truth in truths]
+    return _set(recipe, every, prepared, truths, seen)
+
+
+def _set(
+    recipe: Recipe, every: Spacing, prepared: Prepared, truths: list[Trajectory], seen: list[list[View]]
+) -> KeyframeSet:
     agents = {
         actor.name: _agent(actor, truth, shown, np.random.default_rng((recipe.seed, _STREAM, k)))
-        for k, (actor, (_, truth), shown) in enumerate(zip(actors, chosen, seen, strict=True))
+        for k, (actor, truth, shown) in enumerate(zip(prepared.stage.actors, truths, seen, strict=True))
     }
     x, y, z = (float(v) for v in prepared.layout.size)
     return KeyframeSet(recipe, every, (x, y, z), agents)

@@ -4,11 +4,22 @@ from __future__ import annotations
 
 from collections import Counter, deque
 
+from share.config import Config
+from share.control.policies import POLICIES
+from share.control.qoe import Needs
 from share.types import AgentKind
+from share.wire.messages import Hello
 
 _FRESH = 4  # so many newest keyframes are looked up before others: who waits too long is answered too late
 _WEIGHT = {AgentKind.AR: 4, AgentKind.ROBOT: 1}  # a robot waits four times as many turns as a headset
 _LATE = 100  # passed over, the newest: those that may still be looked up when nothing else waits
+
+
+def served_as(config: Config, hello: Hello) -> AgentKind:
+    """By its needs, not by what it is; by a policy that takes agents alike, as anybody."""
+    if POLICIES[config.edge.policy].alike:
+        return AgentKind.AR
+    return Needs.of(config.control, hello.kind, hello.name).form
 
 
 class Lookups:

@@ -12,8 +12,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from share.config import Config
-from share.control.policies import POLICIES
-from share.control.qoe import Needs
 from share.core.concern import Concern
 from share.core.finding import Finding, in_map
 from share.core.gating import Gating
@@ -28,7 +26,7 @@ from share.core.keeping import (
     Retire,
     edge_to,
 )
-from share.core.lookups import Lookups
+from share.core.lookups import Lookups, served_as
 from share.core.steps import Look, Query, Solve, Step, Verify
 from share.graph.change import Solution
 from share.merge.atlas import Applied, Atlas, Placed
@@ -38,7 +36,7 @@ from share.merge.thinning import TakenOut
 from share.metrics.latency import summary
 from share.place.index import PlaceIndex
 from share.place.verify import Refusal, Sight, Verified
-from share.types import AgentKind, Keyframe
+from share.types import Keyframe
 from share.wire.messages import Hello
 
 _TIMES = 5000  # of each kind of step that a report is about: the newest
@@ -94,17 +92,10 @@ class Mapper:
         """A keyframe, in order, each once."""
         number = self._atlas.add_keyframe(agent, keyframe)
         self._see(number, agent, keyframe)
-        self._lookups.add(agent, self._served_as(agent), number)
+        self._lookups.add(agent, served_as(self._config, self._hellos[agent]), number)
         findings = [] if keyframe.reference >= 0 else [self._founding(agent)]
         self._thin()
         return findings
-
-    def _served_as(self, agent: str) -> AgentKind:
-        """By its needs, not by what it is; by a policy that takes agents alike, as anybody."""
-        if POLICIES[self._config.edge.policy].alike:
-            return AgentKind.AR
-        hello = self._hellos[agent]
-        return Needs.of(self._config.control, hello.kind, hello.name).form
 
     def restore(self, kept: Kept) -> None:
         """What an earlier life of the edge knew, before anything else comes. The views are gone through when

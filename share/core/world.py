@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -22,13 +23,13 @@ from share.core import events as ev
 from share.core.agent import Agent
 from share.core.channel import Channel, Network
 from share.core.finding import Finding
+from share.core.keeping import Change
 from share.core.mapper import Mapper
-from share.core.steps import Look as LookUp
 from share.graph.solver import Solver
 from share.merge.join import Key
 from share.metrics.runlog import RunLog
 from share.place.verify import Verified
-from share.types import F64, Candidate, TrackState
+from share.types import F64, Candidate, Keyframe, TrackState
 from share.wire.codec import Bytes, size
 from share.wire.messages import Hello, peer_id
 
@@ -76,6 +77,18 @@ class Seen:
     candidate: Candidate | None = None
 
 
+class AnyMapper(Protocol):
+    """`share.core.mapper.Mapper`, or `share.core.modelled.ModelledMapper`."""
+
+    def join(self, agent: str, hello: Hello) -> None: ...
+    def add(self, agent: str, keyframe: Keyframe) -> list[Finding]: ...
+    def next_look(self) -> Any: ...
+    def next_solve(self) -> Any: ...
+    def done(self, step: Any, result: Any, ms: float) -> list[Finding]: ...
+    def take_changes(self) -> tuple[Change, ...]: ...
+    def report(self) -> dict[str, Any]: ...
+
+
 class World:
     """Everybody in one room. agents: what each says of itself and sees. The clock of all is the world's."""
 
@@ -86,10 +99,13 @@ class World:
         network: Network,
         costs: Costs,
         seed: int,
+        mapper: AnyMapper | None = None,
     ) -> None:
+        """mapper: by default a real one."""
         self.now_ns = 0
         self.stamps_ns: dict[Key, int] = {}  # of the keyframes that the mapper has had
         self.logs = {hello.name: RunLog() for hello, _ in agents}
+        self.placed: dict[str, list[ev.Localised]] = {hello.name: [] for hello, _ in agents}  # in a map
         self._costs, self._rng = costs, np.random.default_rng(seed)
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._order = count()
@@ -99,7 +115,8 @@ class World:
             self._members[member.peer] = member
             self._next_look(member)
         self.edge = ed.Edge(config, session=1)
-        self.mapper, self._solver = Mapper(config), Solver(config.graph)
+        self.mapper: AnyMapper = Mapper(config) if mapper is None else mapper
+        self._solver = Solver(config.graph)
         self._inbox: deque[tuple[Cost, Callable[[], list[Finding]]]] = deque()  # the mapper's
         self._is_busy = False  # the mapper's process
         self._in(0, self._tick)
@@ -159,6 +176,8 @@ class World:
             match effect:
                 case ev.Send():
                     self._send_up(member, effect.frames)
+                case ev.Localised() if effect.T_map_odom is not None:
+                    self.placed[member.name].append(effect)
                 case ev.FrameDone():
                     log.add(effect.stamp_ns, effect.track_ms, effect.state, effect.keyframe, effect.sent)
                 case ev.CorrectionApplied():
@@ -216,7 +235,7 @@ class World:
         seen = _result(look.run)
         self._in(spent_ns + self._draw(self._cost_of(look, seen)), lambda: self._looked(look, seen))
 
-    def _looked(self, look: LookUp, seen: object) -> None:
+    def _looked(self, look: Any, seen: object) -> None:
         self._tell_front(self.mapper.done(look, seen, 0.0))
         self._turn()
 
@@ -234,7 +253,7 @@ class World:
                 lambda: self._tell_mapper(self._costs.apply, taken_in),
             )
 
-    def _cost_of(self, look: LookUp, seen: object) -> Cost:
+    def _cost_of(self, look: Any, seen: object) -> Cost:
         if look.kind == "place":
             return self._costs.query
         found, judged = self._costs.accepted, self._costs.judge

@@ -1,0 +1,266 @@
+"""A mapper that knows the truth, in place of one that recognises it: a thousand times as quick.
+
+In virtual time (`share.core.world`) it answers as `share.core.mapper.Mapper` does: whose turn it is, what is
+skipped and what is solved are decided by the same code, but whether two views are verified is drawn by
+how much they overlap, and where a solved map has an agent is the truth and an error that is drawn. What it
+leaves out: views that never match, walls between views, loops that are wrong, and how a map gets better
+with what it knows.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from share.config import Config
+from share.control.overlap import Frustum, Seen, volumes
+from share.core.finding import Finding, in_map
+from share.core.gating import Gating
+from share.core.keeping import Change
+from share.core.lookups import Lookups, served_as
+from share.geometry import se3
+from share.place.verify import Refusal, Verified
+from share.types import F64, Correction, Keyframe
+from share.wire.messages import Hello
+
+_COARSE_M = 1.0  # between the points by which overlap is found here
+_COV = np.diag([1e-5] * 3 + [1e-4] * 3)
+
+
+@dataclass(frozen=True)
+class Odds:
+    """Of recognition, in parts of a view's volume, and of a solved map. Defaults: docs/scheduling.md.
+
+    half, width: two views that share `half` are verified every second time, by a logistic curve `width`
+    wide. blur: error of the overlap by which candidates are ranked; strange: so many of all keyframes look
+    alike by chance. sigma_m: error of a solved pose on each axis, sigma_rad: about the vertical. witnesses:
+    verified pairs of keyframes that join two maps.
+    """
+
+    half: float = 0.5
+    width: float = 0.09
+    blur: float = 0.12
+    strange: float = 0.04
+    sigma_m: float = 0.006
+    sigma_rad: float = 0.001
+    witnesses: int = 2
+
+
+@dataclass(frozen=True)
+class Step:
+    """To be run by whoever keeps the time. candidate: for kind `verify`."""
+
+    kind: str
+    number: int
+    act: Callable[[], object]
+    candidate: int = -1
+
+    def run(self, _solver: object = None) -> object:
+        return self.act()
+
+
+@dataclass
+class _Stored:
+    agent: str
+    keyframe: Keyframe
+    T_world_body: F64
+    seen: Seen
+
+
+@dataclass
+class _Run:
+    """Of one agent. told: the map that it was last corrected into. newest: its last keyframe; answer: its
+    newest one that a loop came from, -1 none."""
+
+    hello: Hello
+    map_of: str = ""
+    told: str = ""
+    newest: int = -1
+    answer: int = -1
+    merges: Counter[str] = field(default_factory=Counter)
+
+
+class ModelledMapper:
+    """where: T_world_body (4, 4) of an agent's body, by its name and the stamp of a keyframe."""
+
+    def __init__(self, config: Config, where: Callable[[str, int], F64], odds: Odds, seed: int) -> None:
+        self._config, self._where, self._odds = config, where, odds
+        self._rng = np.random.default_rng(seed)
+        self._stored: list[_Stored] = []
+        self._T_world_cam: dict[str, list[F64]] = {}  # by agent, as `_numbers`
+        self._numbers: dict[str, list[int]] = {}
+        self._runs: dict[str, _Run] = {}
+        self._T_map_world: dict[str, F64] = {}
+        self._lookups = Lookups(config.edge.max_waiting, config.edge.each_waiting)
+        self._gating = Gating(config.control, config.edge.policy)
+        self._search: tuple[int, deque[int], int] | None = None  # number, candidates, how many are wanted
+        self._looking = self._solving = False
+        self._due: dict[str, None] = {}  # maps
+        self._pairs: dict[frozenset[str], int] = {}  # verified ones between two maps
+        self._seen: dict[str, Seen] = {}
+
+    # ------------------------------------------------------------------ as share.core.mapper.Mapper
+
+    def join(self, agent: str, hello: Hello) -> None:
+        control = self._config.control
+        self._runs[agent] = _Run(hello)
+        self._seen[agent] = Seen(Frustum.of(hello.rig.cam0, control.near_m, control.far_m), _COARSE_M)
+        self._T_world_cam[agent], self._numbers[agent] = [], []
+
+    def add(self, agent: str, keyframe: Keyframe) -> list[Finding]:
+        run, number = self._runs[agent], len(self._stored)
+        T = self._where(run.hello.name, keyframe.stamp_ns)
+        self._stored.append(_Stored(agent, keyframe, T, self._seen[agent]))
+        self._numbers[agent].append(number)
+        self._T_world_cam[agent].append(T @ run.hello.rig.T_body_cam0)
+        run.newest = number
+        self._lookups.add(agent, served_as(self._config, run.hello), number)
+        if keyframe.reference >= 0:
+            return []
+        run.map_of = run.told = f"{agent}/{keyframe.id}"
+        self._T_map_world[run.map_of] = keyframe.T_odom_body @ se3.inverse(T)
+        return [in_map(agent, run.map_of, np.eye(4))]
+
+    def next_look(self) -> Step | None:
+        if self._looking:
+            return None
+        step = self._next_verify()
+        if step is None and (number := self._lookups.next()) is not None:
+            step = Step("place", number, lambda: self._candidates(number))
+        self._looking = step is not None
+        return step
+
+    def next_solve(self) -> Step | None:
+        if self._solving or not self._due:
+            return None
+        name = next(iter(self._due))
+        del self._due[name]
+        self._solving = True
+        answered = {}
+        for agent, run in self._runs.items():
+            if run.map_of == name and run.answer >= 0:
+                answered[agent], run.answer = run.answer, -1
+        return Step("solve", -1, lambda: (name, answered))
+
+    def done(self, step: Any, result: Any, ms: float) -> list[Finding]:
+        if isinstance(result, Exception):
+            raise result
+        if step.kind == "solve":
+            self._solving = False
+            return self._solved(*result)
+        self._looking = False
+        if step.kind == "place":
+            hurried = len(self._lookups) >= self._config.edge.hurry_waiting
+            wanted = 1 if hurried else self._config.place.enough
+            most = self._config.edge.hurry_candidates if hurried else len(result)
+            self._search = step.number, deque(result[:most]), wanted
+            return []
+        return self._verified(step) if isinstance(result, Verified) else []
+
+    def take_changes(self) -> tuple[Change, ...]:
+        return ()
+
+    def report(self) -> dict[str, Any]:
+        merges = sum((run.merges for run in self._runs.values()), Counter[str]())
+        return {
+            "agents": {agent: {"map_id": run.map_of} for agent, run in self._runs.items()},
+            "merges": {what: merges[what] for what in ("requested", "skipped", "done")},
+            "maps": dict(Counter(self._runs[stored.agent].map_of for stored in self._stored)),
+        }
+
+    # ------------------------------------------------------------------ what is drawn
+
+    def _shared(self, number: int, agent: str) -> F64:
+        """Overlap, in parts of its view, of a keyframe with all of an agent (N,)."""
+        mine, T = self._stored[number], np.array(self._T_world_cam[agent])
+        T_world_cam = mine.T_world_body @ self._runs[mine.agent].hello.rig.T_body_cam0
+        return volumes(mine.seen, T_world_cam, self._seen[agent], T) / mine.seen.frustum.volume
+
+    def _candidates(self, number: int) -> list[int]:
+        """Best first."""
+        agent, gap = self._stored[number].agent, self._config.merge.min_loop_gap
+        ranked: list[tuple[float, int]] = []
+        for other, numbers in self._numbers.items():
+            if not numbers:
+                continue
+            looks = self._shared(number, other) + self._odds.blur * self._rng.standard_normal(len(numbers))
+            looks[self._rng.random(len(looks)) < self._odds.strange] += 0.5
+            end = len(numbers)
+            if other == agent:  # odometry's business
+                end = max(0, self._stored[number].keyframe.id - gap)
+            best = np.argsort(-looks[:end])[: self._config.place.candidates]
+            ranked += [(float(looks[i]), numbers[i]) for i in best if numbers[i] != number]
+        ranked.sort(reverse=True)
+        return [n for _, n in ranked[: self._config.place.candidates]]
+
+    def _next_verify(self) -> Step | None:
+        if self._search is None:
+            return None
+        number, left, wanted = self._search
+        if not left or not wanted:
+            self._search = None
+            return None
+        candidate = left.popleft()
+        return Step("verify", number, lambda: self._verify(number, candidate), candidate)
+
+    def _verify(self, number: int, candidate: int) -> Verified | Refusal:
+        a, b = self._stored[candidate], self._stored[number]
+        T_a_b = se3.inverse(self._T_cam(a)) @ self._T_cam(b)
+        shared = float(volumes(a.seen, np.eye(4), b.seen, T_a_b[None])[0]) / b.seen.frustum.volume
+        chance = 1 / (1 + np.exp((self._odds.half - shared) / self._odds.width))
+        return Verified(T_a_b, _COV, 40, 30) if self._rng.random() < chance else Refusal("drawn")
+
+    def _T_cam(self, stored: _Stored) -> F64:
+        return stored.T_world_body @ self._runs[stored.agent].hello.rig.T_body_cam0
+
+    def _verified(self, step: Step) -> list[Finding]:
+        a, b = self._stored[step.candidate], self._stored[step.number]
+        one, other = self._runs[a.agent], self._runs[b.agent]
+        if self._search is not None:
+            number, left, wanted = self._search
+            self._search = number, left, wanted - 1
+        other.merges["requested"] += 1
+        T_a_b = se3.inverse(a.T_world_body) @ b.T_world_body
+        volume = self._gating.volume(one.hello.rig, other.hello.rig, T_a_b)
+        if self._gating.refuses(volume, one.map_of == other.map_of):
+            other.merges["skipped"] += 1
+            return []
+        if one.map_of != other.map_of and not self._joins(one, other):
+            return []
+        other.merges["done"] += 1
+        self._gating.completed(volume)
+        other.answer = max(other.answer, b.keyframe.id)
+        self._due[other.map_of] = None
+        return [Finding(b.agent, "loop accepted", "drawn")]
+
+    def _joins(self, one: _Run, other: _Run) -> bool:
+        """Whether there are enough that say so; the younger map then goes."""
+        pair = frozenset((one.map_of, other.map_of))
+        self._pairs[pair] = self._pairs.get(pair, 0) + 1
+        if self._pairs[pair] < self._odds.witnesses:
+            return False
+        kept, gone = sorted(pair, key=list(self._T_map_world).index)
+        for run in self._runs.values():
+            run.map_of = kept if run.map_of == gone else run.map_of
+        self._due.pop(gone, None)
+        return True
+
+    def _solved(self, name: str, answered: Mapping[str, int]) -> list[Finding]:
+        """Corrections of those that are answered or have come from another map."""
+        return [
+            Finding(agent, "correction", "solved", self._correction(agent, run, answered.get(agent, -1)))
+            for agent, run in self._runs.items()
+            if run.map_of == name and (agent in answered or run.told != name)
+        ]
+
+    def _correction(self, agent: str, run: _Run, answer: int) -> Correction:
+        run.told = run.map_of
+        at = self._stored[self._numbers[agent][answer] if answer >= 0 else run.newest]
+        xi = self._rng.standard_normal(6) * ([0.0, 0.0, self._odds.sigma_rad] + [self._odds.sigma_m] * 3)
+        T_map_body = self._T_map_world[run.map_of] @ at.T_world_body @ se3.exp(xi)
+        T_map_odom = T_map_body @ se3.inverse(at.keyframe.T_odom_body)
+        return Correction(se3.orthonormal(T_map_odom), np.zeros((6, 6)), run.map_of, 0, answer)

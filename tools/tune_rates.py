@@ -1,0 +1,155 @@
+"""What a setting of the scheduler costs and gains: a grid of settings, in virtual time with modelled mapping.
+
+    python tools/tune_rates.py control.kp=0.2,0.8,3.2 control.kd=0,0.2 [--policy share] [--link wifi5] \\
+        [--scenes warehouse firestation] [--rooms 401:404] [--agents ar ar robot] [--workers 2] \\
+        [--json FILE] [--picture FILE]
+
+Each room is one of a scene, by its seed, in which everybody walks for a minute; motions as `share emulate`
+draws them, odometry as tools/keyframe_odometry.py does. The first row is `covins-g`. Prints a Markdown table,
+means over rooms with the standard error of the mean: latency of headsets and of robots as a part of
+`covins-g`'s in the same room, the same of their errors in the map and of merges, the share of headsets'
+evaluations that reach their target. Of two settings a picture is drawn: heat maps of latency and error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from share import process
+
+process.prepare()
+
+import numpy as np  # noqa: E402
+from keyframe_making import make_unseen  # noqa: E402
+from keyframe_types import KeyframeSet, Spacing  # noqa: E402
+from measure_joins import configured  # noqa: E402
+from simulate import Row, play  # noqa: E402
+from tool_main import exit_code, line  # noqa: E402
+
+from share.config import POLICIES  # noqa: E402
+from share.emulate.recipe import Recipe  # noqa: E402
+from share.errors import UsageError  # noqa: E402
+
+FIGURES = ("AR latency", "robot latency", "AR error", "robot error", "merges")
+Room = tuple[str, int, tuple[str, ...]]  # scene, seed, kinds
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("grid", nargs="*", metavar="SECTION.NAME=VALUE,VALUE…")
+    parser.add_argument("--policy", choices=POLICIES, default="share")
+    parser.add_argument("--link", default="wifi5")
+    parser.add_argument("--scenes", nargs="+", default=["warehouse", "firestation"])
+    parser.add_argument("--rooms", default="401:404", metavar="FIRST:END")
+    parser.add_argument("--agents", nargs="+", choices=("ar", "robot"), default=["ar", "ar", "robot"])
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--picture", type=Path)
+    options = parser.parse_args()
+    return exit_code("tune_rates", lambda: tune(options))
+
+
+def tune(options: argparse.Namespace) -> None:
+    """Every point of the grid in every room."""
+    names, values = _grid(options.grid)
+    points = list(itertools.product(*values))
+    first, end = map(int, options.rooms.split(":"))
+    rooms: list[Room] = [
+        (scene, seed, tuple(options.agents)) for scene in options.scenes for seed in range(first, end)
+    ]
+    sets = [("edge.policy=" + json.dumps("covins-g"),)] + [
+        ("edge.policy=" + json.dumps(options.policy), *map("=".join, zip(names, point, strict=True)))
+        for point in points
+    ]
+    jobs = [(room, settings, options.link) for room in rooms for settings in sets]  # a room stays in memory
+    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
+        rows = list(pool.map(_play, jobs, chunksize=len(sets)))
+    runs = dict(zip(jobs, rows, strict=True))
+    print("\n".join(line(cells) for cells in ((*names, *FIGURES, "QoE"), ["---"] * (len(names) + 6))))
+    table = []
+    for settings, point in zip(sets[1:], points, strict=True):
+        ratios = [
+            _ratios(runs[room, settings, options.link], runs[room, sets[0], options.link]) for room in rooms
+        ]
+        mean, sem = np.nanmean(ratios, axis=0), np.nanstd(ratios, axis=0) / np.sqrt(len(ratios))
+        qoe = float(np.mean([_qoe(runs[room, settings, options.link]) for room in rooms]))
+        table.append(mean.tolist())
+        told = [f"{m:.3f} ± {s:.3f}" for m, s in zip(mean, sem, strict=True)]
+        print(line([*point, *told, f"{qoe:.2f}"]), flush=True)
+    if options.json:
+        kept = [
+            {"settings": job[1], "scene": job[0][0], "room": job[0][1], **row} for job, row in runs.items()
+        ]
+        options.json.write_text(json.dumps(kept, indent=1) + "\n")
+    if options.picture:
+        _draw(options.picture, names, values, np.array(table))
+
+
+def _grid(words: list[str]) -> tuple[list[str], list[list[str]]]:
+    if bad := [word for word in words if "=" not in word]:
+        raise UsageError(f"'{bad[0]}': give SECTION.NAME=VALUE,VALUE…")
+    return [w.split("=")[0] for w in words], [w.split("=", 1)[1].split(",") for w in words]
+
+
+@cache
+def _room(scene: str, seed: int, kinds: tuple[str, ...]) -> KeyframeSet:
+    motions = tuple(f"{kind}{k}={'walk' if kind == 'ar' else 'robot'}:" for k, kind in enumerate(kinds))
+    size = None if len(kinds) <= 4 else (3.0 * len(kinds) ** 0.5 + 3, 3.0 * len(kinds) ** 0.5 + 3, 4.0)
+    return make_unseen(Recipe(scene, motions, 60.0, seed=seed, size=size), Spacing())
+
+
+def _play(job: tuple[Room, tuple[str, ...], str]) -> Row:
+    room, settings, link = job
+    made = _room(*room)
+    return play(made, configured(list(settings)), link, room[1], modelled=True)
+
+
+def _of(row: Row, kind: str, figure: str) -> float:
+    return float(
+        np.nanmean([a[figure] for name, a in row["agents"].items() if name.startswith(kind)] or [np.nan])
+    )
+
+
+def _ratios(row: Row, base: Row) -> list[float]:
+    """As `FIGURES`."""
+    pairs = [(kind, figure) for figure in ("latency_ms", "error_cm") for kind in ("ar", "robot")]
+    return [*(_of(row, *pair) / _of(base, *pair) for pair in pairs), row["done"] / max(1, base["done"])]
+
+
+def _qoe(row: Row) -> float:
+    return _of(row, "ar", "qoe")
+
+
+def _draw(path: Path, names: list[str], values: list[list[str]], table: np.ndarray[Any, Any]) -> None:
+    """Heat maps over the first two settings; means over the others."""
+    if len(names) < 2:
+        raise UsageError("--picture: of two settings or more")
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    shape = [len(v) for v in values]
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    for axis, column in zip(axes, (0, 2), strict=True):
+        cells = table[:, column].reshape(shape).mean(axis=tuple(range(2, len(shape))))
+        image = axis.imshow(cells, cmap="viridis_r", aspect="auto", origin="lower")
+        axis.set_xticks(range(shape[1]), values[1])
+        axis.set_yticks(range(shape[0]), values[0])
+        axis.set(xlabel=names[1], ylabel=names[0], title=f"{FIGURES[column]} / covins-g")
+        for (i, j), cell in np.ndenumerate(cells):
+            axis.text(j, i, f"{cell:.2f}", ha="center", va="center", color="white")
+        figure.colorbar(image, ax=axis)
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
