@@ -244,7 +244,7 @@ POLICIES = ("covins-g", "share", "linear", "equal", "random")  # `share.control.
 class EdgeConfig:
     """How the edge serves its agents."""
 
-    policy: str = "covins-g"  # what `share edge --policy` says goes before it
+    policy: str = "share"  # what `share edge --policy` says goes before it
     silent_s: float = 3.0  # nothing heard of an agent for this long: it is taken as gone
     name_hold_s: float = 3.0  # a name stays taken so long after its agent was last heard
     max_agents: int = 64  # present at a time; more are refused
@@ -283,21 +283,21 @@ class ControlConfig:
 
     ar_beta: float = 0.015  # 1/ms, of delay beyond 20 ms
     ar_gamma: float = 1.2  # cm, of accuracy
-    ar_target: float = 0.9  # QoE that is aimed at
+    ar_target: float = 0.93  # QoE that is aimed at
     robot_beta: float = 3.0  # cm, of accuracy short of 1/cm
     robot_gamma: float = 400.0  # ms, of 1 / (delay + theta)
     robot_theta_ms: float = 20.0  # a delay well below this is as good as none
     robot_target: float = 0.9  # QoE that is aimed at
     signed_penalty: bool = False  # what is better than asked for raises QoE beyond 1, as the paper prints it
     agents: dict[str, AgentNeeds] = field(default_factory=dict)  # NAME: {form, beta, gamma, theta_ms, target}
-    attribution: bool = False  # a QoE that is short because of delay lowers the rate, as the paper's does not
+    attribution: bool = True  # a QoE that is short because of delay lowers the rate, unlike in the paper
     kp: float = 0.8  # Hz per evaluation, of an error of 1 in QoE
     ki: float = 0.15  # the same, of an error of 1 for a second
     kd: float = 0.2  # the same, of an error that grows by 1 in a second
     alpha: float = 0.3  # weight of the newest slope of the error, of 1
     integral_max_hz: float = 0.1  # the integral's part of a step, at most
-    rate_min_hz: float = 0.5  # keyframes an agent may always send
-    rate_max_hz: float = 10.0  # and the most it may; its rate to begin with
+    rate_min_hz: float = 1.5  # keyframes an agent may always send
+    rate_max_hz: float = 5.0  # and the most it may; its rate to begin with
     gap_s: float = 5.0  # no evaluation for longer: the error's slope is forgotten, its integral held
     random_seed: int = 1  # of policy random
     gate_seed: int = 1  # of which merges are skipped

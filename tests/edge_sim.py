@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from hellos import hello_of
 
-from share.config import Config
+from share.config import Config, EdgeConfig
 from share.core import edge as ed
 from share.core import events as ev
 from share.core.agent import Agent
@@ -143,7 +143,7 @@ class Town:
         config: Config | None = None,
         weather: Weather | None = None,
     ):
-        self.config = config or Config()
+        self.config = config or Config(edge=EdgeConfig(policy="covins-g"))  # everything is sent and merged
         self.weather = weather or Weather(0)
         self.people: dict[bytes, Person] = {}
         self.agents: dict[bytes, Agent] = {}

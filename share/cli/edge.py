@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 @click.option(
     "--policy",
     type=click.Choice(POLICIES),
-    help="Whom the edge serves how much. By default covins-g: every keyframe is sent, every loop merged.",
+    help="Whom the edge serves how much. By default share; covins-g: every keyframe is sent and merged.",
 )
 @options.keys
 @click.option("--map", "map_file", metavar="FILE", help="Keep the map here, and go on with what is in it.")

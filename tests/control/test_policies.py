@@ -14,7 +14,7 @@ from share.control.policies import POLICIES, Policy
 from share.types import AgentKind
 
 S = 1_000_000_000
-CONFIG = ControlConfig()
+CONFIG = ControlConfig(ar_target=0.9, rate_min_hz=0.5, rate_max_hz=10.0, attribution=False)  # wide bounds
 KINDS = {"ar": AgentKind.AR, "robot": AgentKind.ROBOT}
 Plant = Callable[[dict[str, float], str], tuple[float, float]]  # rates, agent -> delay ms, error cm
 
@@ -91,7 +91,7 @@ def test_a_robot_gets_the_form_of_a_headset_by_settings_alone() -> None:
 
 def test_random_is_its_seed() -> None:
     def rates(seed: int) -> list[float | None]:
-        policy = made("random", ControlConfig(random_seed=seed))
+        policy = made("random", replace(CONFIG, random_seed=seed))
         return [policy.rate("ann", AgentKind.AR, 20, 0.1 * t, t * S // 2) for t in range(1, 9)]
 
     assert rates(1) == rates(1) != rates(2)
@@ -127,7 +127,7 @@ def test_agents_do_not_touch_each_other_and_are_forgotten() -> None:
 def test_rates_stay_within_bounds(
     name: str, said: list[tuple[str, float, float | None, float]], signed: bool
 ) -> None:
-    policy, now = made(name, ControlConfig(signed_penalty=signed)), 0.0
+    policy, now = made(name, replace(CONFIG, signed_penalty=signed)), 0.0
     for agent, delay_ms, error_cm, passed in said:
         now += passed
         rate = policy.rate(

@@ -75,7 +75,7 @@ def test_two_agents_end_in_one_map(kitchen, tracked, tmp_path):
         # the last may come when the agent has said goodbye
         assert 0 <= sum(event["agent"] == name for event in corrections) - own["corrections"] <= 1
         assert own["corrections"] > 1
-        assert own["sent"] == own["keyframes"] == report["agents"][name]["keyframes"]
+        assert report["agents"][name]["keyframes"] == own["sent"] <= own["keyframes"]
         assert own["corrected_ms"]["n"] > 0
 
 
@@ -102,7 +102,7 @@ def test_an_edge_that_is_killed_and_started_again(kitchen, tracked, tmp_path):
     for name in agents:
         assert (tmp_path / name / "odom.tum").read_bytes() == tracked[name]
         own = json.loads((tmp_path / name / "report.json").read_text())
-        assert own["keyframes"] == report["agents"][name]["keyframes"]
+        assert report["agents"][name]["keyframes"] == own["sent"] <= own["keyframes"]
         told = [e["map_id"] for e in _events(tmp_path) if (e["event"], e["agent"]) == ("correction", name)]
         assert own["protocol"]["map_id"] in told[-2:]  # the last may come when the agent has said goodbye
         assert own["protocol"]["edge_sessions"] == 2
