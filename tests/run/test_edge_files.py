@@ -13,6 +13,7 @@ from map_changes import small_map
 
 from share.io.map_store import MapStore
 from share.io.map_store.rows import insert
+from share.io.map_store.schema import SCHEMA
 
 
 def edge(folder: Path, name: str = "edge", bind: str = "tcp://127.0.0.1:0") -> Child:
@@ -51,12 +52,12 @@ def test_a_flipped_byte(path, tmp_path):
 def test_a_newer_schema(path, tmp_path):
     with MapStore.open(path) as store:
         store._db.execute("DELETE FROM about WHERE name = 'schema'")
-        insert(store._db, "about", ("schema", "3"))
+        insert(store._db, "about", ("schema", str(SCHEMA + 1)))
     before = path.read_bytes()
     child = edge(tmp_path)
     assert child.wait(20) == 2
-    newer = "was made by a newer SHARE (schema 3, this one knows 2); use that, or give another file"
-    assert child.said == f"share: {path}: {newer}\n"
+    newer = f"was made by a newer SHARE (schema {SCHEMA + 1}, this one knows {SCHEMA})"
+    assert child.said == f"share: {path}: {newer}; use that, or give another file\n"
     assert path.read_bytes() == before
 
 

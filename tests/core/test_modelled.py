@@ -1,0 +1,88 @@
+"""A mapper that knows the truth does what a real one does, as far as latency and rates are concerned."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from edge_sim import Person, walls
+from test_world import MS, seen
+
+from share.config import Config, EdgeConfig
+from share.core.channel import NETWORKS
+from share.core.modelled import ModelledMapper, Odds
+from share.core.world import Costs, Seen, World
+from share.geometry import se3
+
+ROOM = walls(1)
+SECONDS = 6.0
+USUAL = Odds()
+
+
+def played(policy: str = "covins-g", seed: int = 0, odds: Odds | None = USUAL) -> World:
+    """Ann and Bob in one room, half a wall apart. odds: None for a real mapper."""
+    people = {name: Person(name, ROOM, at, run) for name, at, run in (("ann", 0.0, 11), ("bob", 0.5, 22))}
+    frames = {name: list(seen(person, SECONDS)) for name, person in people.items()}
+    where = {
+        name: dict(zip([f.at_ns for f in frames[name] if f.candidate], person.T_world_body, strict=True))
+        for name, person in people.items()
+    }
+    config = Config(edge=EdgeConfig(policy=policy))
+    mapper = odds and ModelledMapper(config, lambda name, stamp_ns: where[name][stamp_ns], odds, seed)
+    agents: list[tuple[object, Iterator[Seen]]] = [(p.hello, iter(frames[n])) for n, p in people.items()]
+    made = World(config, agents, NETWORKS["wifi5"], Costs(), seed, mapper)
+    made.run(SECONDS + 1.0)
+    return made
+
+
+def latency_ms(room: World) -> float:
+    return float(np.mean([log.report()["latency_ms"]["mean"] for log in room.logs.values()]))
+
+
+def test_agents_are_joined_corrected_and_as_late_as_with_a_real_mapper() -> None:
+    model, real = played(), played(odds=None)
+    report = model.edge.report(model.mapper.report())
+    assert list(report["maps"].values()) == [48]
+    assert {name: agent["keyframes"] for name, agent in report["agents"].items()} == {"ann": 24, "bob": 24}
+    assert report["merges"]["skipped"] == 0 < report["merges"]["done"]
+    assert latency_ms(model) == pytest.approx(latency_ms(real), rel=0.2)
+
+
+def test_a_placed_agent_is_where_it_is_but_for_the_drawn_error() -> None:
+    sure = Odds(sigma_m=0.0, sigma_rad=0.0)
+    for odds, most_m in ((sure, 0.03), (replace(sure, sigma_m=0.5), 3.0)):
+        room = played(odds=odds)
+        both = {name: poses[-1] for name, poses in room.placed.items()}
+        assert len({pose.map_id for pose in both.values()}) == 1
+        off = []
+        for pose in both.values():
+            assert pose.T_map_odom is not None
+            off.append(pose.T_map_odom @ pose.T_odom_body)
+        apart = np.linalg.norm((se3.inverse(off[0]) @ off[1])[:3, 3])
+        people = [Person("ann", ROOM, 0.0, 11), Person("bob", ROOM, 0.5, 22)]
+        for person in people:
+            list(seen(person, SECONDS))
+        true = np.linalg.norm((se3.inverse(people[0].T_world_body[-1]) @ people[1].T_world_body[-1])[:3, 3])
+        assert abs(apart - true) < most_m
+        assert bool(abs(apart - true) > 0.03) is (odds is not sure)
+
+
+def test_views_that_share_nothing_are_never_merged() -> None:
+    room = played(odds=Odds(half=5.0, width=0.01))
+    report = room.edge.report(room.mapper.report())
+    assert report["merges"] == {"requested": 0, "skipped": 0, "done": 0}
+    assert sorted(report["maps"].values()) == [24, 24]
+
+
+def test_the_gate_and_rates_are_those_of_the_policy() -> None:
+    report = (room := played("share")).edge.report(room.mapper.report())
+    assert all(agent["rate_hz"] is not None for agent in report["agents"].values())
+    assert report["merges"]["skipped"] > 0
+
+
+def test_the_same_seed_is_the_same_run() -> None:
+    first, again, other = (played(seed=seed) for seed in (1, 1, 2))
+    assert latency_ms(first) == latency_ms(again) != latency_ms(other)
+    assert first.now_ns <= round((SECONDS + 1) * 1000) * MS
