@@ -51,12 +51,14 @@ def test_an_agent_with_keys_gets_in_and_others_do_not(
     public = keys(tmp_path / "ann-keys", "generate", "--name", "ann")
     keys(server.keys, "authorize", "ann", public)
     keys(tmp_path / "eve-keys", "generate", "--name", "eve")
+    quick = tmp_path / "quick.yaml"
+    quick.write_text("agent: {finish_s: 0.2}")  # nobody acknowledges what the other two have
     server_file = tmp_path / "copied.public"
     server_file.write_bytes((server.keys / "edge.public").read_bytes())
     children = {
         "ann": ("--keys", str(tmp_path / "ann-keys"), "--server-key", str(server_file)),
-        "eve": ("--keys", str(tmp_path / "eve-keys"), "--server-key", server.public),
-        "bob": (),
+        "eve": ("--keys", str(tmp_path / "eve-keys"), "--server-key", server.public, "--config", str(quick)),
+        "bob": ("--config", str(quick)),
     }
     started = {
         name: start_agent(tmp_path, name, recording, server.address, *more) for name, more in children.items()

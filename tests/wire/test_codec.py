@@ -162,7 +162,7 @@ def test_says_what_is_wrong(says: str) -> None:
 
 def test_a_peer_cannot_write_into_our_log() -> None:
     for text in ("a\nb", "\x1b[2J", "x" * 2000):
-        assert refused([header(1, 2, (1, text, -1), [(text, (4, 4))]), *T_FRAMES])
+        assert refused([header(2, 2, (1, text, -1), [(text, (4, 4))]), *T_FRAMES])
         assert refused([header(2, 2, POSE_SCALARS, [(text, (4, 4))]), *T_FRAMES])
 
 
@@ -203,7 +203,7 @@ nested = st.recursive(
 
 
 def _message(code: int, scalars: object, table: list, frames: list[bytes]) -> list[bytes]:
-    return [header(1, min(max(code, -(2**63)), 2**64 - 1), scalars, table), *frames]
+    return [header(2, min(max(code, -(2**63)), 2**64 - 1), scalars, table), *frames]
 
 
 wrong_content = st.builds(
@@ -220,7 +220,7 @@ wrong_content = st.builds(
 
 
 @given(wrong_content)
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=500, deadline=None)
 def test_well_formed_headers_with_wrong_content(frames: list[bytes]) -> None:
     refused(frames)
 
@@ -272,8 +272,9 @@ def injured(seed: int, cases: int) -> Counter[bool]:
     return Counter(refused(mutate(rng, valid[case % len(valid)], valid)) for case in range(cases))
 
 
-def test_a_hundred_thousand_injured_messages() -> None:
-    assert injured(seed=3, cases=100_000)[True] > 80_000
+@pytest.mark.parametrize("cases", [25_000, pytest.param(100_000, marks=pytest.mark.slow)])
+def test_injured_messages(cases: int) -> None:
+    assert injured(seed=3, cases=cases)[True] > 0.8 * cases
 
 
 @pytest.mark.slow
@@ -287,7 +288,7 @@ def test_injured_messages_leave_nothing_behind() -> None:
     injured(seed=4, cases=1000)
     tracemalloc.start()
     try:
-        injured(seed=5, cases=10_000)
+        injured(seed=5, cases=3000)
         held, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -298,14 +299,14 @@ def test_injured_messages_leave_nothing_behind() -> None:
 def test_huge_declarations_allocate_nothing() -> None:
     huge = [
         b"\xdd\xff\xff\xff\xff" + b"\x01" * 100,
-        b"\x94\x01\x05\xdd\xff\xff\xff\xff\x01",
-        b"\x94\x01\x05\x90\xdd\xff\xff\xff\xff\x01",
-        b"\x94\x01\x12\x92\x01\xdd\xff\xff\xff\xff\x01\x90",
-        b"\x94\x01\x11\x91\xdb\xff\xff\xff\xff\x90",
-        b"\x94\x01\x05" + b"\x91" * 4000,
+        b"\x94\x02\x05\xdd\xff\xff\xff\xff\x01",
+        b"\x94\x02\x05\x90\xdd\xff\xff\xff\xff\x01",
+        b"\x94\x02\x12\x92\x01\xdd\xff\xff\xff\xff\x01\x90",
+        b"\x94\x02\x11\x91\xdb\xff\xff\xff\xff\x90",
+        b"\x94\x02\x05" + b"\x91" * 4000,
         b"\x91" * 4096,
-        header(1, 3, (1, 0, 0, 0), [("|u1", (2**40, 2**40))] * 6),
-        header(1, 3, (1, 0, 0, 0), [("|u1", (2000, 32))] * 400),
+        header(2, 3, (1, 0, 0, 0), [("|u1", (2**40, 2**40))] * 6),
+        header(2, 3, (1, 0, 0, 0), [("|u1", (2000, 32))] * 400),
     ]
     tracemalloc.start()
     try:
