@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from children import SHARE, Child, start_agent
 
-FRAMES = 45  # of `plain_session`
+FRAMES = 20  # of `plain_session`; agents play in real time
 
 
 def keys(folder: Path, *arguments: str) -> str:
@@ -61,7 +61,8 @@ def test_an_agent_with_keys_gets_in_and_others_do_not(
         "bob": ("--config", str(quick)),
     }
     started = {
-        name: start_agent(tmp_path, name, recording, server.address, *more) for name, more in children.items()
+        name: start_agent(tmp_path, name, recording, server.address, "--frames", f":{FRAMES}", *more)
+        for name, more in children.items()
     }
     codes = {name: child.wait(60) for name, child in started.items()}
     assert codes == {"ann": 0, "eve": 1, "bob": 1}
