@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from itertools import islice
 from multiprocessing import connection, get_context, parent_process
 from types import TracebackType
@@ -18,6 +19,7 @@ from share.errors import ShareError
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 _failed: ShareError | None = None  # of this process, at its start
+_ENDINGS = {signal.SIGINT, signal.SIGTERM}
 _AHEAD = 2  # jobs handed out per worker, so that none waits for work
 
 
@@ -38,7 +40,8 @@ class Pool:
         try:
             while True:
                 for job in islice(waiting, _AHEAD * self._workers - len(running)):
-                    running[self._pool.submit(_do, work, job)] = job
+                    with _undisturbed():
+                        running[self._pool.submit(_do, work, job)] = job
                 if not running:
                     return
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -59,11 +62,22 @@ class Pool:
         self._going_on.close()
 
 
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """SIGINT and SIGTERM wait: a process that gets only half of what it begins with complains at length."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDINGS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _begin(
     going_on: connection.Connection, start: Callable[..., None], arguments: tuple[object, ...]
 ) -> None:
     """The first thing that a process does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDINGS)  # as they were when it was started
     threading.Thread(target=_end_with_parent, args=(going_on,), daemon=True).start()
     global _failed  # an exception here would be printed, and tell the parent nothing
     try:

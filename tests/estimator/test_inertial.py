@@ -29,6 +29,12 @@ def walk(plain_session):
     return list(frames_of(source, Config(), SequencerCounters())), source.rig, source.truth()
 
 
+@pytest.fixture(scope="module")
+def tracked(walk):
+    """What becomes of all of them."""
+    return run(walk, walk[0])
+
+
 def run(walk, frames, config=None):
     tracker, results, candidates = (
         InertialTracker(walk[1], config or InertialConfig(), TrackerConfig()),
@@ -67,9 +73,9 @@ def states(results):
     return [r.state for r in results]
 
 
-def test_to_the_centimetre_and_every_frame(walk):
+def test_to_the_centimetre_and_every_frame(walk, tracked):
     frames = walk[0]
-    results, candidates, _ = run(walk, frames)
+    results, candidates, _ = tracked
     assert set(states(results)[:3]) <= {STARTING, OK}
     assert states(results)[3:] == [OK] * (len(frames) - 3)
     assert error_m(walk, frames, results) < 0.01
@@ -79,10 +85,10 @@ def test_to_the_centimetre_and_every_frame(walk):
         assert np.linalg.eigvalsh(r.cov)[0] > 0
 
 
-def test_up_is_up(walk):
+def test_up_is_up(walk, tracked):
     """Of the body, as keyframes tell others; the accelerometer of a D435i is off by up to 0.2 m/s^2."""
-    frames, _, truth = walk
-    _, candidates, tracker = run(walk, frames)
+    _, _, truth = walk
+    _, candidates, tracker = tracked
     last = tracker.state.stamp_ns
     up = truth.T[np.argmin(np.abs(truth.stamps_ns - last))][2, :3]
     assert np.degrees(np.arccos(tracker.state.T[2, :3] @ up)) < 1.5
@@ -126,7 +132,7 @@ class Late:
 
 
 @pytest.mark.parametrize("shift_s", [0.02, -0.02])
-def test_a_timeshift_that_the_calibration_tells_costs_nothing(walk, plain_session, shift_s):
+def test_a_timeshift_that_the_calibration_tells_costs_nothing(walk, tracked, plain_session, shift_s):
     """Poses are of when the IMU's clock shows the stamp, so the truth is shifted too."""
     source = Late(open_source(f"{plain_session}/ar1"), shift_s)
     frames = list(frames_of(source, Config(), SequencerCounters()))
@@ -134,7 +140,7 @@ def test_a_timeshift_that_the_calibration_tells_costs_nothing(walk, plain_sessio
     results, _, tracker = run((None, source.rig, truth), frames)
     assert tracker.state.offset_s == pytest.approx(shift_s, abs=1e-3)
     assert states(results)[3:] == [OK] * (len(frames) - 3)
-    clean = error_m(walk, walk[0], run(walk, walk[0])[0])
+    clean = error_m(walk, walk[0], tracked[0])
     assert error_m((None, None, truth), frames, results) < clean + 0.001
     deceived, _, _ = run((None, dataclasses.replace(source.rig, timeshift_s=0.0), truth), frames)
     assert error_m((None, None, truth), frames, deceived) > 2 * clean
@@ -240,15 +246,14 @@ def test_a_renderer_knows_the_pose_between_frames(walk):
     assert InertialTracker(walk[1], InertialConfig(), TrackerConfig()).predict(to) is None
 
 
-def test_a_camera_that_sits_elsewhere_is_told_and_found(walk):
+def test_a_camera_that_sits_elsewhere_is_told_and_found(walk, tracked):
     """Turned by 5 degrees and shifted by 5 cm against its calibration."""
     frames, rig, truth = walk
     off = se3.exp(np.concatenate([np.radians(5) * np.array([0.6, 0.0, 0.8]), [0.03, -0.04, 0.0]]))
     wrong = dataclasses.replace(rig, T_body_cam0=rig.T_body_cam0 @ off)
     fixed, _, _ = run((frames, wrong, truth), frames)
     _, _, tracker = run((frames, wrong, truth), frames, InertialConfig(extrinsic_rad=0.05, extrinsic_m=0.03))
-    right, _, _ = run(walk, frames)
-    assert all(r.sound for r in right)
+    assert all(r.sound for r in tracked[0])
     assert not any(r.sound for r in fixed[-5:])
     left = se3.log(se3.inverse(rig.T_body_cam0) @ tracker.state.T_body_cam)
     assert np.degrees(np.linalg.norm(left[:3])) < 1.5

@@ -17,8 +17,8 @@ DEFAULT = TrackerConfig()
 
 @pytest.fixture(scope="module")
 def walk():
-    """Four seconds of a person's stereo images, and the true poses of cam0."""
-    T = poses("walker", np.arange(1, 5, 1 / HZ), 5)
+    """Three seconds of a person's stereo images, and the true poses of cam0."""
+    T = poses("walker", np.arange(1, 4, 1 / HZ), 5)
     return pairs(T, 5), T
 
 

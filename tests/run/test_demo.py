@@ -47,6 +47,12 @@ def without_up(recording: Path) -> int:
     return frames
 
 
+def pictured(out: Path) -> bool:
+    picture = (out / "trajectories.png").read_bytes()
+    return picture.startswith(b"\x89PNG") and len(picture) > 20_000
+
+
+@pytest.mark.slow
 def test_six_seconds_of_everything(tmp_path):
     """In the plain room, which is quickly drawn; with this seed all three soon look at the same things."""
     seed = ("--scene", "plain", "--seed", "8")
@@ -61,9 +67,7 @@ def test_six_seconds_of_everything(tmp_path):
         report = json.loads((tmp_path / "out" / name / "report.json").read_text())
         assert report["frames"] == FRAMES
         assert report["tracked"] == FRAMES - without_up(session / name)
-    picture = (tmp_path / "out" / "trajectories.png").read_bytes()
-    assert picture.startswith(b"\x89PNG")
-    assert len(picture) > 20_000
+    assert pictured(tmp_path / "out")
 
 
 def test_without_opengl_it_plays_the_plain_room(plain_cache, tmp_path):
@@ -74,10 +78,12 @@ def test_without_opengl_it_plays_the_plain_room(plain_cache, tmp_path):
     assert re.fullmatch(
         r"share: the plain room, because cannot draw without a screen \(.+\): apt install .+\n", done.stderr
     )
-    assert re.search(r"of 3 agents in one map", done.stdout)
+    assert re.search(r"\d of 3 agents in one map, joint ATE \d\.\d\d cm", done.stdout)
     for name in ("ar1", "ar2", "robot"):
+        assert re.search(rf"^ *{name} ", done.stdout, re.MULTILINE)
         report = json.loads((tmp_path / "out" / name / "report.json").read_text())
         assert report["frames"] == report["tracked"] == 45
+    assert pictured(tmp_path / "out")
     assert len(list((plain_cache / "share").iterdir())) == 1  # the session that was there, by the same recipe
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from children import SHARE, Child, start_agent
 
-FRAMES = 45  # of `plain_session`
+FRAMES = 20  # of `plain_session`; agents play in real time
 
 
 def keys(folder: Path, *arguments: str) -> str:
@@ -51,15 +51,18 @@ def test_an_agent_with_keys_gets_in_and_others_do_not(
     public = keys(tmp_path / "ann-keys", "generate", "--name", "ann")
     keys(server.keys, "authorize", "ann", public)
     keys(tmp_path / "eve-keys", "generate", "--name", "eve")
+    quick = tmp_path / "quick.yaml"
+    quick.write_text("agent: {finish_s: 0.2}")  # nobody acknowledges what the other two have
     server_file = tmp_path / "copied.public"
     server_file.write_bytes((server.keys / "edge.public").read_bytes())
     children = {
         "ann": ("--keys", str(tmp_path / "ann-keys"), "--server-key", str(server_file)),
-        "eve": ("--keys", str(tmp_path / "eve-keys"), "--server-key", server.public),
-        "bob": (),
+        "eve": ("--keys", str(tmp_path / "eve-keys"), "--server-key", server.public, "--config", str(quick)),
+        "bob": ("--config", str(quick)),
     }
     started = {
-        name: start_agent(tmp_path, name, recording, server.address, *more) for name, more in children.items()
+        name: start_agent(tmp_path, name, recording, server.address, "--frames", f":{FRAMES}", *more)
+        for name, more in children.items()
     }
     codes = {name: child.wait(60) for name, child in started.items()}
     assert codes == {"ann": 0, "eve": 1, "bob": 1}

@@ -52,7 +52,7 @@ def made(tool, recipe, every, cache):
 
 
 def test_views_and_truth_are_the_recordings(made, recipe, tmp_path):
-    session = make_session(recipe, tmp_path / "session")
+    session = make_session(recipe, tmp_path / "session", workers=1)
     for name, kind in NAMES.items():
         source, agent = open_source(str(session / name)), made.agents[name]
         truth, frames = source.truth(), frames_of(source, Config(), SequencerCounters())

@@ -226,7 +226,7 @@ wrong_content = st.builds(
 
 
 @given(wrong_content)
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=500, deadline=None)
 def test_well_formed_headers_with_wrong_content(frames: list[bytes]) -> None:
     refused(frames)
 
@@ -278,8 +278,9 @@ def injured(seed: int, cases: int) -> Counter[bool]:
     return Counter(refused(mutate(rng, valid[case % len(valid)], valid)) for case in range(cases))
 
 
-def test_a_hundred_thousand_injured_messages() -> None:
-    assert injured(seed=3, cases=100_000)[True] > 80_000
+@pytest.mark.parametrize("cases", [25_000, pytest.param(100_000, marks=pytest.mark.slow)])
+def test_injured_messages(cases: int) -> None:
+    assert injured(seed=3, cases=cases)[True] > 0.8 * cases
 
 
 @pytest.mark.slow
@@ -293,7 +294,7 @@ def test_injured_messages_leave_nothing_behind() -> None:
     injured(seed=4, cases=1000)
     tracemalloc.start()
     try:
-        injured(seed=5, cases=10_000)
+        injured(seed=5, cases=3000)
         held, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from share.emulate.motion import figures
 from share.emulate.motion.figures import FIGURES
@@ -122,7 +123,6 @@ class _Walk:
     @staticmethod
     def of(avatar: Avatar) -> _Walk:
         from scipy.ndimage import gaussian_filter1d
-        from scipy.signal import hilbert
 
         span = (avatar.path.end_ns - avatar.path.start_ns) / 1e9
         seconds = np.arange(int(span * _RATE_HZ) + 1) / _RATE_HZ
@@ -133,7 +133,7 @@ class _Walk:
         v = np.gradient(xy, 1 / _RATE_HZ, axis=0)
         looks = T[:, :2, 0] / np.maximum(np.linalg.norm(T[:, :2, 0], axis=1, keepdims=True), 0.2)
         way = gaussian_filter1d(v + _LOOKS * looks, sigma, axis=0, mode="nearest")
-        phase = np.unwrap(np.angle(hilbert(-_band(neck[:, 2]))))
+        phase = np.unwrap(np.angle(-_band(neck[:, 2])))
         heading = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
         return _Walk(seconds, xy, heading, np.linalg.norm(v, axis=1), phase)
 
@@ -145,12 +145,12 @@ class _Walk:
         return _Walk(seconds, xy, *(r[:, 0] for r in rest))
 
 
-def _band(z: F64) -> F64:
+def _band(z: F64) -> NDArray[np.complex128]:
+    """The analytic signal of what is quick as steps are in z (N,): no negative frequencies."""
     spectrum = np.fft.rfft(z - z.mean())
     hz = np.fft.rfftfreq(len(z), 1 / _RATE_HZ)
     spectrum[(hz < _STEP_HZ[0]) | (hz > _STEP_HZ[1])] = 0
-    out: F64 = np.fft.irfft(spectrum, len(z))
-    return out
+    return np.fft.ifft(2 * spectrum, len(z))
 
 
 def _leaned(hip: F64, neck: F64, heading: F64) -> F64:

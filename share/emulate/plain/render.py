@@ -3,13 +3,10 @@
 All in inverse depth q = 1/z: where a ray r (world frame, camera z = 1) from c meets the plane
 x_k = p, q = r_k / (p - c_k), a multiple of an image that is affine in the pixel. A box is the q-interval
 between its exit and entry planes (the slab method of Kay & Kajiya 1986). Textures are mip-mapped,
-trilinear (Williams 1983): channel 1 of the pyramid holds the next coarser level at the same size,
-so one remap fetches both.
+trilinear (Williams 1983): the room's pyramid holds two levels in a pixel, so one remap fetches both.
 """
 
 from __future__ import annotations
-
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -33,8 +30,8 @@ class Renderer:
         if len(room.origin) > _MAX_FACES:
             raise ValueError(f"room: {len(room.origin)} faces, at most {_MAX_FACES}")
         self._room, self._camera = room, camera
-        self._pyramid, self._corner = _pyramid(room.atlas)
-        self._origin = _table(room.origin)
+        self._pyramid = room.pyramid.pixels
+        self._corner, self._origin = _table(room.pyramid.corners), _table(room.origin)
         shape = (camera.height, camera.width)
         self._q, self._face = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
 
@@ -151,22 +148,3 @@ def _table(values: F32) -> F32:
 
 _AXIS = (np.arange(256) % 6 // 2).astype(np.uint8)
 _SHRINK = (0.5 ** np.arange(256)).astype(np.float32)
-
-
-def _pyramid(atlas: U8) -> tuple[U8, F32]:
-    """All levels side by side, (H, W', 2), and the corner of each level as tables (2, 256).
-
-    Pixel x of level 0 is pixel x / 2 of level 1 (pyrDown keeps even pixels).
-    """
-    levels = [atlas]
-    for _ in range(LEVELS):
-        levels.append(cv2.pyrDown(levels[-1]))
-    width = sum(level.shape[1] for level in levels[:-1])
-    out = np.zeros((atlas.shape[0], width, 2), np.uint8)
-    corner, x = np.zeros((LEVELS, 2), np.float32), 0
-    for i, (level, coarser) in enumerate(pairwise(levels)):
-        h, w = level.shape
-        out[:h, x : x + w, 0] = level
-        out[:h, x : x + w, 1] = cv2.pyrUp(coarser, dstsize=(w, h))
-        corner[i], x = (x, 0), x + w
-    return out, _table(corner)

@@ -8,6 +8,8 @@ box b across axis k; its picture is one patch of the atlas.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -20,6 +22,15 @@ LEVELS = 6  # of the mip pyramid: level l has 2^-l of the resolution
 _PAD = 1 << (LEVELS - 1)  # texels repeated around a patch, so that no level bleeds into its neighbour
 _ATLAS_WIDTH = 4096
 _SHADE = (0.92, 1.0, 1.06)  # light falls a little differently on each axis
+
+
+@dataclass(frozen=True, eq=False)
+class Pyramid:
+    """An atlas at all LEVELS side by side. pixels: (H, W', 2) uint8, channel 1 the next coarser level at the
+    same size; corners: (LEVELS, 2) float32, where (column, row) each level begins."""
+
+    pixels: U8
+    corners: F32
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +47,11 @@ class Room:
         """Extent of the room (3,) m."""
         size: F64 = self.boxes[0, 1]
         return size
+
+    @cached_property
+    def pyramid(self) -> Pyramid:
+        """The atlas as renderers want it, made once for all of them."""
+        return _pyramid(self.atlas)
 
 
 def make_room(seed: int, size: tuple[float, float, float] = (9.0, 6.0, 3.0)) -> Room:
@@ -135,3 +151,19 @@ def _origins(boxes: F64, corners: list[tuple[int, int]]) -> F32:
         top = -lo[up] if across == 2 else hi[up]
         out[face] = cx - lo[along] * TEXELS_PER_M, cy + top * TEXELS_PER_M
     return out
+
+
+def _pyramid(atlas: U8) -> Pyramid:
+    """Pixel x of level 0 is pixel x / 2 of level 1 (pyrDown keeps even pixels)."""
+    levels = [atlas]
+    for _ in range(LEVELS):
+        levels.append(cv2.pyrDown(levels[-1]))
+    width = sum(level.shape[1] for level in levels[:-1])
+    pixels = np.zeros((atlas.shape[0], width, 2), np.uint8)
+    corners, x = np.zeros((LEVELS, 2), np.float32), 0
+    for i, (level, coarser) in enumerate(pairwise(levels)):
+        h, w = level.shape
+        pixels[:h, x : x + w, 0] = level
+        pixels[:h, x : x + w, 1] = cv2.pyrUp(coarser, dstsize=(w, h))
+        corners[i], x = (x, 0), x + w
+    return Pyramid(pixels, corners)

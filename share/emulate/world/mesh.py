@@ -65,7 +65,7 @@ def concat(shapes: Sequence[Shape]) -> Shape:
     materials = tuple(dict.fromkeys(m for shape in shapes for m in shape.materials))
     number = {m: i for i, m in enumerate(materials)}
     layers = [np.array([number[m] for m in s.materials], np.int32)[s.mesh.layer] for s in shapes]
-    return Shape(joined([replace(s.mesh, layer=k) for s, k in zip(shapes, layers, strict=True)]), materials)
+    return Shape(replace(joined([s.mesh for s in shapes]), layer=np.concatenate(layers)), materials)
 
 
 def joined(meshes: Sequence[Mesh]) -> Mesh:
@@ -88,14 +88,14 @@ def quad(
     """A parallelogram: lower left corner (3,) m and the two edges (3,) m from it, as seen from its
     front, which is where `along` x `up` points. A print fills it with its picture number `cell`."""
     a, u = np.asarray(along, float), np.asarray(up, float)
-    corners = np.asarray(corner, float) + np.stack([0 * a, a, a + u, u])
-    width, height = np.linalg.norm(a), np.linalg.norm(u)
+    corners = np.asarray(corner, float) + np.array([0 * a, a, a + u, u])
     if skin.fitted:
         uv = _cell(skin, cell)
     else:
+        width, height = np.sqrt(a @ a), np.sqrt(u @ u)
         shear = a @ u / width
-        flat = np.array([(0, 0), (width, 0), (width + shear, -1), (shear, -1)])
-        flat[2:, 1] = -np.sqrt(max(height**2 - shear**2, 0.0))
+        down = -np.sqrt(max(height**2 - shear**2, 0.0))
+        flat = np.array([(0, 0), (width, 0), (width + shear, down), (shear, down)])
         uv = flat / skin.extent + _shift(rng)
     return _planar(corners, uv, skin)
 
@@ -279,13 +279,14 @@ def _planar(corners: F64, uv: F64, skin: Material) -> Shape:
     """A convex planar face (N, 3) m as a fan of triangles."""
     n = _cross(corners[1] - corners[0], corners[2] - corners[0])
     count = len(corners)
-    fan = np.stack([np.zeros(count - 2), np.arange(1, count - 1), np.arange(2, count)], axis=1)
+    normals = np.empty((count, 3), np.float32)
+    normals[:] = n / np.sqrt(n @ n)
     mesh = Mesh(
         vertices=corners.astype(np.float32),
-        normals=np.tile(n / np.sqrt(n @ n), (count, 1)).astype(np.float32),
+        normals=normals,
         uv=uv.astype(np.float32),
         layer=np.zeros(count, np.int32),
-        faces=fan.astype(np.int32),
+        faces=np.array([(0, k, k + 1) for k in range(1, count - 1)], np.int32),
     )
     return Shape(mesh, (skin,))
 

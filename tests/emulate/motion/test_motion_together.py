@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from motion_sim import SECONDS, every, floor
 
+from share.emulate.motion import crowd as crowds
 from share.emulate.motion import paper, walk
 from share.emulate.motion.crowd import Member, Present, crowd, length_of, present_of
 from share.emulate.motion.route import SPACING, Network, arc_length, smooth
@@ -82,7 +83,8 @@ def test_two_people_and_a_robot_keep_apart_and_off_one_who_is_there():
     assert all(np.array_equal(a.position.c, b.position.c) for a, b in zip(paths, again, strict=True))
 
 
-def test_a_room_without_a_way_says_so():
+def test_a_room_without_a_way_says_so(monkeypatch):
+    monkeypatch.setattr(crowds, "_ATTEMPTS", 3)
     tight = Ground(floor(size=(1.8, 1.8), blocks=()))
     members = [Member(str(k), Wish("person", 0.8, 0.0), 1.7) for k in range(6)]
     with pytest.raises(UsageError, match="larger --size"):

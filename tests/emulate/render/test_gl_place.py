@@ -23,18 +23,24 @@ def exact_depth(mesh, camera, T_world_cam):
     """Depth of the nearest triangle on every pixel's ray, by brute force in double precision; and whether
     the ray clears the sides of all triangles by the 1/256 px that OpenGL rounds corners to."""
     px = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1).reshape(-1, 2)
-    r = rays(camera.normalise(px.astype(float)))
-    best, clear = np.zeros(len(r)), np.ones(len(r), bool)
+    every = rays(camera.normalise(px.astype(float)))
+    x, y = np.ascontiguousarray((every[:, :2] / every[:, 2:]).T)
+    best, clear = np.zeros(len(every)), np.ones(len(every), bool)
     for corners in mesh.triangles.astype(float):
         p = transform(inverse(T_world_cam), corners)
         if (p[:, 2] < 0).all():
             continue
+        here = np.arange(len(every))
+        if (p[:, 2] > 0.01).all():  # only the rays near it
+            (left, top), (right, bottom) = (f(p[:, :2] / p[:, 2:], axis=0) for f in (np.min, np.max))
+            here = here[(x > left - 0.01) & (x < right + 0.01) & (y > top - 0.01) & (y < bottom + 0.01)]
+        r = every[here]
         normal = np.cross(p[1] - p[0], p[2] - p[0])
         q = r @ normal / (normal @ p[0])
         sides = np.stack([r @ (e / np.linalg.norm(e)) for e in (np.cross(p[i], p[i - 2]) for i in range(3))])
-        inner = np.maximum(sides.min(0), -sides.max(0))
-        best = np.where((inner > 0) & (q > best), q, best)
-        clear &= np.abs(inner) > 1.5e-5
+        inner = np.maximum(sides.min(0, initial=np.inf), -sides.max(0, initial=-np.inf))
+        best[here] = np.where((inner > 0) & (q > best[here]), q, best[here])
+        clear[here] &= np.abs(inner) > 1.5e-5
     return (1 / best).reshape(camera.height, -1), clear.reshape(camera.height, -1)
 
 
