@@ -177,6 +177,18 @@ class LinkConfig:
 
 
 @dataclass(frozen=True)
+class StreamConfig:
+    """How agents that do not track themselves send frames to the edge that does (policy streamed)."""
+
+    window: int = 3  # frames of an agent under way; of others the newest waits. As many wait for a tracker
+    patience_s: float = 1.0  # a frame without an answer for this long has none
+    begin_s: float = 20.0  # a recording is not played before the edge can track it, but then it is
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "window", "patience_s")
+
+
+@dataclass(frozen=True)
 class ClockConfig:
     """The filter of the edge's clock against the agent's."""
 
@@ -237,7 +249,8 @@ class MergeConfig:
     drop_chi2: float = 1000.0  # a solved graph at odds with a loop by more than this drops it
 
 
-POLICIES = ("covins-g", "share", "linear", "equal", "random")  # `share.control.policies` has what each does
+STREAMED = "streamed"
+POLICIES = ("covins-g", "share", "linear", "equal", "random", STREAMED)  # see `share.control.policies`
 
 
 @dataclass(frozen=True)
@@ -330,6 +343,7 @@ class Config:
     control: ControlConfig = field(default_factory=ControlConfig)
     agent: AgentConfig = field(default_factory=AgentConfig)
     link: LinkConfig = field(default_factory=LinkConfig)
+    stream: StreamConfig = field(default_factory=StreamConfig)
     clock: ClockConfig = field(default_factory=ClockConfig)
 
 

@@ -31,7 +31,7 @@ from load_room import room  # noqa: E402
 from measure_joins import configured  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
-from share.config import POLICIES, Config  # noqa: E402
+from share.config import POLICIES, STREAMED, Config  # noqa: E402
 from share.core.events import Localised  # noqa: E402
 from share.core.modelled import ModelledMapper, Odds  # noqa: E402
 from share.core.world import Costs, Seen, World  # noqa: E402
@@ -42,6 +42,7 @@ from share.metrics.association import Trajectory  # noqa: E402
 from share.metrics.local_error import LocalError  # noqa: E402
 from share.types import F64, Candidate  # noqa: E402
 
+SIMULATED = [policy for policy in POLICIES if policy != STREAMED]  # its agents send raw frames
 FRAME_NS = 33_333_333
 HEAD = ("policy", "agent", "latency ms", "frames ms", "corrected ms", "n", "sent", "Hz told", "QoE", "cm")
 
@@ -50,7 +51,7 @@ Row = dict[str, Any]
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--policies", nargs="*", choices=POLICIES, default=["covins-g", "share"])
+    parser.add_argument("--policies", nargs="*", choices=SIMULATED, default=["covins-g", "share"])
     parser.add_argument("--link", default="wifi5")
     parser.add_argument("--seeds", default="0:3", metavar="FIRST:END")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.NAME=VALUE")

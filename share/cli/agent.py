@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     "--link", metavar="NAME|FILE", help="Talk through an emulated network: wifi5, wifi-busy, a file."
 )
 @click.option("--link-seed", type=int, default=0, show_default=True, help="Of what that network does.")
+@click.option("--streamed", is_flag=True, help="Send raw frames; the edge tracks (policy streamed).")
 @click.option("--true-error", is_flag=True, help="Tell the edge the true error of tracking, for experiments.")
 @options.calib
 @options.frames
@@ -53,6 +54,7 @@ def agent(
     server_key: str | None,
     link: str | None,
     link_seed: int,
+    streamed: bool,
     true_error: bool,
     calib: str | None,
     frames: slice | None,
@@ -74,9 +76,12 @@ def agent(
     from share.io.transport import check_keys, connect, parse_address
     from share.run.agent import AgentRun
     from share.run.stop import on_stop
+    from share.run.stream import StreamRun
     from share.types import AgentKind
     from share.wire.messages import Hello
 
+    if streamed and true_error:
+        raise UsageError("--true-error: is of an agent that tracks itself; leave out --streamed, or this")
     shaped = None if link is None else _shaped(link, link_seed)
     with_keys = _keys(keys, server_key)
     check_keys(parse_address(address), with_keys)
@@ -84,12 +89,14 @@ def agent(
     options.say_notes(opened)
     error = _by_truth(opened) if true_error else None
     run_id = secrets.randbits(63)
-    hello = Hello(options.agent_name(name), AgentKind(kind), run_id, opened.rig)
-    live = _LiveLine(opened.images_count)
+    hello = Hello(options.agent_name(name), AgentKind(kind), run_id, opened.rig, streamed)
+    live = _LiveLine(opened.images_count, streamed)
     folder = None if out is None else Path(out)
     dial = partial(connect, address, run_id, with_keys)
     through = dial if shaped is None else lambda: shaped(dial())
-    run = AgentRun(opened, hello, settings, through, folder, live.say, live.show, verbose, error)
+    run = (StreamRun if streamed else AgentRun)(
+        opened, hello, settings, through, folder, live.say, live.show, verbose, error
+    )
     with on_stop(run.stop):
         run.go()
     live.end()
@@ -140,15 +147,19 @@ def _shaped(name: str, seed: int) -> Callable[[AgentLink], AgentLink]:
 class _LiveLine(LiveLine):
     """How far the run is, written over; and what is said, on lines of its own."""
 
-    def __init__(self, total: int) -> None:
+    def __init__(self, total: int, streamed: bool) -> None:
         super().__init__()
-        self._total = total
+        self._total, self._streamed = total, streamed
 
     def show(self, status: Status) -> None:
         if not self.seen or (status.frames % 5 and status.frames != self._total):
             return
         r = status.report()
         rtt = "  –  " if r["rtt_ms"] is None else f"{r['rtt_ms']:.1f} ms"
+        if self._streamed:
+            counts = f"streamed {r['streamed']} answered {r['answered']} left out {r['drop_frame']}"
+            self.write(f"{status.frames}/{self._total} {status.state:4} {counts} rtt {rtt}")
+            return
         self.write(
             f"{status.frames}/{self._total} {status.state:4} sent {r['sent']} acknowledged "
             f"{r['acknowledged']} corrections {r['corrections']} rtt {rtt} map {r['map_id'] or '–'}"
@@ -162,11 +173,13 @@ class _LiveLine(LiveLine):
 def _summary(run: AgentRun) -> str:
     r = run.report
     p95 = r["track_ms"]["p95"]
-    lines = [
-        f"{r['tracked']} of {r['frames']} frames tracked, lost for {r['lost_s']:.1f} s",
-        f"{r['sent']} of {r['keyframes']} keyframes sent, {r['corrections']} corrections, "
-        f"{r['bytes_up'] / 1e6:.2f} MB up, {r['bytes_down'] / 1e6:.3f} MB down",
-    ]
+    traffic = f"{r['bytes_up'] / 1e6:.2f} MB up, {r['bytes_down'] / 1e6:.3f} MB down"
+    keyframes = f"{r['sent']} of {r['keyframes']} keyframes sent, {r['corrections']} corrections"
+    lines = [f"{r['tracked']} of {r['frames']} frames tracked, lost for {r['lost_s']:.1f} s"]
+    if "untracked" in r:
+        lines += [f"{r['untracked']} more frames had no answer of the edge, {traffic}"]
+    else:
+        lines += [f"{keyframes}, {traffic}"]
     if r["drop_late"]:
         lines.append(f"{r['drop_late']} more frames came too late and were left out")
     if p95 is not None:

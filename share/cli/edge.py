@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
-from share.config import POLICIES
+from share.config import POLICIES, STREAMED
+from share.errors import UsageError
 
 if TYPE_CHECKING:
     from share.io.keys import EdgeKeys
@@ -60,13 +61,19 @@ def edge(
     from share.run.edge import EdgeRun
     from share.run.status import StatusServer
     from share.run.stop import on_stop
+    from share.wire.codec import MAX_FRAME_BYTES, MAX_IMAGE_BYTES
 
     with_keys = _keys(keys, parse_address(bind, bind=True).local)
     if policy is not None:
         settings = replace(settings, edge=replace(settings.edge, policy=policy))
+    raw = settings.edge.policy == STREAMED
+    if raw and map_file is not None:
+        raise UsageError("--map: there is none by policy streamed; leave it out, or take another policy")
     folder = None if out is None else Path(out)
     with ExitStack() as stack:
-        link = stack.enter_context(closing(bind_link(bind, with_keys)))
+        link = stack.enter_context(
+            closing(bind_link(bind, with_keys, MAX_IMAGE_BYTES if raw else MAX_FRAME_BYTES))
+        )
         store = None if map_file is None else stack.enter_context(_open_map(Path(map_file)))
         run = EdgeRun(settings, link, folder, lambda e: _tell(e, verbose), store)
         with on_stop(run.stop):
@@ -111,7 +118,7 @@ def _say_keys(keys: EdgeKeys | None) -> None:
 
 _NEWS = {"joined the edge", "left", "back", "silent", "refused"}
 _NEWS |= {"not let in", "maps joined", "merge undone", "job failed", "not written", "mapper lost"}
-_NEWS |= {"odometry doubted", "map"}
+_NEWS |= {"odometry doubted", "map", "tracking lost"}
 
 
 def _tell(event: dict[str, Any], verbose: bool) -> None:
@@ -121,12 +128,17 @@ def _tell(event: dict[str, Any], verbose: bool) -> None:
 
 
 def _summary(report: dict[str, Any]) -> str:
-    lines = [
-        f"{name}: {a['keyframes']} keyframes, {a['corrections']} corrections, "
-        f"{a['bytes_up'] / 1e6:.2f} MB up, in map {a.get('map_id') or 'none yet'}"
-        for name, a in report["agents"].items()
-    ]
+    lines = [_of_agent(name, agent) for name, agent in report["agents"].items()]
     if loops := report.get("loops"):  # the mapper has reported
         done = report["merges"]["done"]
         lines.append(f"loops: {loops['tried']} tried, {loops['accepted']} accepted; {done} merges")
     return "\n".join(lines)
+
+
+def _of_agent(name: str, a: dict[str, Any]) -> str:
+    up = f"{a['bytes_up'] / 1e6:.2f} MB up"
+    if "frames_streamed" in a:
+        done = f"{a['frames_tracked']} of {a['frames_streamed']} frames tracked"
+        return f"{name}: {done}, {a['frames_dropped']} left out, {up}"
+    where = a.get("map_id") or "none yet"
+    return f"{name}: {a['keyframes']} keyframes, {a['corrections']} corrections, {up}, in map {where}"

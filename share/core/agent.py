@@ -17,6 +17,7 @@ from share.core.drift import Drift
 from share.core.ledger import Entry, Ledger
 from share.core.map_frame import MapFrame
 from share.core.rate import Every, TokenBucket, seconds
+from share.core.streaming import Streaming
 from share.core.worth import Worth
 from share.errors import UsageError, WireError
 from share.geometry.se3 import inverse
@@ -33,7 +34,10 @@ _REMEMBERED = 16  # pings under way, earlier lives of the edge, complaints
 
 
 class Agent:
-    """One run of one agent. `hello` is repeated until an edge welcomes it."""
+    """One run of one agent. `hello` is repeated until an edge welcomes it.
+
+    It is given FrameTracked and KeyframeMade, or where `hello.streams`, FrameArrived.
+    """
 
     def __init__(self, hello: m.Hello, config: Config) -> None:
         link = config.link
@@ -46,6 +50,7 @@ class Agent:
         self._worth = Worth()
         self._map = MapFrame(config.agent)
         self._drift = Drift()
+        self._streaming = Streaming(config.stream) if hello.streams else None
         self._clock = ClockFilter(config.clock)
         self._hello_timer, self._ping_timer = Every(link.hello_s), Every(link.ping_s)
         self._T_odom_body: F64 | None = None
@@ -74,6 +79,10 @@ class Agent:
                 self._frame_tracked(event, now_ns)
             case ev.KeyframeMade():
                 self._offer(event, now_ns)
+            case ev.FrameArrived() if self._streaming:
+                self._streaming.arrived(event, self._connected)
+            case ev.NotTaken() if self._streaming:
+                self._streaming.not_taken(event.index)
             case ev.Received():
                 self._received(event, now_ns)
             case ev.Finished():
@@ -86,11 +95,17 @@ class Agent:
             self._keep_up(now_ns)
         return self._effects
 
+    @property
+    def connected(self) -> bool:
+        """To an edge that has welcomed it and is not silent."""
+        return self._connected
+
     def report(self) -> dict[str, Any]:
         """Counters and the present state, as plain data."""
         return {
             **{name: self._counts[name] for name in _COUNTED},
             **{name: self._ledger.counts[name] for name in _BOOKED},
+            **(self._streaming.report() if self._streaming else {}),
             "keyframes": self._chain.next_id,
             "open": self._ledger.open,
             "rate_hz": self._bucket.hz,
@@ -109,7 +124,7 @@ class Agent:
             self._map.forget()
         if frame.T_odom_body is not None and frame.state.has_pose:
             self._localised(frame, frame.T_odom_body, now_ns)
-        if not frame.keyframe:
+        if self._streaming or not frame.keyframe:
             self._frame_done(frame, sent=False)
 
     def _offer(self, made: ev.KeyframeMade, now_ns: int) -> None:
@@ -138,7 +153,7 @@ class Agent:
         self._effects.append(
             ev.Localised(frame.index, frame.stamp_ns, T_odom_body, T_map_odom, self._map.map_id, frame.state)
         )
-        if self._connected:
+        if self._connected and not self._streaming:
             self._counts["poses"] += 1
             self._send(self._pose_update(frame, T_odom_body))
 
@@ -176,8 +191,10 @@ class Agent:
                 self._bucket.limit(message.hz, now_ns)
             case m.Pong():
                 self._ponged(message, now_ns)
+            case m.Tracked() if self._streaming:
+                self._tracked_afar(message, self._streaming, now_ns)
             case _:
-                self._complain(f"the edge sent a {type(message).__name__}, which only agents send")
+                self._complain(f"the edge sent a {type(message).__name__}, which is not for this agent")
 
     def _complain(self, text: str) -> None:
         """Counts a bad message; says each kind once."""
@@ -204,9 +221,13 @@ class Agent:
         self._clock.reset()
         self._pings.clear()
         held = self._ledger.begin(welcome)
-        self._say(
-            f"the edge has restarted; it is sent {held} keyframes again" if again else "connected to the edge"
-        )
+        if again and self._streaming:
+            self._streaming.edge_restarted()
+            self._say("the edge has restarted; it begins tracking anew")
+        elif again:
+            self._say(f"the edge has restarted; it is sent {held} keyframes again")
+        else:
+            self._say("connected to the edge")
 
     def _refused(self, refused: m.Refused, now_ns: int) -> None:
         text = f"the edge refuses '{self._name}': {refused.reason}"
@@ -216,7 +237,7 @@ class Agent:
             return
         self._connected = False
         self._hello_timer.postpone(now_ns + seconds(self._config.link.refused_s))
-        self._say(f"{text}; tracking goes on alone")
+        self._say(f"{text}; {self._alone}")
 
     def _corrected(self, correction: Correction, now_ns: int) -> None:
         if not self._connected or correction.revision <= self._revision or not self._of_stretch(correction):
@@ -250,6 +271,12 @@ class Agent:
         known = max(correction.answers, last.keyframe.id if last and correction.answers < 0 else -1)
         return known >= self._chain.first_of_stretch
 
+    def _tracked_afar(self, answer: m.Tracked, streaming: Streaming, now_ns: int) -> None:
+        frame = streaming.tracked(answer, now_ns)
+        if frame is not None:
+            self._effects.append(ev.TrackedAfar(frame, answer.sound, answer.waits))
+            self._frame_tracked(frame, now_ns)
+
     def _ponged(self, pong: m.Pong, now_ns: int) -> None:
         ping = m.Ping(pong.sequence, pong.sent_ns)
         if ping not in self._pings:
@@ -267,10 +294,16 @@ class Agent:
         if self._connected:
             self._ping(now_ns)
             self._send_keyframes(now_ns)
+            self._send_frame(now_ns)
         elif self._hello_timer.due(now_ns):
             self._send_hello(now_ns)
-        if self._finish_by_ns is not None and (not self._ledger.open or now_ns >= self._finish_by_ns):
+        if self._finish_by_ns is not None and (self._is_done or now_ns >= self._finish_by_ns):
             self._end()
+
+    @property
+    def _is_done(self) -> bool:
+        """Nothing is waited for."""
+        return not self._ledger.open and (self._streaming is None or self._streaming.is_idle)
 
     def _send_hello(self, now_ns: int) -> None:
         self._hello_timer.postpone(now_ns + seconds(self._config.link.hello_s))
@@ -284,7 +317,7 @@ class Agent:
         if not self._silence_said:
             self._silence_said = True
             gone = "the edge is silent" if self._session is not None else "no edge answers yet"
-            self._say(f"{gone}; tracking goes on alone")
+            self._say(f"{gone}; {self._alone}")
 
     def _ping(self, now_ns: int) -> None:
         if self._ping_timer.due(now_ns):
@@ -296,6 +329,13 @@ class Agent:
     def _send_keyframes(self, now_ns: int) -> None:
         for entry in self._ledger.due(now_ns):
             self._send(entry.keyframe)
+
+    def _send_frame(self, now_ns: int) -> None:
+        frame = None if self._streaming is None else self._streaming.next(now_ns)
+        if frame is not None:
+            frames = encode(frame)
+            self._counts["bytes_up"] += size(frames)
+            self._effects.append(ev.SendFrame(frame.index, frames))
 
     def _finished(self, now_ns: int) -> None:
         self._finish_by_ns = now_ns + seconds(self._config.agent.finish_s)
@@ -312,6 +352,10 @@ class Agent:
     def _send_frames(self, frames: Any) -> None:
         self._counts["bytes_up"] += size(frames)
         self._effects.append(ev.Send(frames))
+
+    @property
+    def _alone(self) -> str:
+        return "nobody tracks this agent" if self._streaming else "tracking goes on alone"
 
     def _say(self, text: str) -> None:
         self._effects.append(ev.Say(text))

@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from share import __version__
 from share.config import Config
+from share.core.afar import FromTracker, ToTracker
 from share.core.finding import Finding
 from share.core.inorder import InOrder
 from share.core.keeping import Change, KeepKeyframe, KeepRun
@@ -57,7 +58,7 @@ class Tick:
     """Time has passed."""
 
 
-Event = Received | Found | Kept | Tick
+Event = Received | Found | Kept | Tick | FromTracker
 
 # ---------------------------------------------------------------- effects
 
@@ -99,7 +100,7 @@ class Record:
     fields: dict[str, Any]
 
 
-Effect = Send | Join | Add | Keep | Record
+Effect = Send | Join | Add | Keep | Record | ToTracker
 
 
 class Edge:
@@ -108,6 +109,8 @@ class Edge:
     keeps: what is applied is acknowledged only once it is `Kept`. known: runs of earlier lives.
     began_ns: times in records count from here (default: the first event).
     """
+
+    tracks: ClassVar[bool] = False  # agents stream: `share.core.tracking_edge`
 
     def __init__(
         self,
@@ -133,6 +136,10 @@ class Edge:
         """What `event` leads to. `now_ns` is the edge's clock and never goes back."""
         self._began_ns = now_ns if self._began_ns is None else self._began_ns
         self._effects = []
+        self._react(event, now_ns)
+        return self._effects
+
+    def _react(self, event: Event, now_ns: int) -> None:
         match event:
             case Received():
                 self._receive(event, now_ns)
@@ -144,7 +151,6 @@ class Edge:
                 self._kept(event.ticket)
             case Tick():
                 self._notice_silence(now_ns)
-        return self._effects
 
     # ------------------------------------------------------------------ messages
 
@@ -166,17 +172,24 @@ class Edge:
                 pong = wire.Pong(message.sequence, message.sent_ns, now_ns, now_ns, self._session)
                 self._send(event.peer, pong)
             case wire.Bye() if peer:
-                peer.gone = True
-                self._record(now_ns, "left", peer, "said bye")
-            case Keyframe() if peer:
-                self._keyframe(peer, message, now_ns)
-            case wire.PoseUpdate() if peer:
-                counts["poses"] += 1
-                peer.state = message.state
-            case wire.Evaluation() if peer:
-                self._evaluated(event.peer, peer, message, now_ns)
-            case _:  # from a stranger, or not an agent's word
+                self._gone(peer, "left", "said bye", now_ns)
+            case _ if peer:
+                self._told(event.peer, peer, message, now_ns)
+            case _:  # from a stranger
                 counts["unexpected"] += 1
+
+    def _told(self, peer_id: bytes, peer: Peer, message: wire.Message, now_ns: int) -> None:
+        """What an agent says of itself."""
+        match message:
+            case Keyframe():
+                self._keyframe(peer, message, now_ns)
+            case wire.PoseUpdate():
+                peer.counts["poses"] += 1
+                peer.state = message.state
+            case wire.Evaluation():
+                self._evaluated(peer_id, peer, message, now_ns)
+            case _:  # not this agent's word
+                peer.counts["unexpected"] += 1
 
     def _complain(self, peer: Peer | None, reason: str, now_ns: int) -> None:
         """Counts a bad message; says the first of each peer."""
@@ -194,8 +207,11 @@ class Edge:
     def _notice_silence(self, now_ns: int) -> None:
         for peer in self._peers.values():
             if not peer.gone and now_ns - peer.heard_ns > seconds(self._config.edge.silent_s):
-                peer.gone = True
-                self._record(now_ns, "silent", peer, f"nothing heard for {self._config.edge.silent_s:g} s")
+                self._gone(peer, "silent", f"nothing heard for {self._config.edge.silent_s:g} s", now_ns)
+
+    def _gone(self, peer: Peer, what: str, reason: str, now_ns: int) -> None:
+        peer.gone = True
+        self._record(now_ns, what, peer, reason)
 
     # ------------------------------------------------------------------ coming in
 
@@ -206,12 +222,12 @@ class Edge:
             self._record(now_ns, "refused", None, reason)
             return
         if peer_id not in self._peers:
-            key = self._key(hello)
-            self._enter(peer_id, Peer(hello, key, now_ns))
-            self._keep(KeepRun(key, hello))
+            self._enter(peer_id, Peer(hello, self._key(hello), now_ns))
             self._schedule.begin(hello.name)
             self._record(now_ns, "joined the edge", self._peers[peer_id], f"{hello.kind} '{hello.name}'")
-        peer = self._peers[peer_id]
+        self._welcome(peer_id, self._peers[peer_id], now_ns)
+
+    def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
         peer.greeted = True
         self._send(peer_id, wire.Welcome(self._session, peer.safe))
         if peer.missed is not None:
@@ -221,8 +237,10 @@ class Edge:
     def _objection(self, peer_id: bytes, hello: wire.Hello, now_ns: int) -> str | None:
         """Why this run cannot be taken in, if it cannot."""
         edge, known = self._config.edge, self._peers.get(peer_id)
-        if hello.streams:
-            return "this edge tracks nobody: the agent has to track itself"
+        if hello.streams and not self.tracks:
+            return "this edge tracks nobody: start it with --policy streamed, or the agent without --streamed"
+        if self.tracks and not hello.streams:
+            return "this edge tracks its agents (policy streamed): start the agent with --streamed"
         if known is not None:
             same = known.hello.name == hello.name
             return None if same else f"this run's number is in use by '{known.hello.name}'; start again"
@@ -244,6 +262,7 @@ class Edge:
     def _enter(self, peer_id: bytes, peer: Peer) -> None:
         self._peers[peer_id] = peer
         self._by_key[peer.key] = peer_id
+        self._keep(KeepRun(peer.key, peer.hello))
         self._effects.append(Join(peer.key, peer.hello))
 
     def _recall(self, run: Known) -> None:
@@ -349,6 +368,10 @@ class Edge:
         """Of every agent, its evaluations and what came of them (`share.core.schedule`)."""
         return {peer.hello.name: self._schedule.series(peer.hello.name) for peer in self._peers.values()}
 
+    def _report_of(self, peer: Peer) -> dict[str, Any]:
+        """What is known of it beside what was heard."""
+        return self._schedule.report(peer.hello.name)
+
     def report(self, mapped: dict[str, Any]) -> dict[str, Any]:
         """edge.json: per agent and in all, but for `series`. mapped: the mapper's report, whose `agents` are
         by run.
@@ -363,7 +386,7 @@ class Edge:
             **mapped,
             "agents": {
                 peer.hello.name if newest[peer.hello.name] is peer else peer.key: peer.report()
-                | self._schedule.report(peer.hello.name)
+                | self._report_of(peer)
                 | of_agents.get(peer.key, {})
                 for peer in self._peers.values()
             },

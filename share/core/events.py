@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from share.errors import ShareError
-from share.types import F64, Candidate, TrackState
+from share.types import F64, Candidate, Frame, TrackState, Wait
 from share.wire.codec import Bytes
 
 # ---------------------------------------------------------------- events
@@ -46,6 +46,21 @@ class KeyframeMade:
 
 
 @dataclass(frozen=True, eq=False)
+class FrameArrived:
+    """A frame for the edge to track, with the IMU samples since the one before; when it came in."""
+
+    frame: Frame
+    arrived_ns: int
+
+
+@dataclass(frozen=True)
+class NotTaken:
+    """Of a `SendFrame`: the link could not take it."""
+
+    index: int
+
+
+@dataclass(frozen=True, eq=False)
 class Received:
     """A message from the edge, undecoded."""
 
@@ -67,7 +82,7 @@ class Finished:
     """No frame will follow."""
 
 
-AgentEvent = Connected | FrameTracked | KeyframeMade | Received | Tick | Finished
+AgentEvent = Connected | FrameTracked | KeyframeMade | FrameArrived | NotTaken | Received | Tick | Finished
 
 # ---------------------------------------------------------------- effects
 
@@ -77,6 +92,23 @@ class Send:
     """Hand these frames to the link; whether they left is not reported back."""
 
     frames: Sequence[Bytes]
+
+
+@dataclass(frozen=True, eq=False)
+class SendFrame:
+    """The same for a frame to be tracked; if the link does not take it, `NotTaken` is the answer."""
+
+    index: int
+    frames: Sequence[Bytes]
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedAfar:
+    """The edge has tracked a frame; `FrameDone` follows. frame: as for one that is tracked here."""
+
+    frame: FrameTracked
+    sound: bool
+    waits: Wait | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,4 +174,4 @@ class Stop:
     """Everything is done: close the link."""
 
 
-AgentEffect = Send | Localised | CorrectionApplied | FrameDone | Say | Fail | Stop
+AgentEffect = Send | SendFrame | TrackedAfar | Localised | CorrectionApplied | FrameDone | Say | Fail | Stop

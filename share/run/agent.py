@@ -83,7 +83,7 @@ class AgentRun:
         self._source, self._settings = source, settings
         self._say, self._show, self._verbose = say, show, verbose
         self._machine = Agent(hello, settings)
-        self._tracker = tracker_for(source, settings)
+        self._prepare()
         self._files, self._log = AgentFiles(out, say), RunLog()
         self._error = error
         self._late = Late(settings.agent.late_ms)
@@ -95,6 +95,10 @@ class AgentRun:
         self._ended = False
         self.report: dict[str, Any] = {}
         self.trouble: str | None = None  # why the edge does not let this agent in
+
+    def _prepare(self) -> None:
+        """Raises what is wrong with the source before there is a link."""
+        self._tracker = tracker_for(self._source, self._settings)
 
     def stop(self) -> None:
         """End early, in good order: no more frames, but what was sent is still waited for."""

@@ -2,6 +2,8 @@
 
 link -> Edge (core) -> mapper's process (share.run.mapping) -> findings -> Edge -> link
                     -> keeper's thread (share.run.keeper)   -> what is safe -> acknowledgements
+     or by policy `streamed`
+link -> TrackingEdge -> a process each (share.run.tracking) -> poses -> TrackingEdge -> link
 """
 
 from __future__ import annotations
@@ -18,8 +20,11 @@ from pathlib import Path
 from typing import Any
 
 from share.config import Config
+from share.control.policies import POLICIES
+from share.core.afar import Answered, BeginTracking, EndTracking, Lost, Ready, Track
 from share.core.edge import Add, Edge, Effect, Event, Found, Join, Keep, Kept, Received, Record, Send, Tick
 from share.core.peer import known_runs
+from share.core.tracking_edge import TrackingEdge
 from share.io.files import atomic_write, check_writable, claim
 from share.io.line_file import LineFile
 from share.io.map_store import MapStore
@@ -27,6 +32,7 @@ from share.io.transport import EdgeLink
 from share.run.companion import Companion
 from share.run.keeper import Keeper
 from share.run.mapping import Mapped, Restore, map_all
+from share.run.tracking import Trackers
 
 TICK_MS = 50
 _REPORT_S = 1.0
@@ -44,7 +50,7 @@ class _Said:
 
 
 @dataclass(frozen=True)
-class _Lost:
+class _MapperLost:
     """The mapper's process has died."""
 
     how: str
@@ -90,8 +96,10 @@ class EdgeRun:
             while not self._stopping:
                 self._step()
         finally:
-            self._mapping.close()
+            if self._mapping is not None:
+                self._mapping.close()
             self._take_answers()
+            self._trackers.close()
             if self._keeper is not None:
                 self._keeper.close()
             self._link.close()
@@ -119,13 +127,22 @@ class EdgeRun:
 
     def _begin(self) -> None:
         """A new life: agents notice by its number, and send again what it lacks."""
+        self._mapped: dict[str, Any] = {}
+        self._mapping: Companion | None = None
+        self._keeper: Keeper | None = None
+        self._trackers = Trackers(self._settings, self._answered)
+        self._machine: Edge
+        if POLICIES[self._settings.edge.policy].raw:
+            self._machine = TrackingEdge(self._settings, secrets.randbits(63), began_ns=self._began_ns)
+        else:
+            self._begin_mapping()
+
+    def _begin_mapping(self) -> None:
         kept = None if self._store is None else self._store.load()
         writable = self._store is not None and self._store.writable
         known = () if kept is None else known_runs(kept)
         self._machine = Edge(self._settings, secrets.randbits(63), writable, known, self._began_ns)
-        self._mapped: dict[str, Any] = {}
         self._mapping = Companion("mapping", map_all, (self._settings,), self._answered, self._mapping_lost)
-        self._keeper: Keeper | None = None
         if kept is not None:
             self._mapping.send(Restore(kept))
         if self._store is not None and writable:
@@ -160,20 +177,24 @@ class EdgeRun:
             match self._inbox.get():
                 case Found() as found:
                     self._handle(found)
-                case Kept() as kept:
-                    self._handle(kept)
+                case Kept() | Ready() | Answered() as answer:
+                    self._handle(answer)
+                case Lost() as lost if not self._stopping:
+                    self._trouble[f"the tracker of {lost.key} {lost.how}"] = time.monotonic() + _UNWELL_S
+                    self._handle(lost)
                 case Mapped() as mapped:
                     self._mapped = mapped.report
                 case _Said() as said:
                     self._say(said.event, said.text)
-                case _Lost() as lost if not self._stopping:
-                    self._begin_anew(lost.how)
+                case _MapperLost() as gone if not self._stopping:
+                    self._begin_anew(gone.how)
 
     def _begin_anew(self, how: str) -> None:
         """The mapper has died: as if the whole edge had been restarted, to its agents too."""
         self._say("mapper lost", f"its process {how}; agents are asked for what is not in the map's file")
         self._trouble[f"the mapper's process {how}"] = time.monotonic() + _UNWELL_S
-        self._mapping.close()
+        if self._mapping is not None:
+            self._mapping.close()
         if self._keeper is not None:
             self._keeper.drain()
         self._begin()
@@ -186,8 +207,10 @@ class EdgeRun:
         match effect:
             case Send():
                 self._link.send(effect.peer, effect.frames)
-            case Join() | Add():
+            case Join() | Add() if self._mapping is not None:
                 self._mapping.send(effect)
+            case BeginTracking() | Track() | EndTracking():
+                self._trackers.do(effect)
             case Keep() if self._keeper is not None:
                 self._keeper.keep(effect)
             case Record():
@@ -203,7 +226,7 @@ class EdgeRun:
         self._answered(_Said("map", text))
 
     def _mapping_lost(self, how: str) -> None:
-        self._answered(_Lost(how))
+        self._answered(_MapperLost(how))
 
     # ------------------------------------------------------------------ what is said
 

@@ -10,6 +10,7 @@ from share.core.sequencer import SequencerCounters, sequence, streams_of
 from share.errors import DataError, MisfitError, UsageError
 from share.estimator.inertial.tracker import InertialTracker
 from share.estimator.visual import VisualTracker
+from share.geometry.camera import Rig
 from share.io.images import load
 from share.io.source import Source
 from share.types import Frame
@@ -46,9 +47,20 @@ def frames_of(
 
 
 def tracker_for(source: Source, config: Config) -> VisualTracker | InertialTracker:
-    """The estimator that fits the rig."""
-    if source.rig.imu is not None:
-        return InertialTracker(source.rig, config.inertial, config.tracker)
-    if source.rig.cam1 is None and source.rig.depth is None:
+    """The estimator that fits the source's rig. Raises UsageError where there is none."""
+    check_trackable(source)
+    return tracker_of(source.rig, config)
+
+
+def check_trackable(source: Source) -> None:
+    """Raises UsageError unless some estimator fits the rig."""
+    rig = source.rig
+    if rig.imu is None and rig.cam1 is None and rig.depth is None:
         raise UsageError(f"{source.name}: one camera alone gives no scale; stereo, depth or an IMU is needed")
-    return VisualTracker(source.rig, config.tracker)
+
+
+def tracker_of(rig: Rig, config: Config) -> VisualTracker | InertialTracker:
+    """The estimator that fits a rig. Raises ValueError where there is none."""
+    if rig.imu is not None:
+        return InertialTracker(rig, config.inertial, config.tracker)
+    return VisualTracker(rig, config.tracker)

@@ -20,13 +20,28 @@ from numpy.typing import NDArray
 
 from share.errors import WireError
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.types import DESCRIPTOR_BYTES, MAX_KEYPOINTS, AgentKind, Correction, Keyframe, TrackState, View
+from share.types import (
+    DESCRIPTOR_BYTES,
+    F32,
+    F64,
+    I64,
+    MAX_KEYPOINTS,
+    AgentKind,
+    Correction,
+    Frame,
+    ImuBatch,
+    Keyframe,
+    TrackState,
+    View,
+    Wait,
+)
 from share.wire import messages as m
 
 VERSION = 3
 MAX_HEADER_BYTES = 4096
 MAX_ARRAYS = 8
-MAX_FRAME_BYTES = MAX_KEYPOINTS * DESCRIPTOR_BYTES  # the largest array of any message
+MAX_FRAME_BYTES = MAX_KEYPOINTS * DESCRIPTOR_BYTES  # the largest array of any message but Frame
+MAX_IMAGE_BYTES = 4 * 1920 * 1200  # the largest of that: a depth image
 
 Bytes = bytes | memoryview
 Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
@@ -34,7 +49,7 @@ Ids = Annotated[tuple[Int64, ...], Meta(max_length=m.MAX_HELD)]
 Text = Annotated[str, Meta(max_length=m.MAX_TEXT)]
 Name = Annotated[str, Meta(max_length=64)]
 
-_DTYPES = {code: np.dtype(code) for code in ("<f8", "<f4", "|u1")}
+_DTYPES = {code: np.dtype(code) for code in ("<f8", "<f4", "<i8", "|u1")}
 
 
 class _Version(msgspec.Struct, array_like=True):
@@ -100,6 +115,8 @@ class _Array:
         if dtype != self.dtype or not self._admits(shape):
             raise ValueError(f"{self.path}: {dtype} of shape {shape[:4]}, expected {self.dtype} {self.shape}")
         size = prod(shape) * _DTYPES[dtype].itemsize
+        if size > MAX_IMAGE_BYTES:
+            raise ValueError(f"{self.path}: {size} bytes, at most {MAX_IMAGE_BYTES}")
         data = memoryview(frame)
         if data.nbytes != size:
             raise ValueError(f"{self.path}: {data.nbytes} bytes, its shape needs {size}")
@@ -119,6 +136,21 @@ class _Array:
 
     def _is_absent(self, shape: tuple[int, ...]) -> bool:
         return self.optional and shape == (0,)
+
+
+def _image(path: str, dtype: str = "|u1", optional: bool = False) -> _Array:
+    return _Array(path, dtype, (None, None), optional, m.MAX_SIDE)
+
+
+def _samples(path: str, dtype: str, *shape: int) -> _Array:
+    return _Array(path, dtype, (None, *shape), most=m.MAX_SAMPLES)
+
+
+def _frame(*, stamps_ns: I64, gyro: F64, accel: F64, **fields: Any) -> Frame:
+    depth: F32 | None = fields["depth"]
+    if depth is not None and not (np.isfinite(depth) & (depth >= 0)).all():
+        raise ValueError("depth: has values that are negative or not finite")
+    return Frame(**fields, imu=ImuBatch(stamps_ns, gyro, accel))
 
 
 @dataclass(frozen=True)
@@ -190,6 +222,19 @@ _LAYOUTS: dict[type, _Layout] = {
     ),
     m.Ping: _Layout(5, m.Ping, _Scalars.of(sequence=Int64, sent_ns=Int64)),
     m.Bye: _Layout(6, m.Bye),
+    Frame: _Layout(
+        7,
+        _frame,
+        _Scalars.of(stamp_ns=Int64, index=Int64, gap_ns=Int64),
+        (
+            _image("image0"),
+            _image("image1", optional=True),
+            _image("depth", "<f4", optional=True),
+            _samples("imu.stamps_ns", "<i8"),
+            _samples("imu.gyro", "<f8", 3),
+            _samples("imu.accel", "<f8", 3),
+        ),
+    ),
     m.Welcome: _Layout(16, m.Welcome, _Scalars.of(session=Int64, next_keyframe=Int64)),
     m.Refused: _Layout(17, m.Refused, _Scalars.of(reason=Text)),
     m.Ack: _Layout(18, m.Ack, _Scalars.of(next_keyframe=Int64, held=Ids)),
@@ -204,6 +249,20 @@ _LAYOUTS: dict[type, _Layout] = {
         21,
         m.Pong,
         _Scalars.of(sequence=Int64, sent_ns=Int64, received_ns=Int64, replied_ns=Int64, session=Int64),
+    ),
+    m.Tracked: _Layout(
+        22,
+        m.Tracked,
+        _Scalars.of(
+            index=Int64,
+            stamp_ns=Int64,
+            state=TrackState,
+            keyframe=bool,
+            new_stretch=bool,
+            sound=bool,
+            waits=Wait | None,
+        ),
+        (_pose("T_odom_body", optional=True),),
     ),
 }
 _BY_CODE = {layout.code: (cls, layout) for cls, layout in _LAYOUTS.items()}

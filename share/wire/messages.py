@@ -10,12 +10,13 @@ import math
 from dataclasses import dataclass
 
 from share.geometry.camera import Camera, Rig
-from share.types import F64, AgentKind, Correction, Keyframe, TrackState, checked_pose
+from share.types import F64, AgentKind, Correction, Frame, Keyframe, TrackState, Wait, checked_pose
 
 MAX_RATE_HZ = 1000.0
 MAX_HELD = 256  # ids in one Ack: the most keyframes that may wait at the edge for a gap to close
 MAX_TEXT = 512  # characters of anything a person reads
 MAX_SIDE = 8192  # px, of an image
+MAX_SAMPLES = 20_000  # of an IMU, in one frame
 PEER_BYTES = 8
 
 
@@ -163,6 +164,27 @@ class Pong:
     session: int
 
 
-Up = Hello | PoseUpdate | Keyframe | Evaluation | Ping | Bye
-Down = Welcome | Refused | Ack | Correction | Rate | Pong
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """What a streamed frame came to: its index and stamp, and of the tracker's result what an agent uses
+    (`share.estimator.result`). T_odom_body (4, 4) where the state has a pose."""
+
+    index: int
+    stamp_ns: int
+    state: TrackState
+    T_odom_body: F64 | None
+    keyframe: bool = False
+    new_stretch: bool = False
+    sound: bool = True
+    waits: Wait | None = None
+
+    def __post_init__(self) -> None:
+        if (self.T_odom_body is not None) != self.state.has_pose:
+            raise ValueError(f"T_odom_body: goes with a state that has a pose, not with {self.state}")
+        if self.T_odom_body is not None:
+            object.__setattr__(self, "T_odom_body", checked_pose("T_odom_body", self.T_odom_body))
+
+
+Up = Hello | PoseUpdate | Keyframe | Evaluation | Ping | Bye | Frame
+Down = Welcome | Refused | Ack | Correction | Rate | Pong | Tracked
 Message = Up | Down

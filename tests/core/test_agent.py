@@ -116,7 +116,7 @@ def test_bad_messages_are_counted_and_said_once_a_kind() -> None:
         lines += said(handle(agent, ev.Received(frames), S))
     assert agent.report()["bad_messages"] == 5
     assert len(lines) == 3
-    assert lines[-1] == "the edge sent a Bye, which only agents send"
+    assert lines[-1] == "the edge sent a Bye, which is not for this agent"
 
 
 def test_another_wire_version_is_said_in_words() -> None:

@@ -16,7 +16,7 @@ from wire_strategies import messages
 
 from share.errors import WireError
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.types import AgentKind, Correction, Keyframe, TrackState, View
+from share.types import AgentKind, Correction, Frame, ImuBatch, Keyframe, TrackState, View, Wait
 from share.wire import codec
 from share.wire import messages as m
 
@@ -35,6 +35,14 @@ def keyframe(n: int, id_: int = 7) -> Keyframe:
     return Keyframe(id_, id_ - 1, 10**18, POSE, np.eye(6), POSE, np.array([0, 0, 1.0]), 0.01, view)
 
 
+def frame(stereo: bool) -> Frame:
+    rng = np.random.default_rng(1)
+    image0, image1 = rng.integers(0, 256, (2, 12, 16)).astype(np.uint8)
+    depth = rng.uniform(0, 9, (10, 14)).astype(np.float32)
+    imu = ImuBatch(np.arange(5) + 10**18, rng.normal(size=(5, 3)), rng.normal(size=(5, 3)))
+    return Frame(10**18, 4, image0, *((image1, None) if stereo else (None, depth)), imu, 7)
+
+
 EXAMPLES: list[m.Message] = [
     m.Hello("ann", AgentKind.AR, 2**62, STEREO),
     m.PoseUpdate(1_700_000_000_123_456_789, TrackState.INERTIAL_ONLY, 2**31, POSE),
@@ -48,6 +56,10 @@ EXAMPLES: list[m.Message] = [
     Correction(POSE, np.eye(6), "map-1", 5, 3),
     m.Rate(4.5),
     m.Pong(1, 1, 2, 3, 2**62),
+    frame(True),
+    frame(False),
+    m.Tracked(4, 10**18, TrackState.OK, POSE, keyframe=True),
+    m.Tracked(5, 10**18, TrackState.INITIALISING, None, waits=Wait.TILT),
 ]
 
 
@@ -342,6 +354,53 @@ def test_a_rig_that_is_none_is_refused() -> None:
     loud = [*scalars[:7], {**scalars[7], "gyro_walk": float("inf")}, *scalars[8:]]
     with pytest.raises(WireError, match="noise or a rate"):
         codec.decode([header(version, code, loud, table), *frames[1:]])
+
+
+def injured_frame(at: int, entry: tuple[str, tuple[int, ...]], data: bytes) -> list[bytes]:
+    """A depth frame with array number `at` declared and sent in another way."""
+    frames = copied(codec.encode(frame(False)))
+    version, code, scalars, table = msgspec.msgpack.decode(frames[0])
+    table[at] = entry
+    head = header(version, code, scalars, table)
+    return [head, *frames[1 : at + 1], data, *frames[at + 2 :]]
+
+
+@pytest.mark.parametrize(
+    ("at", "entry", "data", "said"),
+    [
+        (0, ("|u1", (12,)), b"\0" * 12, "image0: |u1 of shape (12,)"),
+        (0, ("|u1", (0,)), b"", "image0: |u1 of shape (0,)"),
+        (0, ("|u1", (8193, 1)), b"\0" * 8193, "image0: |u1 of shape (8193, 1)"),
+        (0, ("|u1", (8192, 8192)), b"\0" * 9, "image0: 67108864 bytes, at most 9216000"),
+        (0, ("|u1", (12, 16)), b"\0" * 191, "image0: 191 bytes, its shape needs 192"),
+        (1, ("|u1", (0,)), b"\0", "image1: 1 bytes, its shape needs 0"),
+        (2, ("<f4", (1, 2)), np.array([[1, np.nan]], "<f4").tobytes(), "depth: has values"),
+        (2, ("<f4", (1, 2)), np.array([[1, -1]], "<f4").tobytes(), "depth: has values"),
+        (3, ("<i8", (4,)), b"\0" * 32, "gyro: shape (5, 3), expected (4, 3)"),
+        (3, ("<i8", (20_001,)), b"\0" * 160_008, "imu.stamps_ns: <i8 of shape (20001,)"),
+        (4, ("<f8", (5, 3)), np.full(15, np.inf).tobytes(), "gyro: has values that are not finite"),
+    ],
+)
+def test_a_frame_that_is_none_is_refused(
+    at: int, entry: tuple[str, tuple[int, ...]], data: bytes, said: str
+) -> None:
+    with pytest.raises(WireError, match=re.escape(said)):
+        codec.decode(injured_frame(at, entry, data))
+
+
+def test_images_are_not_copied_on_either_side() -> None:
+    sent = frame(True)
+    frames = codec.encode(sent)
+    assert np.shares_memory(np.frombuffer(frames[1], np.uint8), sent.image0)
+    got = codec.decode(copied(frames))
+    assert isinstance(got, Frame)
+    assert got.image0.base is not None and not got.image0.flags.owndata
+
+
+def test_a_pose_goes_with_its_state() -> None:
+    for state, T in ((TrackState.LOST, POSE), (TrackState.OK, None)):
+        with pytest.raises(ValueError, match="goes with a state that has a pose"):
+            m.Tracked(1, 2, state, T)
 
 
 def test_a_second_camera_stands_somewhere() -> None:

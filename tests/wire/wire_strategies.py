@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as hnp
 
 from share.geometry import se3
 from share.geometry.camera import MOST_TIMESHIFT_S, Camera, ImuNoise, Rig
-from share.types import AgentKind, Correction, Keyframe, TrackState, View
+from share.types import AgentKind, Correction, Frame, ImuBatch, Keyframe, TrackState, View, Wait
 from share.wire import messages as m
 
 int64 = st.integers(-(2**63), 2**63 - 1)
@@ -56,6 +56,25 @@ imus = st.builds(ImuNoise, amount, amount, amount, amount, amount)
 
 
 @st.composite
+def frames(draw: st.DrawFn) -> Frame:
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    (h, w, n), deep = draw(st.tuples(*[st.integers(0, 40)] * 3)), draw(st.integers(0, 2))
+    image0, image1 = rng.integers(0, 256, (2, h, w)).astype(np.uint8)
+    depth = rng.uniform(0, 9, (w, h)).astype(np.float32)
+    imu = ImuBatch(rng.integers(-(2**63), 2**63 - 1, n), rng.normal(size=(n, 3)), rng.normal(size=(n, 3)))
+    seen = [(None, None), (image1, None), (None, depth)][deep]
+    return Frame(draw(int64), draw(int64), image0, *seen, imu, draw(int64))
+
+
+@st.composite
+def tracked(draw: st.DrawFn) -> m.Tracked:
+    state = draw(st.sampled_from(TrackState))
+    T = draw(poses()) if state.has_pose else None
+    flags = draw(st.tuples(st.booleans(), st.booleans(), st.booleans(), st.none() | st.sampled_from(Wait)))
+    return m.Tracked(draw(int64), draw(int64), state, T, *flags)
+
+
+@st.composite
 def rigs(draw: st.DrawFn) -> Rig:
     cam1, depth = (draw(st.none() | st.tuples(cameras, poses())) or (None, None) for _ in range(2))
     shift_s = draw(st.floats(-MOST_TIMESHIFT_S, MOST_TIMESHIFT_S))
@@ -75,4 +94,6 @@ messages = st.one_of(
     st.builds(Correction, poses(), covs, names, int64, int64),
     st.builds(m.Rate, st.floats(0, m.MAX_RATE_HZ)),
     st.builds(m.Pong, int64, int64, int64, int64, int64),
+    frames(),
+    tracked(),
 )

@@ -17,7 +17,7 @@ from typing import Protocol
 
 from share.errors import TransportError, UsageError
 from share.io.keys import AgentKeys, EdgeKeys
-from share.wire.codec import Bytes
+from share.wire.codec import MAX_FRAME_BYTES, Bytes
 
 QUEUE_MESSAGES = 128  # a queue in either direction; poses at 30 Hz fill it in 4 s
 LINGER_MS = 200  # how long `close` may wait for a last message to leave
@@ -141,8 +141,10 @@ def connect(address: str, run_id: int, keys: AgentKeys | None = None) -> AgentLi
     return ZmqAgentLink(address, run_id, keys)
 
 
-def bind(address: str, keys: EdgeKeys | None = None) -> EdgeLink:
-    """A link that agents connect to. Raises UsageError, or TransportError if the port is in use."""
+def bind(address: str, keys: EdgeKeys | None = None, max_frame_bytes: int = MAX_FRAME_BYTES) -> EdgeLink:
+    """A link that agents connect to; who sends it a frame above `max_frame_bytes` is cut off.
+
+    Raises UsageError, or TransportError if the port is in use."""
     from share.io.transport.zeromq import ZmqEdgeLink
 
-    return ZmqEdgeLink(address, keys)
+    return ZmqEdgeLink(address, keys, max_frame_bytes)

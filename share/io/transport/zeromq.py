@@ -32,8 +32,8 @@ _COMMON: dict[int, int] = {
     zmq.HEARTBEAT_TIMEOUT: 2000,
     zmq.HEARTBEAT_TTL: 2000,
 }
-# With CURVE libzmq measures the sealed frame: name and nonce 16, authenticator 16, flags 1 byte more.
-_SEALED: dict[int, int] = {zmq.MAXMSGSIZE: MAX_FRAME_BYTES + 33}
+_SEAL_BYTES = 33  # libzmq measures the sealed frame: name and nonce 16, authenticator 16, flags 1 byte
+_SEALED: dict[int, int] = {zmq.MAXMSGSIZE: MAX_FRAME_BYTES + _SEAL_BYTES}
 _DEALER: dict[int, int] = {
     zmq.IMMEDIATE: 1,  # nothing queues for an edge that is not there
     zmq.RECONNECT_IVL: 100,
@@ -188,9 +188,12 @@ class ZmqEdgeLink:
     back within about a second, as after a break of the network.
     """
 
-    def __init__(self, address: str, keys: EdgeKeys | None = None) -> None:
+    def __init__(
+        self, address: str, keys: EdgeKeys | None = None, max_frame_bytes: int = MAX_FRAME_BYTES
+    ) -> None:
         self._target = check_keys(parse_address(address, bind=True), keys)
         self._keys = keys
+        self._options = _ROUTER | {zmq.MAXMSGSIZE: max_frame_bytes + (_SEAL_BYTES if keys else 0)}
         self.strangers = 0  # messages dropped because their sender is no agent
         self._open()
 
@@ -224,7 +227,7 @@ class ZmqEdgeLink:
         self._close(LINGER_MS)
 
     def _open(self) -> None:
-        self._link = _Socket(zmq.ROUTER, _ROUTER | (_SEALED if self._keys else {}), self._target)
+        self._link = _Socket(zmq.ROUTER, self._options, self._target)
         socket = self._link.socket
         self._door = None if self._keys is None else Doorkeeper(self._link.context, socket, self._keys)
         try:

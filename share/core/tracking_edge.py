@@ -1,0 +1,93 @@
+"""The edge that tracks its agents, each alone, from what they stream: policy `streamed`.
+
+It has no map. An agent is welcomed once its tracker is ready, so that its first frames are not lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+from share.core.afar import Afar, Answered, Lost, Ready, ToTracker
+from share.core.edge import Edge, Event
+from share.core.peer import Peer
+from share.core.window import Window
+from share.types import Frame
+from share.wire import messages as wire
+
+
+class TrackingEdge(Edge):
+    """Beside the effects of `Edge`, but for those to the mapper and the keeper: BeginTracking, Track and
+    EndTracking; it is told Ready, Answered and Lost."""
+
+    tracks: ClassVar[bool] = True
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self._afar: dict[str, Afar] = {}  # by the key of the run
+
+    def _react(self, event: Event, now_ns: int) -> None:
+        match event:
+            case Ready() | Answered() | Lost():
+                afar = self._afar[event.key]
+                if event.life == afar.life and afar.is_running:
+                    self._hear(self._by_key[event.key], afar, event, now_ns)
+            case _:
+                super()._react(event, now_ns)
+
+    def _hear(self, peer_id: bytes, afar: Afar, event: Ready | Answered | Lost, now_ns: int) -> None:
+        """Its tracker says so."""
+        peer = self._peers[peer_id]
+        match event:
+            case Ready():
+                afar.is_ready = True
+                self._welcome(peer_id, peer, now_ns)
+            case Answered():
+                peer.state = event.answer.state
+                self._send(peer_id, event.answer)
+                self._do(afar.answered(event.answer, now_ns))
+            case Lost():
+                may_do_better = afar.lost()
+                self._record(now_ns, "tracking lost", peer, f"its process {event.how}; odometry begins anew")
+                if may_do_better:
+                    self._do(afar.begin())
+                else:  # it says hello again after a while
+                    self._send(peer_id, wire.Refused(f"the process that is to track it {event.how}"))
+
+    def _told(self, peer_id: bytes, peer: Peer, message: wire.Message, now_ns: int) -> None:
+        if not isinstance(message, Frame):
+            peer.counts["unexpected"] += 1
+            return
+        try:
+            self._do(self._afar[peer.key].frame(message, now_ns))
+        except ValueError as error:
+            self._complain(peer, str(error), now_ns)
+
+    def _enter(self, peer_id: bytes, peer: Peer) -> None:
+        self._peers[peer_id] = peer
+        self._by_key[peer.key] = peer_id
+        window = Window(self._config.stream.window)
+        self._afar[peer.key] = Afar(peer.key, peer.hello.rig, window)
+
+    def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
+        """Now, or as soon as its tracker is ready."""
+        afar = self._afar[peer.key]
+        self._do(afar.begin())
+        if afar.is_ready:
+            super()._welcome(peer_id, peer, now_ns)
+
+    def _heard(self, peer: Peer, now_ns: int) -> None:
+        was_gone = peer.gone
+        super()._heard(peer, now_ns)
+        if was_gone:
+            self._do(self._afar[peer.key].begin())
+
+    def _gone(self, peer: Peer, what: str, reason: str, now_ns: int) -> None:
+        super()._gone(peer, what, reason, now_ns)
+        self._do(self._afar[peer.key].end())
+
+    def _do(self, effects: Sequence[ToTracker]) -> None:
+        self._effects.extend(effects)
+
+    def _report_of(self, peer: Peer) -> dict[str, Any]:
+        return super()._report_of(peer) | self._afar[peer.key].report()
