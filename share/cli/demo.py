@@ -10,7 +10,8 @@ import click
 
 from share.cli import options
 from share.cli.progress import LiveLine, Stages
-from share.config import POLICIES
+from share.config import POLICIES, STREAMED
+from share.errors import UsageError
 
 if TYPE_CHECKING:
     from share.metrics.ate import Ate
@@ -60,6 +61,8 @@ def demo(
     """
     folder = Path(out)
     options.load_config(config_file)  # what is wrong with this and the link is said before anything is made
+    if policy == STREAMED and true_error:
+        raise UsageError("--true-error: is of agents that track themselves; leave it out by policy streamed")
     if link is not None:
         from share.io.transport.shaped import network
 
@@ -79,7 +82,7 @@ def demo(
     folders = play(session, seconds, terms, folder, lambda now: live.write(_line(now)))
     live.end()
     result = score(session, folders)
-    click.echo(_table(result))
+    click.echo(_table(result, policy == STREAMED))
     if result.joint is not None:
         from share.io.picture import draw_trajectories
 
@@ -108,7 +111,7 @@ def _line(now: Progress) -> str:
     return f"frames: {frames}   in a shared map: {now.joined}   corrections: {now.corrections}"
 
 
-def _table(result: SessionScore) -> str:
+def _table(result: SessionScore, streamed: bool) -> str:
     joint = {} if result.joint is None else result.joint.agents
     head = (
         "agent",
@@ -143,6 +146,10 @@ def _table(result: SessionScore) -> str:
         )
     widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
     lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    if streamed:
+        untracked = ", ".join(f"{name} {agent.report['untracked']}" for name, agent in result.agents.items())
+        told = f"each tracked alone by the edge; frames without an answer: {untracked}"
+        return "\n".join([*lines, "", told])
     members = len(joint)
     verdict = (
         f"{members} of {len(result.agents)} agents in one map"

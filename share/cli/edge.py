@@ -69,11 +69,10 @@ def edge(
     raw = settings.edge.policy == STREAMED
     if raw and map_file is not None:
         raise UsageError("--map: there is none by policy streamed; leave it out, or take another policy")
+    most = MAX_IMAGE_BYTES if raw else MAX_FRAME_BYTES
     folder = None if out is None else Path(out)
     with ExitStack() as stack:
-        link = stack.enter_context(
-            closing(bind_link(bind, with_keys, MAX_IMAGE_BYTES if raw else MAX_FRAME_BYTES))
-        )
+        link = stack.enter_context(closing(bind_link(bind, with_keys, most)))
         store = None if map_file is None else stack.enter_context(_open_map(Path(map_file)))
         run = EdgeRun(settings, link, folder, lambda e: _tell(e, verbose), store)
         with on_stop(run.stop):

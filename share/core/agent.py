@@ -82,7 +82,8 @@ class Agent:
             case ev.FrameArrived() if self._streaming:
                 self._streaming.arrived(event, self._connected)
             case ev.NotTaken() if self._streaming:
-                self._streaming.not_taken(event.index)
+                self._streaming.not_taken(event.sent.index)
+                self._counts["bytes_up"] -= size(event.sent.frames)
             case ev.Received():
                 self._received(event, now_ns)
             case ev.Finished():

@@ -53,11 +53,11 @@ class FrameArrived:
     arrived_ns: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class NotTaken:
-    """Of a `SendFrame`: the link could not take it."""
+    """The link could not take this frame."""
 
-    index: int
+    sent: SendFrame
 
 
 @dataclass(frozen=True, eq=False)

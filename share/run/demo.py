@@ -12,6 +12,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from share.config import STREAMED
 from share.errors import ShareError
 from share.io.files import writable_dir
 from share.io.session import Session
@@ -51,7 +52,8 @@ class Terms:
         link = (
             () if self.link is None else ("--link", self.link, "--link-seed", str(1000 * self.seed + number))
         )
-        return (*link, *(("--true-error",) if self.true_error else ()), *self._settings())
+        flags = (("--true-error", self.true_error), ("--streamed", self.policy == STREAMED))
+        return (*link, *(flag for flag, wanted in flags if wanted), *self._settings())
 
     def _settings(self) -> tuple[str, ...]:
         return () if self.config is None else ("--config", self.config)

@@ -57,7 +57,7 @@ class StreamRun(AgentRun):
         match effect:
             case ev.SendFrame():
                 if not self._link.send(effect.frames):
-                    self._handle(ev.NotTaken(effect.index))
+                    self._handle(ev.NotTaken(effect))
             case ev.TrackedAfar():
                 self._log.add_result(effect.frame.new_stretch, effect.sound, effect.waits)
                 self._waits = effect.waits

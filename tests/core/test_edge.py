@@ -171,13 +171,6 @@ def test_a_name_in_use_is_refused_until_its_holder_is_silent():
     assert sent(tell(edge, 2, hello(run_id=2), 200 + 3100), m.Welcome)
 
 
-def test_who_streams_is_refused_by_an_edge_that_does_not_track():
-    edge = ed.Edge(Config(), 7)
-    effects = tell(edge, 1, replace(hello(), streams=True))
-    assert sent(effects, m.Refused)[0].reason == "this edge tracks nobody: the agent has to track itself"
-    assert not sent(effects, m.Welcome)
-
-
 def test_a_name_is_free_at_once_after_goodbye():
     edge = ed.Edge(Config(), 7)
     tell(edge, 1, hello())
