@@ -253,6 +253,22 @@ def test_an_oversized_frame_is_not_let_in_and_harms_nobody() -> None:
         context.term()
 
 
+@pytest.mark.parametrize("with_keys", [False, True], ids=["zmq", "curve"])
+def test_an_edge_that_takes_images_takes_them_up_to_its_bound(with_keys: bool, tmp_path: Path) -> None:
+    edge_keys, agent_keys = keys_in(tmp_path) if with_keys else (None, None)
+    most = 1_000_000
+    with (
+        closing(bind("tcp://127.0.0.1:0", edge_keys, most)) as edge,
+        closing(connect(edge.endpoint, 1, agent_keys)) as agent,
+    ):
+        eventually(lambda: agent.send([b"hello", bytes(most)]))
+        heard = eventually(lambda: edge.receive(100))
+        assert [len(frame) for frame in heard[1]] == [5, most]
+        assert agent.send([bytes(most + 1)])
+        assert edge.receive(500) is None  # its sender was cut off
+        eventually(lambda: agent.send([b"back"]) and edge.receive(100))
+
+
 def test_bytes_that_are_not_zeromq_harm_nobody() -> None:
     with closing(bind("tcp://127.0.0.1:0")) as edge, closing(connect(edge.endpoint, 2)) as agent:
         raw = socket.create_connection(("127.0.0.1", parse_address(edge.endpoint).port))
