@@ -31,10 +31,9 @@ import numpy as np  # noqa: E402
 from keyframe_making import make_unseen  # noqa: E402
 from keyframe_types import KeyframeSet, Spacing  # noqa: E402
 from measure_joins import configured  # noqa: E402
-from simulate import Row, play  # noqa: E402
+from simulate import SIMULATED, Row, play  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
-from share.config import POLICIES  # noqa: E402
 from share.emulate.recipe import Recipe  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 
@@ -45,7 +44,7 @@ Room = tuple[str, int, tuple[str, ...]]  # scene, seed, kinds
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("grid", nargs="*", metavar="SECTION.NAME=VALUE,VALUE…")
-    parser.add_argument("--policy", choices=POLICIES, default="share")
+    parser.add_argument("--policy", choices=SIMULATED, default="share")
     parser.add_argument("--link", default="wifi5")
     parser.add_argument("--scenes", nargs="+", default=["warehouse", "firestation"])
     parser.add_argument("--rooms", default="401:404", metavar="FIRST:END")
