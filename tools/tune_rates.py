@@ -140,12 +140,19 @@ def _draw(path: Path, names: list[str], values: list[list[str]], table: np.ndarr
     figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     for axis, column in zip(axes, (0, 2), strict=True):
         cells = table[:, column].reshape(shape).mean(axis=tuple(range(2, len(shape))))
-        image = axis.imshow(cells, cmap="viridis_r", aspect="auto", origin="lower")
+        image = axis.imshow(cells, cmap="Blues", aspect="auto", origin="lower")
         axis.set_xticks(range(shape[1]), values[1])
         axis.set_yticks(range(shape[0]), values[0])
         axis.set(xlabel=names[1], ylabel=names[0], title=f"{FIGURES[column]} / covins-g")
         for (i, j), cell in np.ndenumerate(cells):
-            axis.text(j, i, f"{cell:.2f}", ha="center", va="center", color="white")
+            axis.text(
+                j,
+                i,
+                f"{cell:.2f}",
+                ha="center",
+                va="center",
+                color="white" if image.norm(cell) > 0.5 else "black",
+            )
         figure.colorbar(image, ax=axis)
     figure.savefig(path, dpi=110)
 

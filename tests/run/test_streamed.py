@@ -43,7 +43,9 @@ def tracked_here(recording: Path) -> str:
     return format_tum(track(open_source(str(recording)), Config(), lambda done: None).trajectory)
 
 
-@pytest.mark.parametrize("link", [(), ("--link", "wifi5")], ids=["loopback", "wifi5"])
+@pytest.mark.parametrize(
+    "link", [(), pytest.param(("--link", "wifi5"), marks=pytest.mark.slow)], ids=["loopback", "wifi5"]
+)
 def test_poses_are_those_of_share_track(
     plain_session: Path, tmp_path: Path, config: Path, link: tuple[str, ...]
 ) -> None:
@@ -177,6 +179,7 @@ def test_what_does_not_go_together(what: str, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_the_whole_demo(plain_cache: Path, tmp_path: Path) -> None:
     settings = ("--scene", "plain", "--seconds", "3", "--seed", "18", "--policy", "streamed")
     done = subprocess.run(

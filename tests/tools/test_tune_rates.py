@@ -1,0 +1,39 @@
+"""A grid of the scheduler's settings in virtual time, as a person calls it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+TOOL = Path(__file__).parents[2] / "tools" / "tune_rates.py"
+
+
+def tuned(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, str(TOOL), *arguments], capture_output=True, text=True, timeout=300
+    )
+
+
+@pytest.mark.slow
+def test_fewer_keyframes_save_latency_and_a_picture_shows_it(tmp_path: Path) -> None:
+    one = ("--scenes", "warehouse", "--rooms", "501:502", "--workers", "1")
+    where = ("--json", str(tmp_path / "a.json"), "--picture", str(tmp_path / "a.png"))
+    done = tuned("control.rate_min_hz=0.5,1.5", "control.kp=0.8,3.2", *one, *where)
+    assert done.returncode == 0, done.stderr
+    rows = [line.split("|")[1:-1] for line in done.stdout.splitlines()[2:]]
+    latency = np.array([float(row[2].split("±")[0]) for row in rows])
+    assert len(rows) == 4 and (latency > 0.5).all() and (latency < 0.95).all()
+    assert latency[:2].mean() < latency[2:].mean()  # at most 0.5 Hz less, so sooner
+    runs = json.loads((tmp_path / "a.json").read_text())
+    assert len(runs) == 5 and {run["policy"] for run in runs} == {"covins-g", "share"}
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_is_no_setting_is_said() -> None:
+    done = tuned("control.kp")
+    assert (done.returncode, done.stderr) == (2, "tune_rates: 'control.kp': give SECTION.NAME=VALUE,VALUE…\n")
