@@ -250,7 +250,7 @@ class MergeConfig:
 
 
 STREAMED = "streamed"
-POLICIES = ("covins-g", "share", "linear", "equal", "random", STREAMED)  # see `share.control.policies`
+POLICIES = ("share", "covins-g", "linear", "equal", "random", STREAMED)  # see `share.control.policies`
 
 
 @dataclass(frozen=True)
