@@ -59,6 +59,8 @@ def main() -> int:
 def tune(options: argparse.Namespace) -> None:
     """Every point of the grid in every room."""
     names, values = _grid(options.grid)
+    if options.picture and len(names) < 2:
+        raise UsageError("--picture: of two settings or more")
     points = list(itertools.product(*values))
     first, end = map(int, options.rooms.split(":"))
     rooms: list[Room] = [
@@ -129,8 +131,6 @@ def _qoe(row: Row) -> float:
 
 def _draw(path: Path, names: list[str], values: list[list[str]], table: np.ndarray[Any, Any]) -> None:
     """Heat maps over the first two settings; means over the others."""
-    if len(names) < 2:
-        raise UsageError("--picture: of two settings or more")
     import matplotlib
 
     matplotlib.use("Agg")
