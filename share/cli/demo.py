@@ -10,12 +10,12 @@ import click
 
 from share.cli import options
 from share.cli.progress import LiveLine, Stages
+from share.cli.table import aligned
 from share.config import POLICIES, STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
     from share.metrics.ate import Ate
-    from share.run.demo import Progress
     from share.run.score import SessionScore
 
 _SEED = 11  # in this room all three soon look at the same things; in others 20 s may be too short for that
@@ -71,7 +71,7 @@ def demo(
     from share.emulate.session import cached_session
     from share.io.files import writable_dir
     from share.io.session import read_session
-    from share.run.demo import Terms, play
+    from share.run.play import Terms, play
     from share.run.score import score
 
     writable_dir(folder)
@@ -79,7 +79,7 @@ def demo(
         session = read_session(cached_session(recipe(_drawable(scene), seconds, seed), progress=stages))
     live = LiveLine()
     terms = Terms(policy, link, seed, true_error, config_file)
-    folders = play(session, seconds, terms, folder, lambda now: live.write(_line(now)))
+    folders = play(session, seconds, terms, folder, lambda now: live.write(str(now)))
     live.end()
     result = score(session, folders)
     click.echo(_table(result, policy == STREAMED))
@@ -104,11 +104,6 @@ def _drawable(scene: str | None) -> str:
     if reason is not None:
         click.echo(f"share: the plain room, because {reason}", err=True)
     return SCENE if reason is None else FALLBACK
-
-
-def _line(now: Progress) -> str:
-    frames = "  ".join(f"{name} {count}" for name, count in now.frames.items())
-    return f"frames: {frames}   in a shared map: {now.joined}   corrections: {now.corrections}"
 
 
 def _table(result: SessionScore, streamed: bool) -> str:
@@ -144,8 +139,7 @@ def _table(result: SessionScore, streamed: bool) -> str:
                 str(r["corrections"]),
             )
         )
-    widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
-    lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    lines = aligned(rows).splitlines()
     if streamed:
         untracked = ", ".join(f"{name} {agent.report['untracked']}" for name, agent in result.agents.items())
         told = f"each tracked alone by the edge; frames without an answer: {untracked}"

@@ -26,6 +26,7 @@ COMMANDS = {
     "edge": ("share.cli.edge", "edge", "Join the maps of all agents and send corrections back."),
     "dataset": ("share.cli.dataset", "dataset", "Look into, convert and recover recordings; export maps."),
     "emulate": ("share.cli.emulate", "emulate", "Record agents that move through a virtual room."),
+    "evaluate": ("share.cli.evaluate", "evaluate", "Play sessions on stated terms, score and compare them."),
     "keys": ("share.cli.keys", "keys", "Who may connect to an edge from another machine."),
 }
 

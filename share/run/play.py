@@ -1,4 +1,4 @@
-"""The whole system on this machine: an edge and an agent per recording, as processes of their own."""
+"""A session in real time on this machine: an edge and an agent per recording, as processes of their own."""
 
 from __future__ import annotations
 
@@ -30,6 +30,10 @@ class Progress:
     frames: dict[str, int]
     joined: int
     corrections: int
+
+    def __str__(self) -> str:
+        frames = "  ".join(f"{name} {count}" for name, count in self.frames.items())
+        return f"frames: {frames}   in a shared map: {self.joined}   corrections: {self.corrections}"
 
 
 @dataclass(frozen=True)

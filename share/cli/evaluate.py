@@ -1,0 +1,220 @@
+"""`share evaluate`: sessions played on stated terms, scored, and policies compared."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from share.cli import options
+from share.cli.progress import LiveLine
+from share.cli.run_table import table
+from share.config import POLICIES
+from share.errors import ShareError
+
+if TYPE_CHECKING:
+    from share.config import Config
+    from share.metrics.figures import RunFigures
+    from share.run.play import Progress
+    from share.run.trial import Trial
+
+BASE = "covins-g"  # what the others are told as a part of
+
+_link = click.option(
+    "--link", metavar="NAME|FILE", help="Through an emulated network, as share agent --link."
+)
+_true_error = click.option("--true-error", is_flag=True, help="Agents tell the edge their true error.")
+
+
+@click.group()
+def evaluate() -> None:
+    """Play sessions on stated terms, score them, and compare policies.
+
+    \b
+    Example:  share emulate --scene warehouse --motion paper:1 --seconds 60 --out room1
+              share evaluate run room1 --link wifi5 --out runs/one
+              share evaluate score runs/one
+              share evaluate ablation room1 --link wifi5 --out ablation
+    """
+
+
+@evaluate.command(short_help="Play a session in real time, and keep everything.")
+@click.argument("session", type=click.Path(path_type=Path))
+@click.option("--policy", type=click.Choice(POLICIES), default=POLICIES[0], show_default=True)
+@_link
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of link and scheduler.")
+@_true_error
+@options.config
+@click.option("--out", required=True, metavar="RUN", type=click.Path(path_type=Path), help="A new folder.")
+def run(
+    session: Path,
+    policy: str,
+    link: str | None,
+    seed: int,
+    true_error: bool,
+    config_file: str | None,
+    out: Path,
+) -> None:
+    """Play SESSION in real time: an edge and its agents, each a process of its own.
+
+    RUN holds what they leave, the settings in effect and what else is needed to play it again. It is
+    whole or not there: a run that is broken off leaves nothing.
+
+    \b
+    Example:  share evaluate run room1 --policy covins-g --link wifi5 --out runs/covins
+    """
+    config, live = _settings(config_file, link), LiveLine()
+    from share.io.session import read_session
+    from share.run.figures import figures
+    from share.run.play import Terms
+    from share.run.trial import run_trial
+
+    terms = Terms(policy, link, seed, true_error)
+    trial = run_trial(read_session(session), terms, config, out, lambda now: live.write(str(now)))
+    live.end()
+    click.echo(table(figures(trial)))
+
+
+@evaluate.command(short_help="Errors, latency, merges and QoE of runs.")
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--csv", "csv_file", metavar="FILE", type=click.Path(path_type=Path), help="A line an agent.")
+@options.as_json
+def score(runs: tuple[Path, ...], csv_file: Path | None, as_json: bool) -> None:
+    """Score RUNS, folders by `share evaluate run`, against the truth of their sessions.
+
+    \b
+    Example:  share evaluate score runs/*
+    """
+    from share.io.files import atomic_write, check_writable
+    from share.run.figures import figures
+    from share.run.report import PROTOCOL, agents_csv
+    from share.run.trial import read_trial
+
+    if csv_file is not None:
+        check_writable(csv_file)
+    trials = [read_trial(folder) for folder in runs]
+    found = [figures(trial) for trial in trials]
+    if csv_file is not None:
+        atomic_write(csv_file, agents_csv(found))
+    if as_json:
+        told = [_plain(one) | {"record": trial.record} for one, trial in zip(found, trials, strict=True)]
+        click.echo(json.dumps({"protocol": PROTOCOL, "runs": told}, default=str))
+        return
+    for one, trial in zip(found, trials, strict=True):
+        machine = trial.record["machine"]
+        click.echo(table(one))
+        click.echo(
+            f"played {trial.record['began']} by SHARE {trial.record['version']} on {machine['cores']} cores "
+            f"of {machine['cpu']}, load before {machine['load']:g}\n"
+        )
+    click.echo("\n".join(PROTOCOL))
+
+
+@evaluate.command(short_help="All policies on sessions, in turn, compared.")
+@click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--policy",
+    "chosen",
+    type=click.Choice(POLICIES),
+    multiple=True,
+    help="May be repeated.  [default: all that share a map]",
+)
+@_link
+@click.option("--seeds", type=click.IntRange(1), default=1, show_default=True, help="How many: 0, 1, …")
+@_true_error
+@options.config
+@click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path))
+def ablation(
+    sessions: tuple[Path, ...],
+    chosen: tuple[str, ...],
+    link: str | None,
+    seeds: int,
+    true_error: bool,
+    config_file: str | None,
+    out: Path,
+) -> None:
+    """Play SESSIONS by each policy with each seed, and compare the policies.
+
+    Policies follow each other on each session, so that a machine that slows down does so for all. In DIR:
+    a folder a run, agents.csv, runs.csv, report.md and pictures. Broken off, the same command goes on
+    where it stopped.
+
+    \b
+    Example:  share evaluate ablation room1 room2 --policy share --policy covins-g --link wifi5 --out two
+    """
+    config, live = _settings(config_file, link), LiveLine()
+    from share.io.files import writable_dir
+    from share.io.session import read_session
+    from share.run.ablation import go_through, plan
+    from share.run.figures import figures
+    from share.run.play import Terms
+
+    policies = chosen or tuple(policy for policy in POLICIES if policy != "streamed")
+    opened = [read_session(folder) for folder in sessions]
+    planned = plan(opened, policies, range(seeds), Terms("", link, 0, true_error), out / "runs")
+    writable_dir(out)
+    trials: list[Trial] = []
+    failed: list[str] = []
+
+    def show(number: int, now: Progress | None) -> None:
+        name = planned[number].out.name
+        live.write(f"{number + 1} of {len(planned)}: {name}  {now or ''}")
+
+    for one, came in go_through(planned, config, show):
+        if isinstance(came, ShareError):
+            failed.append(one.out.name)
+            live.end()
+            click.echo(f"share: {one.out.name}: {came}", err=True)
+        else:
+            trials.append(came)
+    live.end()
+    if trials:
+        _write(out, [figures(trial) for trial in trials], trials)
+    if failed:
+        raise ShareError(f"{len(failed)} of {len(planned)} runs failed; the same command plays them again")
+
+
+def _write(out: Path, found: list[RunFigures], trials: list[Trial]) -> None:
+    from share.io.files import atomic_write
+    from share.metrics.comparison import policies
+    from share.run.report import agents_csv, draw, markdown, runs_csv
+
+    names = policies(found)
+    report = markdown(found, trials, BASE if BASE in names else names[0])
+    atomic_write(out / "agents.csv", agents_csv(found))
+    atomic_write(out / "runs.csv", runs_csv(found))
+    atomic_write(out / "report.md", report)
+    pictures = draw(out, found)
+    click.echo(report)
+    click.echo(f"report: {out / 'report.md'}   pictures: {', '.join(map(str, pictures))}")
+
+
+def _settings(config_file: str | None, link: str | None) -> Config:
+    """What is wrong with either is said before anything is played."""
+    config = options.load_config(config_file)
+    if link is not None:
+        from share.io.transport.shaped import network
+
+        network(link)
+    return config
+
+
+def _plain(run: RunFigures) -> dict[str, Any]:
+    """For JSON, which knows no NaN."""
+    return {name: _known(value) for name, value in (dataclasses.asdict(run) | {"metres": run.metres}).items()}
+
+
+def _known(value: Any) -> Any:
+    match value:
+        case float() if math.isnan(value):
+            return None
+        case dict():
+            return {name: _known(one) for name, one in value.items()}
+        case list() | tuple():
+            return [_known(one) for one in value]
+        case _:
+            return value

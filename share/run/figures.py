@@ -1,0 +1,124 @@
+"""The figures of a trial, from the files that its agents and its edge left."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from share.errors import DataError
+from share.metrics.ate import Ate
+from share.metrics.figures import AgentFigures, Conditions, RunFigures
+from share.metrics.rpe import Rpe, rpe_frames, rpe_time
+from share.run.score import AgentScore, SessionScore, score
+from share.run.trial import Trial
+
+
+def figures(trial: Trial) -> RunFigures:
+    """Raises DataError on damaged files."""
+    found = score(trial.session, trial.folders)
+    edge = _read(trial.folder / "edge" / "edge.json")
+    joined_s = _joined(trial.folder / "edge" / "events.jsonl")
+    agents = tuple(
+        _of_agent(name, str(trial.session.agents[name].kind), one, found, edge, joined_s.get(name, math.nan))
+        for name, one in found.agents.items()
+    )
+    merges = edge.get("merges", {})
+    terms = trial.terms
+    return RunFigures(
+        Conditions(trial.session.folder.name, terms.policy, terms.link or "", terms.seed),
+        agents,
+        in_one_map=0 if found.joint is None else len(found.joint.agents),
+        joint_ate_cm=_cm(None if found.joint is None else found.joint.joint),
+        merges_requested=merges.get("requested", 0),
+        merges_skipped=merges.get("skipped", 0),
+        merges_done=merges.get("done", 0),
+    )
+
+
+def _of_agent(
+    name: str, kind: str, one: AgentScore, found: SessionScore, edge: dict[str, Any], joined_s: float
+) -> AgentFigures:
+    report, in_map = one.report, None if found.joint is None else found.joint.agents.get(name)
+    track, corrected = report["track_ms"], report["corrected_ms"]
+    frame, second = _rpe(one, rpe_frames), _rpe(one, rpe_time)
+    span_s = float(one.truth.stamps_ns[-1] - one.truth.stamps_ns[0]) / 1e9
+    qoe = [value for value in edge["series"].get(name, {}).get("qoe", []) if value is not None]
+    return AgentFigures(
+        agent=name,
+        kind=kind,
+        frames=report["frames"],
+        tracked=report["tracked"],
+        latency_ms=_number(report["latency_ms"]["mean"]),
+        track_ms=_number(track["mean"]),
+        track_p95_ms=_number(track["p95"]),
+        track_p99_ms=_number(track["p99"]),
+        over_20ms=_number(report["over_20ms"]),
+        corrected=corrected["n"],
+        corrected_ms=_number(corrected["mean"]),
+        corrected_p50_ms=_number(corrected["p50"]),
+        corrected_p95_ms=_number(corrected["p95"]),
+        odom_ate_cm=_cm(one.odometry),
+        ate_cm=_cm(in_map),
+        in_map=0 if in_map is None else in_map.n,
+        rpe_frame_cm=frame[0],
+        rpe_frame_deg=frame[1],
+        rpe_1s_cm=second[0],
+        rpe_1s_deg=second[1],
+        metres=float(np.linalg.norm(np.diff(one.truth.T[:, :3, 3], axis=0), axis=1).sum()),
+        joined_s=joined_s,
+        keyframes=report["keyframes"],
+        sent=report["sent"],
+        rate_hz=_number(report["rate_hz"]),
+        kb_up_s=report["bytes_up"] / 1e3 / span_s,
+        kb_down_s=report["bytes_down"] / 1e3 / span_s,
+        cpu_ms_per_frame=_number(report["cpu_ms_per_frame"]),
+        qoe=float(np.mean(qoe)) if qoe else math.nan,
+    )
+
+
+def _rpe(one: AgentScore, measure: Any) -> tuple[float, float]:
+    """rms, cm and degrees."""
+    try:
+        rpe: Rpe | None = None if one.map is None else measure(one.map, one.truth)
+    except DataError:  # too few poses
+        rpe = None
+    return (
+        (math.nan, math.nan) if rpe is None else (100 * rpe.translation.rmse, math.degrees(rpe.rotation.rmse))
+    )
+
+
+def _joined(events: Path) -> dict[str, float]:
+    """When each agent was first in one map with another, s since the first of all came to the edge."""
+    began: float | None = None
+    where: dict[str, str] = {}
+    joined: dict[str, float] = {}
+    for line in events.read_text().splitlines():
+        event = json.loads(line)
+        if event["event"] == "joined the edge" and began is None:
+            began = event["t_s"]
+        if event["event"] == "correction":
+            where[event["agent"]] = event["map_id"]
+            together = [name for name, map_id in where.items() if map_id == event["map_id"]]
+            for name in together if len(together) > 1 else ():
+                joined.setdefault(name, event["t_s"] - (began or 0.0))
+    return joined
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        found: dict[str, Any] = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read: {error}") from None
+    return found
+
+
+def _cm(ate: Ate | None) -> float:
+    return math.nan if ate is None else 100 * ate.rmse
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value

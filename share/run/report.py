@@ -1,0 +1,181 @@
+"""Figures of trials as text and pictures: CSV for a program, Markdown for a reader."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from share.io.charts import draw_bars
+from share.metrics.bootstrap import Interval
+from share.metrics.comparison import MEASURES, compare, no_worse, policies
+from share.metrics.figures import AgentFigures, Conditions, RunFigures
+from share.metrics.latency import NOTICED_MS
+from share.run.trial import Trial
+
+_AGENT = [field.name for field in dataclasses.fields(AgentFigures)]
+_CONDITIONS = [field.name for field in dataclasses.fields(Conditions)]
+_RUN = ("in_one_map", "joint_ate_cm", "merges_requested", "merges_skipped", "merges_done", "merges_per_metre")
+PROTOCOL = (
+    "latency: mean over all frames' track_ms and all corrected_ms together; ms from a frame's arrival",
+    "poses: causal, every frame that has one; truth interpolated at their stamps over at most 100 ms",
+    "odom ATE: rms, SE3-aligned, each agent alone; map ATE: rms under one SE3 alignment for all in one map",
+    "RPE: rms of poses in the map, from frame to frame and over 1 s, no alignment; docs/evaluation.md",
+)
+
+
+def agents_csv(runs: Iterable[RunFigures]) -> str:
+    """A line an agent and run."""
+    return _csv(
+        [*_CONDITIONS, *_AGENT],
+        ([*_conditions(run), *(getattr(agent, f) for f in _AGENT)] for run in runs for agent in run.agents),
+    )
+
+
+def runs_csv(runs: Iterable[RunFigures]) -> str:
+    """A line a run."""
+    return _csv(
+        [*_CONDITIONS, *_RUN, "metres"],
+        ([*_conditions(run), *(getattr(run, f) for f in _RUN), run.metres] for run in runs),
+    )
+
+
+def markdown(runs: Sequence[RunFigures], trials: Sequence[Trial], base: str) -> str:
+    """All policies against `base`."""
+    names = policies(runs)
+    parts = [
+        "# Policies compared",
+        _provenance(runs, trials),
+        f"## Each policy, and as a part of `{base}`",
+        _comparison(runs, names, base),
+        "In brackets: 95 % by drawing the runs again (pairs of the same session, link and seed).",
+    ]
+    others = [name for name in names if name != names[0]]
+    if others:
+        parts += [f"## Errors by `{names[0]}`", *(_wins(runs, names[0], other) for other in others)]
+    parts += ["## Every agent", _every_agent(runs, names)]
+    return "\n\n".join(parts) + "\n"
+
+
+def draw(folder: Path, runs: Sequence[RunFigures]) -> list[Path]:
+    """Latency and error of every agent on every session, by policy; the pictures' paths."""
+    names, sessions = policies(runs), list(dict.fromkeys(run.conditions.session for run in runs))
+    agents = list(dict.fromkeys(agent.agent for run in runs for agent in run.agents))
+    figures = {
+        "latency.png": ("latency_ms", "ms", NOTICED_MS),
+        "ate.png": ("ate_cm", "cm", None),
+    }
+    for file, (field, unit, line) in figures.items():
+        panels = {
+            agent: {
+                name: [_mean_of(runs, name, session, agent, field) for session in sessions] for name in names
+            }
+            for agent in agents
+        }
+        draw_bars(folder / file, panels, sessions, unit, line)
+    return [folder / file for file in figures]
+
+
+def _provenance(runs: Sequence[RunFigures], trials: Sequence[Trial]) -> str:
+    records = [trial.record for trial in trials]
+    machines = {
+        f"{r['machine']['cpu']}, {r['machine']['cores']} cores, {r['machine']['system']}" for r in records
+    }
+    loads = [r["machine"]["load"] for r in records]
+    told = [
+        f"{len(runs)} runs in real time, every agent and the edge a process, "
+        f"{min(r['began'] for r in records)} to {max(r['began'] for r in records)}.",
+        f"Sessions: {', '.join(sorted({run.conditions.session for run in runs}))}; "
+        f"links: {', '.join(sorted({run.conditions.link or 'loopback' for run in runs}))}; "
+        f"seeds: {', '.join(map(str, sorted({run.conditions.seed for run in runs})))}.",
+        f"Machine: {'; '.join(sorted(machines))}; load before a run {min(loads):g} to {max(loads):g}.",
+        f"SHARE {', '.join(sorted({r['version'] for r in records}))}; "
+        + (
+            "evaluations tell the true error"
+            if records[0]["true_error"]
+            else "evaluations tell odometry's sigma"
+        )
+        + ".",
+    ]
+    return "\n".join(f"* {line}" for line in (*told, *(f"{text[0].upper()}{text[1:]}." for text in PROTOCOL)))
+
+
+def _comparison(runs: Sequence[RunFigures], names: Sequence[str], base: str) -> str:
+    found = {name: compare(runs, name, base) for name in names}
+    rows = [["", *names]]
+    for k, measure in enumerate(MEASURES):
+        cells = []
+        for name in names:
+            one = found[name][k]
+            ratio = "" if name == base else f"; {_interval(one.ratio)}"
+            cells.append(_number(one.value.value) + ratio)
+        rows.append([f"{measure.name}{', ' + measure.unit if measure.unit else ''}", *cells])
+    return _markdown(rows)
+
+
+def _wins(runs: Sequence[RunFigures], name: str, other: str) -> str:
+    better, of = no_worse(runs, name, other)
+    told = f"in {better} of {of} runs of an agent (those in which it is in the map by both)"
+    return f"* no more than by `{other}` {told}"
+
+
+def _every_agent(runs: Sequence[RunFigures], names: Sequence[str]) -> str:
+    rows = [["session", "agent", *(f"{name}: ms, cm" for name in names)]]
+    for session in dict.fromkeys(run.conditions.session for run in runs):
+        for agent in dict.fromkeys(
+            a.agent for r in runs if r.conditions.session == session for a in r.agents
+        ):
+            cells = [
+                f"{_number(_mean_of(runs, name, session, agent, 'latency_ms'))}, "
+                f"{_number(_mean_of(runs, name, session, agent, 'ate_cm'))}"
+                for name in names
+            ]
+            rows.append([session, agent, *cells])
+    return _markdown(rows)
+
+
+def _mean_of(runs: Sequence[RunFigures], policy: str, session: str, agent: str, field: str) -> float:
+    values = [
+        getattr(one, field)
+        for run in runs
+        if run.conditions.policy == policy and run.conditions.session == session
+        for one in run.agents
+        if one.agent == agent
+    ]
+    known = [value for value in values if not math.isnan(value)]
+    return sum(known) / len(known) if known else math.nan
+
+
+def _conditions(run: RunFigures) -> list[object]:
+    return [getattr(run.conditions, name) for name in _CONDITIONS]
+
+
+def _csv(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(head)
+    for row in rows:
+        writer.writerow([_cell(value) for value in row])
+    return text.getvalue()
+
+
+def _cell(value: object) -> object:
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.6g}"
+    return value
+
+
+def _markdown(rows: Sequence[Sequence[str]]) -> str:
+    head, *body = rows
+    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *body))
+
+
+def _interval(of: Interval) -> str:
+    return "–" if math.isnan(of.value) else f"{of.value:.2f} [{of.low:.2f}, {of.high:.2f}]"
+
+
+def _number(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.3g}"

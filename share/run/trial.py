@@ -1,0 +1,114 @@
+"""A trial: a session played in real time on stated terms, kept with what is needed to do it again.
+
+Its folder holds what the agents and the edge left, `config.yaml` (the settings in effect) and `run.json`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from share import __version__
+from share.config import Config
+from share.errors import DataError, UsageError
+from share.io.files import atomic_write, new_folder
+from share.io.machine import describe_machine
+from share.io.session import Session, read_session
+from share.io.trajectory import read_tum
+from share.run.play import Progress, Terms, play
+from share.strict import to_mapping
+
+RUN = "run.json"
+SETTINGS = "config.yaml"
+SCHEMA = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One that is over. record: run.json."""
+
+    folder: Path
+    session: Session
+    terms: Terms
+    record: dict[str, Any]
+
+    @property
+    def folders(self) -> dict[str, Path]:
+        """Of each agent's files, by name."""
+        return {name: self.folder / name for name in self.session.agents}
+
+
+def run_trial(
+    session: Session, terms: Terms, config: Config, out: Path, show: Callable[[Progress], None]
+) -> Trial:
+    """Plays it. `out` is whole or not there. config: for all; what it draws is drawn by the seed of `terms`.
+
+    Raises UsageError where `out` is there already or the session has no truth, ShareError where an agent or
+    the edge fails.
+    """
+    seconds = _seconds(session)
+    with new_folder(out) as work:
+        atomic_write(work / SETTINGS, settings_of(config, terms.seed))
+        began, machine = datetime.now(UTC), describe_machine()
+        play(session, seconds, dataclasses.replace(terms, config=str(work / SETTINGS)), work, show)
+        record = {
+            "schema": SCHEMA,
+            "session": str(session.folder.resolve()),
+            "provenance": session.provenance,
+            "policy": terms.policy,
+            "link": terms.link,
+            "seed": terms.seed,
+            "true_error": terms.true_error,
+            "seconds": seconds,
+            "began": began.isoformat(timespec="seconds"),
+            "took_s": round((datetime.now(UTC) - began).total_seconds(), 1),
+            "version": __version__,
+            "machine": machine,
+        }
+        atomic_write(work / RUN, json.dumps(record, indent=2, default=str) + "\n")
+    return read_trial(out)
+
+
+def read_trial(folder: Path) -> Trial:
+    """Raises UsageError or DataError where `folder` is not one that is over."""
+    path = folder / RUN
+    if not path.is_file():
+        raise UsageError(f"{folder}: has no {RUN}; it is not a run by `share evaluate run`")
+    try:
+        record = json.loads(path.read_text())
+        terms = Terms(record["policy"], record["link"], record["seed"], record["true_error"])
+        session = record["session"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: is damaged: {error!r}") from None
+    if not Path(session).is_dir():
+        raise UsageError(f"{path}: its session {session} is not there any more, and with it the truth")
+    return Trial(folder, read_session(Path(session)), terms, record)
+
+
+def settings_of(config: Config, seed: int) -> str:
+    """The text of config.yaml: `config`, with draws of the scheduler of their own for each seed."""
+    import yaml
+
+    control = config.control
+    drawn = dataclasses.replace(
+        control, gate_seed=control.gate_seed + seed, random_seed=control.random_seed + seed
+    )
+    text: str = yaml.safe_dump(to_mapping(dataclasses.replace(config, control=drawn)), sort_keys=False)
+    return text
+
+
+def _seconds(session: Session) -> float:
+    """Of the longest truth."""
+    spans = []
+    for name in session.agents:
+        path = session.folder / "truth" / f"{name}.tum"
+        if not path.is_file():
+            raise UsageError(f"{path}: no such file; without the truth of all agents nothing can be scored")
+        stamps_ns = read_tum(path).stamps_ns
+        spans.append((int(stamps_ns[-1]) - int(stamps_ns[0])) / 1e9 if len(stamps_ns) else 0.0)
+    return max(spans)

@@ -1,0 +1,109 @@
+"""`share evaluate` as a user types it: a session played, scored, and policies compared."""
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from share.cli.main import main
+
+
+class Done(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def evaluate(capsys) -> Callable[..., Done]:
+    """`share evaluate ARGUMENTS`."""
+
+    def run(*arguments: object) -> Done:
+        with pytest.raises(SystemExit) as end:
+            main(["evaluate", *map(str, arguments)])
+        assert isinstance(end.value.code, int)
+        return Done(end.value.code, *capsys.readouterr())
+
+    return run
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+def runs_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_run_is_scored_compared_and_never_overwritten(evaluate, plain_session, tmp_path):
+    out = tmp_path / "ablation"
+    arguments = ("ablation", plain_session, "--policy", "covins-g", "--true-error", "--out", out)
+    done = evaluate(*arguments)
+    assert done.code == 0, done.err
+    assert done.err == ""
+    (run,) = (out / "runs").iterdir()
+    assert {"config.yaml", "run.json", "edge", "ar1", "robot"} <= {path.name for path in run.iterdir()}
+    assert "| AR latency, ms |" in (out / "report.md").read_text()
+    assert (out / "report.md").read_text().strip() in done.out
+    for picture in ("latency.png", "ate.png"):
+        assert (out / picture).read_bytes().startswith(b"\x89PNG")
+
+    scored = evaluate("score", run, "--csv", tmp_path / "one.csv")
+    assert scored.code == 0, scored.err
+    assert "policy covins-g, loopback, seed 0" in scored.out
+    rows = rows_of(tmp_path / "one.csv")
+    assert [row["agent"] for row in rows] == ["ar1", "ar2", "robot"]
+    assert {row["frames"] for row in rows} == {"45"}
+    assert rows == rows_of(out / "agents.csv")
+    told = json.loads(evaluate("score", run, "--json").out)["runs"][0]
+    assert told["conditions"] == {"session": plain_session.name, "policy": "covins-g", "link": "", "seed": 0}
+    assert told["record"]["machine"]["cores"] >= 1
+    assert told["agents"][0]["latency_ms"] == pytest.approx(float(rows[0]["latency_ms"]), rel=1e-5)
+
+    again = evaluate("run", plain_session, "--out", run)
+    assert again.code == 2
+    assert "give a new name" in again.err
+    before = (run / "run.json").stat().st_mtime_ns
+    assert evaluate(*arguments).code == 0  # there is nothing left to play
+    assert (run / "run.json").stat().st_mtime_ns == before
+    other = evaluate(*(word for word in arguments if word != "--true-error"))
+    assert other.code == 2
+    assert "was played on other terms" in other.err
+
+
+@pytest.mark.slow
+def test_what_is_missing_is_played_the_next_time(evaluate, plain_session, tmp_path):
+    out = tmp_path / "two"
+    arguments = ("ablation", plain_session, "--policy", "share", "--policy", "covins-g", "--out", out)
+    assert evaluate(*arguments).code == 0
+    kept, gone = sorted((out / "runs").iterdir())
+    before = (kept / "run.json").stat().st_mtime_ns
+    shutil.rmtree(gone)
+    assert evaluate(*arguments).code == 0
+    assert len(runs_in(out / "runs")) == 2
+    assert (kept / "run.json").stat().st_mtime_ns == before
+
+
+def test_what_is_wrong_is_said_before_anything_is_played(evaluate, plain_session, tmp_path):
+    for arguments, what in (
+        (("run", plain_session, "--link", "wifi6", "--out", tmp_path / "r"), "wifi6"),
+        (("run", tmp_path, "--out", tmp_path / "r"), "session.yaml"),
+        (("score", tmp_path), "has no run.json"),
+        (("ablation", plain_session, plain_session, "--out", tmp_path / "r"), "two sessions are called"),
+    ):
+        done = evaluate(*arguments)
+        assert done.code in (1, 2)
+        assert what in done.err
+        assert done.err.count("\n") == 1
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for path in plain_session.glob("*.*"):
+        shutil.copy(path, bare)
+    done = evaluate("run", bare, "--out", tmp_path / "r")
+    assert done.code == 2
+    assert "without the truth of all agents nothing can be scored" in done.err
+    assert not (tmp_path / "r").exists()

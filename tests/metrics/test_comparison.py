@@ -1,0 +1,63 @@
+"""Policies against each other, by hand."""
+
+import dataclasses
+import math
+
+import pytest
+
+from share.metrics.comparison import MEASURES, compare, no_worse, policies
+from share.metrics.figures import AgentFigures, Conditions, RunFigures
+
+NAN = math.nan
+
+
+def agent(name: str, kind: str, **known: float) -> AgentFigures:
+    """Everything else is 0 or unknown."""
+    blank = {f.name: 0 if f.type == "int" else NAN for f in dataclasses.fields(AgentFigures)}
+    return AgentFigures(**{**blank, "agent": name, "kind": kind, **known})  # type: ignore[arg-type]
+
+
+def run(
+    policy: str, session: str, latency: tuple[float, float], ate: tuple[float, float], done: int
+) -> RunFigures:
+    agents = tuple(
+        agent(name, kind, latency_ms=ms, ate_cm=cm, metres=10.0)
+        for name, kind, ms, cm in zip(("ann", "bot"), ("ar", "robot"), latency, ate, strict=True)
+    )
+    return RunFigures(Conditions(session, policy, "wifi5", 0), agents, 2, 1.0, 2 * done, 0, done)
+
+
+RUNS = [
+    run("covins-g", "one", (20.0, 40.0), (1.0, 2.0), 100),
+    run("share", "one", (10.0, 40.0), (1.0, 3.0), 20),
+    run("share", "two", (20.0, 44.0), (0.9, NAN), 10),
+    run("covins-g", "two", (30.0, 40.0), (1.0, 2.0), 50),
+    run("covins-g", "three", (500.0, 500.0), (9.0, 9.0), 900),  # share has not played it
+]
+
+
+def found(policy: str) -> dict[str, tuple[float, float]]:
+    return {one.measure.name: (one.value.value, one.ratio.value) for one in compare(RUNS, policy, "covins-g")}
+
+
+def test_ratios_are_of_sessions_that_both_have_played():
+    share = found("share")
+    assert share["AR latency"] == pytest.approx((15.0, 30 / 50))
+    assert share["robot latency"] == pytest.approx((42.0, 84 / 80))
+    assert share["merges a metre"] == pytest.approx((0.75, 30 / 150))
+    assert share["robot ATE in the map"] == pytest.approx((3.0, 3 / 2))  # in two it was in no map
+    assert math.isnan(share["AR QoE"][0])
+
+
+def test_the_base_is_all_of_itself():
+    assert {ratio for _, ratio in found("covins-g").values() if not math.isnan(ratio)} == {1.0}
+
+
+def test_whose_error_is_no_more():
+    assert no_worse(RUNS, "share", "covins-g") == (2, 3)
+    assert no_worse(RUNS, "covins-g", "share") == (2, 3)
+
+
+def test_policies_keep_their_order_and_every_measure_has_a_name():
+    assert policies(RUNS) == ["covins-g", "share"]
+    assert len({measure.name for measure in MEASURES}) == len(MEASURES)

@@ -1,0 +1,53 @@
+"""In which order sessions are played, and what is not played again."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from share.config import Config, from_mapping
+from share.errors import UsageError
+from share.io.session import Session
+from share.run.ablation import plan
+from share.run.play import Terms
+from share.run.trial import read_trial, settings_of
+
+TERMS = Terms("", "wifi5")
+
+
+def session(folder: str) -> Session:
+    return Session(Path(folder), {}, {})
+
+
+def test_policies_take_turns_at_being_first():
+    runs = plan([session("a"), session("b")], ("share", "covins-g", "equal"), [0, 1], TERMS, Path("out"))
+    assert [run.out.name for run in runs] == [
+        *("a-share-0", "a-covins-g-0", "a-equal-0"),
+        *("b-covins-g-0", "b-equal-0", "b-share-0"),
+        *("a-equal-1", "a-share-1", "a-covins-g-1"),
+        *("b-share-1", "b-covins-g-1", "b-equal-1"),
+    ]
+    assert {(run.terms.policy, run.terms.link, run.terms.seed) for run in runs[-1:]} == {
+        ("equal", "wifi5", 1)
+    }
+
+
+def test_two_sessions_of_one_name_would_share_their_runs():
+    with pytest.raises(UsageError, match="two sessions are called room"):
+        plan([session("x/room"), session("y/room")], ("share",), [0], TERMS, Path("out"))
+
+
+def test_each_seed_draws_anew_and_settings_come_back_as_they_were():
+    texts = [settings_of(Config(), seed) for seed in (0, 3)]
+    first, third = (from_mapping(Config, yaml.safe_load(text), "") for text in texts)
+    assert first == Config()
+    assert third.control.gate_seed == first.control.gate_seed + 3
+    assert third.control.random_seed == first.control.random_seed + 3
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", "{", json.dumps({"policy": "share"})])
+def test_a_damaged_record_is_said(tmp_path, text):
+    (tmp_path / "run.json").write_text(text)
+    with pytest.raises(Exception, match=r"run\.json: is damaged"):
+        read_trial(tmp_path)
