@@ -11,12 +11,12 @@ import numpy as np
 from share.core.measurement import CAM0, CAM1, DEPTH
 from share.emulate import shooting
 from share.emulate.chunks import Picture, encoded
-from share.emulate.pool import Pool
 from share.emulate.progress import Progress
 from share.emulate.sensor.device import Pictures
 from share.emulate.sensor.exposure import Shots
 from share.emulate.stage import Actor, Stage
 from share.geometry.camera import Rig
+from share.io.pool import Pool
 from share.types import I64, Frame, View
 from share.vision.view import make_view
 

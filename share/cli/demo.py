@@ -78,7 +78,7 @@ def demo(
     with Stages() as stages:
         session = read_session(cached_session(recipe(_drawable(scene), seconds, seed), progress=stages))
     live = LiveLine()
-    terms = Terms(policy, link, seed, true_error, config_file)
+    terms = Terms(policy, link, seed, true_error, config=config_file)
     folders = play(session, seconds, terms, folder, lambda now: live.write(str(now)))
     live.end()
     result = score(session, folders)

@@ -14,7 +14,7 @@ from share.cli import options
 from share.cli.progress import LiveLine
 from share.cli.run_table import table
 from share.config import POLICIES
-from share.errors import ShareError
+from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
     from share.config import Config
@@ -26,6 +26,9 @@ BASE = "covins-g"  # what the others are told as a part of
 
 _link = click.option(
     "--link", metavar="NAME|FILE", help="Through an emulated network, as share agent --link."
+)
+_virtual = click.option(
+    "--virtual", is_flag=True, help="In virtual time: tracked once, how long things take is drawn."
 )
 _true_error = click.option("--true-error", is_flag=True, help="Agents tell the edge their true error.")
 
@@ -42,12 +45,13 @@ def evaluate() -> None:
     """
 
 
-@evaluate.command(short_help="Play a session in real time, and keep everything.")
+@evaluate.command(short_help="Play a session, and keep everything.")
 @click.argument("session", type=click.Path(path_type=Path))
 @click.option("--policy", type=click.Choice(POLICIES), default=POLICIES[0], show_default=True)
 @_link
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of link and scheduler.")
 @_true_error
+@_virtual
 @options.config
 @click.option("--out", required=True, metavar="RUN", type=click.Path(path_type=Path), help="A new folder.")
 def run(
@@ -56,10 +60,12 @@ def run(
     link: str | None,
     seed: int,
     true_error: bool,
+    virtual: bool,
     config_file: str | None,
     out: Path,
 ) -> None:
-    """Play SESSION in real time: an edge and its agents, each a process of its own.
+    """Play SESSION in real time: an edge and its agents, each a process of its own. Or, with --virtual, by
+    the same trackers and machines in virtual time, whatever else this machine does.
 
     RUN holds what they leave, the settings in effect and what else is needed to play it again. It is
     whole or not there: a run that is broken off leaves nothing.
@@ -73,7 +79,7 @@ def run(
     from share.run.play import Terms
     from share.run.trial import run_trial
 
-    terms = Terms(policy, link, seed, true_error)
+    terms = Terms(policy, link, seed, true_error, virtual)
     trial = run_trial(read_session(session), terms, config, out, lambda now: live.write(str(now)))
     live.end()
     click.echo(table(figures(trial)))
@@ -126,6 +132,14 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, as_json: bool) -> None:
 @_link
 @click.option("--seeds", type=click.IntRange(1), default=1, show_default=True, help="How many: 0, 1, …")
 @_true_error
+@_virtual
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 64),
+    default=1,
+    show_default=True,
+    help="Sessions at a time (--virtual).",
+)
 @options.config
 @click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path))
 def ablation(
@@ -134,6 +148,8 @@ def ablation(
     link: str | None,
     seeds: int,
     true_error: bool,
+    virtual: bool,
+    workers: int,
     config_file: str | None,
     out: Path,
 ) -> None:
@@ -147,6 +163,8 @@ def ablation(
     Example:  share evaluate ablation room1 room2 --policy share --policy covins-g --link wifi5 --out two
     """
     config, live = _settings(config_file, link), LiveLine()
+    if workers > 1 and not virtual:
+        raise UsageError("--workers: runs in real time would slow each other down; it goes with --virtual")
     from share.io.files import writable_dir
     from share.io.session import read_session
     from share.run.ablation import go_through, plan
@@ -155,23 +173,24 @@ def ablation(
 
     policies = chosen or tuple(policy for policy in POLICIES if policy != "streamed")
     opened = [read_session(folder) for folder in sessions]
-    planned = plan(opened, policies, range(seeds), Terms("", link, 0, true_error), out / "runs")
+    planned = plan(opened, policies, range(seeds), Terms("", link, 0, true_error, virtual), out / "runs")
     writable_dir(out)
-    trials: list[Trial] = []
+    played: dict[Path, Trial] = {}
     failed: list[str] = []
 
     def show(number: int, now: Progress | None) -> None:
         name = planned[number].out.name
         live.write(f"{number + 1} of {len(planned)}: {name}  {now or ''}")
 
-    for one, came in go_through(planned, config, show):
+    for one, came in go_through(planned, config, show, workers):
         if isinstance(came, ShareError):
             failed.append(one.out.name)
             live.end()
             click.echo(f"share: {one.out.name}: {came}", err=True)
         else:
-            trials.append(came)
+            played[one.out] = came
     live.end()
+    trials = [played[one.out] for one in planned if one.out in played]
     if trials:
         _write(out, [figures(trial) for trial in trials], trials)
     if failed:

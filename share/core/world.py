@@ -69,12 +69,15 @@ class Costs:
 @dataclass(frozen=True, eq=False)
 class Seen:
     """A frame: when it comes in, where odometry says it is, how wrong that is, and what it shows others, if
-    it is offered as a keyframe."""
+    it is offered as a keyframe. stamp_ns: of its sensor; None: as at_ns. breaks: odometry began anew."""
 
     at_ns: int
-    T_odom_body: F64
+    T_odom_body: F64 | None
     error_cm: float | None = None
     candidate: Candidate | None = None
+    stamp_ns: int | None = None
+    state: TrackState = TrackState.OK
+    breaks: bool = False
 
 
 class AnyMapper(Protocol):
@@ -100,12 +103,16 @@ class World:
         costs: Costs,
         seed: int,
         mapper: AnyMapper | None = None,
+        watch: Callable[[str, ev.AgentEffect], None] = lambda name, effect: None,
+        record: Callable[[dict[str, Any]], None] = lambda fields: None,
     ) -> None:
-        """mapper: by default a real one."""
+        """mapper: by default a real one. watch: is told what every agent does, by name; record: what the edge
+        decides."""
         self.now_ns = 0
         self.stamps_ns: dict[Key, int] = {}  # of the keyframes that the mapper has had
         self.logs = {hello.name: RunLog() for hello, _ in agents}
         self.placed: dict[str, list[ev.Localised]] = {hello.name: [] for hello, _ in agents}  # in a map
+        self._watch, self._record = watch, record
         self._costs, self._rng = costs, np.random.default_rng(seed)
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._order = count()
@@ -127,6 +134,10 @@ class World:
         while self._events and self._events[0][0] <= end_ns:
             self.now_ns, _, act = heapq.heappop(self._events)
             act()
+
+    def reports(self) -> dict[str, dict[str, Any]]:
+        """What each agent's machine has counted, by name."""
+        return {member.name: member.machine.report() for member in self._members.values()}
 
     def _in(self, ns: int, act: Callable[[], None]) -> None:
         heapq.heappush(self._events, (self.now_ns + ns, next(self._order), act))
@@ -153,13 +164,13 @@ class World:
         member.busy_ns = done_ns
         frame = ev.FrameTracked(
             index=member.frames,
-            stamp_ns=look.at_ns,
+            stamp_ns=look.at_ns if look.stamp_ns is None else look.stamp_ns,
             arrived_ns=look.at_ns,
             done_ns=done_ns,
-            state=TrackState.OK,
+            state=look.state,
             T_odom_body=look.T_odom_body,
             keyframe=look.candidate is not None,
-            new_stretch=member.frames == 0,
+            new_stretch=look.breaks or member.frames == 0,
             error_cm=look.error_cm,
         )
         member.frames += 1
@@ -173,6 +184,7 @@ class World:
     def _to_agent(self, member: _Member, event: ev.AgentEvent) -> None:
         log = self.logs[member.name]
         for effect in member.machine.handle(event, self.now_ns):
+            self._watch(member.name, effect)
             match effect:
                 case ev.Send():
                     self._send_up(member, effect.frames)
@@ -198,6 +210,8 @@ class World:
                     self._send_down(effect)
                 case ed.Join() | ed.Add():
                     self._tell_mapper(self._costs.add, partial(self._hear, effect))
+                case ed.Record():
+                    self._record(effect.fields)
 
     def _send_down(self, effect: ed.Send) -> None:
         member, copy = self._members[effect.peer], [bytes(frame) for frame in effect.frames]

@@ -19,7 +19,6 @@ from share.emulate import shooting
 from share.emulate.asl import check_asl, to_asl
 from share.emulate.growth import Growth
 from share.emulate.plan_picture import draw_plan
-from share.emulate.pool import Pool
 from share.emulate.preparation import Prepared, keep_room, prepare
 from share.emulate.progress import Progress, silent
 from share.emulate.recipe import Recipe
@@ -31,6 +30,7 @@ from share.emulate.types import START_NS
 from share.errors import ShareError
 from share.io.files import atomic_write, writable_dir, writing
 from share.io.kalibr import to_kalibr
+from share.io.pool import Pool
 from share.io.session import SCHEMA, SESSION
 from share.io.target import T_WORLD_TARGET, TARGET, to_plain
 from share.types import F64

@@ -4,13 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
 from pathlib import Path
 
+from share import process
 from share.config import Config
 from share.errors import DataError, ShareError, UsageError
+from share.io.pool import Pool
 from share.io.session import Session
 from share.run.play import Progress, Terms
 from share.run.trial import RUN, SETTINGS, Trial, read_trial, run_trial, settings_of
+
+Came = Trial | ShareError
+Show = Callable[[int, Progress | None], None]  # which of the runs, and how far it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,27 +53,46 @@ def plan(
 
 
 def go_through(
-    runs: Sequence[Planned], config: Config, show: Callable[[int, Progress | None], None]
-) -> Iterator[tuple[Planned, Trial | ShareError]]:
-    """What is not done yet is played; each with what came of it. show: which of `runs`, and how far it is.
+    runs: Sequence[Planned], config: Config, show: Show, workers: int = 1
+) -> Iterator[tuple[Planned, Came]]:
+    """What is not done yet is played; each of `runs` with what came of it.
 
-    Raises UsageError where a run is there that was on other terms.
+    workers: sessions that are played side by side, which only virtual time stands. Raises UsageError where
+    a run is there that was on other terms.
     """
-    for number, planned in enumerate(runs):
-        if planned.is_done:
-            yield planned, _as_planned(planned, config)
-            continue
-        show(number, None)
+    ready = {planned.out: _as_planned(planned, config) for planned in runs if planned.is_done}
+    yield from ((planned, ready[planned.out]) for planned in runs if planned.out in ready)
+    left = [(number, planned) for number, planned in enumerate(runs) if planned.out not in ready]
+    if workers == 1:
+        for number, planned in left:
+            show(number, None)
+            yield planned, _play(planned, config, partial(show, number))
+        return
+    by_session = sorted(left, key=lambda one: str(one[1].session.folder))
+    jobs = [
+        ([planned for _, planned in group], config)
+        for _, group in groupby(by_session, key=lambda one: one[1].session.folder)
+    ]
+    with Pool(min(workers, max(1, len(jobs))), process.prepare, ()) as pool:
+        for done, (_, came) in enumerate(pool.run(_play_all, jobs)):
+            show(done, None)
+            yield from came
 
-        def shown(now: Progress, number: int = number) -> None:
-            show(number, now)
 
-        try:
-            yield planned, run_trial(planned.session, planned.terms, config, planned.out, shown)
-        except (UsageError, DataError):
-            raise
-        except ShareError as error:
-            yield planned, error
+def _play_all(job: tuple[list[Planned], Config]) -> list[tuple[Planned, Came]]:
+    """Of one session."""
+    runs, config = job
+    return [(planned, _play(planned, config, lambda now: None)) for planned in runs]
+
+
+def _play(planned: Planned, config: Config, show: Callable[[Progress], None]) -> Came:
+    """A run that fails is no reason not to play the next."""
+    try:
+        return run_trial(planned.session, planned.terms, config, planned.out, show)
+    except (UsageError, DataError):
+        raise
+    except ShareError as error:
+        return error
 
 
 def _as_planned(planned: Planned, config: Config) -> Trial:

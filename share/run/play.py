@@ -39,12 +39,14 @@ class Progress:
 @dataclass(frozen=True)
 class Terms:
     """On which a session is played. link: an emulated network, by name or file; seed: of what it does.
-    true_error: agents tell the edge how wrong they are by the truth. config: a file, for all."""
+    true_error: agents tell the edge how wrong they are by the truth. virtual: in virtual time
+    (`share.run.virtual`). config: a file, for all."""
 
     policy: str
     link: str | None = None
     seed: int = 0
     true_error: bool = False
+    virtual: bool = False
     config: str | None = None
 
     def of_edge(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""A trial: a session played in real time on stated terms, kept with what is needed to do it again.
+"""A trial: a session played on stated terms, kept with what is needed to do it again.
 
 Its folder holds what the agents and the edge left, `config.yaml` (the settings in effect) and `run.json`.
 """
@@ -21,6 +21,7 @@ from share.io.machine import describe_machine
 from share.io.session import Session, read_session
 from share.io.trajectory import read_tum
 from share.run.play import Progress, Terms, play
+from share.run.virtual import play_virtually
 from share.strict import to_mapping
 
 RUN = "run.json"
@@ -55,7 +56,8 @@ def run_trial(
     with new_folder(out) as work:
         atomic_write(work / SETTINGS, settings_of(config, terms.seed))
         began, machine = datetime.now(UTC), describe_machine()
-        play(session, seconds, dataclasses.replace(terms, config=str(work / SETTINGS)), work, show)
+        told = dataclasses.replace(terms, config=str(work / SETTINGS))
+        (play_virtually if terms.virtual else play)(session, seconds, told, work, show)
         record = {
             "schema": SCHEMA,
             "session": str(session.folder.resolve()),
@@ -64,6 +66,7 @@ def run_trial(
             "link": terms.link,
             "seed": terms.seed,
             "true_error": terms.true_error,
+            "virtual": terms.virtual,
             "seconds": seconds,
             "began": began.isoformat(timespec="seconds"),
             "took_s": round((datetime.now(UTC) - began).total_seconds(), 1),
@@ -81,7 +84,7 @@ def read_trial(folder: Path) -> Trial:
         raise UsageError(f"{folder}: has no {RUN}; it is not a run by `share evaluate run`")
     try:
         record = json.loads(path.read_text())
-        terms = Terms(record["policy"], record["link"], record["seed"], record["true_error"])
+        terms = Terms(*(record[name] for name in ("policy", "link", "seed", "true_error", "virtual")))
         session = record["session"]
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}: is damaged: {error!r}") from None

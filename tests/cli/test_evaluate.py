@@ -107,3 +107,44 @@ def test_what_is_wrong_is_said_before_anything_is_played(evaluate, plain_session
     assert done.code == 2
     assert "without the truth of all agents nothing can be scored" in done.err
     assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.slow
+def test_in_virtual_time_the_same_seed_gives_the_same_run(evaluate, plain_session, tmp_path):
+    """And odometry is that of real time, to the last digit."""
+    virtual = ("--virtual", "--true-error", "--link", "wifi5")
+    for name in ("one", "two"):
+        assert evaluate("run", plain_session, *virtual, "--out", tmp_path / name).code == 0
+    assert evaluate("run", plain_session, *virtual, "--seed", 1, "--out", tmp_path / "other").code == 0
+    assert evaluate("run", plain_session, "--out", tmp_path / "real").code == 0
+    for agent in ("ar1", "ar2", "robot"):
+        for file in ("odom.tum", "map.tum", "latency.csv"):
+            one, two, other = (
+                (tmp_path / run / agent / file).read_bytes() for run in ("one", "two", "other")
+            )
+            assert one == two
+        assert one != other  # latencies are drawn
+        odom, real = ((tmp_path / run / agent / "odom.tum").read_bytes() for run in ("one", "real"))
+        assert odom == real
+
+
+@pytest.mark.slow
+def test_virtual_runs_go_side_by_side(evaluate, plain_session, tmp_path):
+    """Two sessions by two policies; the table has them in the order that was asked for."""
+    twin = tmp_path / "twin"
+    shutil.copytree(plain_session, twin)
+    out = tmp_path / "out"
+    policies = ("--policy", "share", "--policy", "covins-g")
+    done = evaluate("ablation", plain_session, twin, *policies, "--virtual", "--workers", 2, "--out", out)
+    assert done.code == 0, done.err
+    assert len(runs_in(out / "runs")) == 4
+    assert "|  | share | covins-g |" in done.out
+    rows = rows_of(out / "agents.csv")
+    halves = [
+        sorted(str({**row, "session": ""}) for row in rows if row["session"] == session.name)
+        for session in (plain_session, twin)
+    ]
+    assert halves[0] == halves[1]  # whichever process played them
+    refused = evaluate("ablation", twin, "--workers", 2, "--out", out)
+    assert refused.code == 2
+    assert "goes with --virtual" in refused.err

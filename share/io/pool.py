@@ -47,7 +47,7 @@ class Pool:
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     yield running.pop(future), future.result()
         except BrokenProcessPool:
-            raise ShareError("a process that makes images has died; is memory short?") from None
+            raise ShareError("one of its processes has died; is memory short?") from None
 
     def __enter__(self) -> Pool:
         return self

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from share.emulate.pool import Pool
 from share.errors import ShareError, UsageError
+from share.io.pool import Pool
 
 _base = 0
 

@@ -1,0 +1,159 @@
+"""A session in virtual time: what agents saw is tracked once, all else goes through `share.core.world`.
+
+The tracker, the agents' and the edge's machines and the mapper are the real ones, and odometry is the same to
+the last digit as in real time. How long things take is drawn (`Costs`), so that neither this machine nor what
+else it does shows in a latency, and the same seed gives the same run.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from share import __version__, config
+from share.config import Config, InertialConfig, SequencerConfig, TrackerConfig
+from share.core import events as ev
+from share.core.channel import Network
+from share.core.sequencer import SequencerCounters
+from share.core.world import Costs, Seen, World
+from share.errors import UsageError
+from share.geometry.camera import Rig
+from share.io.files import atomic_write, writable_dir
+from share.io.line_file import LineFile
+from share.io.session import Session, read_session
+from share.io.source import Source, open_source
+from share.io.transport.shaped import network
+from share.metrics.local_error import LocalError
+from share.run.agent_files import AgentFiles
+from share.run.pipeline import frames_of, tracker_for
+from share.run.play import Progress, Terms
+from share.strict import to_mapping
+from share.wire.messages import Hello
+
+_AFTER_S = 2.0  # for what is under way when the last frame has come
+_SHOW_EVERY = 50  # frames of an agent
+
+
+def play_virtually(
+    session: Session, seconds: float, terms: Terms, out: Path, show: Callable[[Progress], None]
+) -> dict[str, Path]:
+    """As `share.run.play.play`, with the same files; those of processes (logs) are not there.
+
+    Raises UsageError where an agent's recording cannot be tracked or the policy is one that streams.
+    """
+    settings = config.load(Path(terms.config).read_text(), terms.config) if terms.config else Config()
+    settings = dataclasses.replace(settings, edge=dataclasses.replace(settings.edge, policy=terms.policy))
+    if terms.policy == config.STREAMED:
+        raise UsageError("policy streamed is not played in virtual time: its agents do not track")
+    tracked = _tracked(session.folder.resolve(), settings.tracker, settings.inertial, settings.sequencer)
+    began_ns = min(looks[0].at_ns for _, looks in tracked.values() if looks)
+    members = [
+        (Hello(name, agent.kind, number + 1, tracked[name][0]), _coming(tracked[name][1], began_ns, terms))
+        for number, (name, agent) in enumerate(session.agents.items())
+    ]
+    folders = {name: out / name for name in session.agents}
+    observer = _Observer(folders, writable_dir(out / "edge"), show)
+    link = Network() if terms.link is None else network(terms.link)
+    world = World(settings, members, link, Costs(), terms.seed, watch=observer.watch, record=observer.record)
+    world.run(seconds + _AFTER_S)
+    observer.finish(world, settings)
+    return folders
+
+
+@lru_cache(maxsize=1)  # policies follow each other on one session
+def _tracked(
+    folder: Path, tracker: TrackerConfig, inertial: InertialConfig, sequencer: SequencerConfig
+) -> dict[str, tuple[Rig, list[Seen]]]:
+    """What each agent's frames came to, by name; they come in at the session's own times, ns."""
+    settings = Config(tracker=tracker, inertial=inertial, sequencer=sequencer)
+    session = read_session(folder)
+    return {
+        name: _track(open_source(f"{folder}/{name}"), settings, agent.clock_offset_ns)
+        for name, agent in session.agents.items()
+    }
+
+
+def _track(source: Source, settings: Config, clock_offset_ns: int) -> tuple[Rig, list[Seen]]:
+    tracker, truth = tracker_for(source, settings), source.truth()
+    error = None if truth is None else LocalError(truth)
+    seen = []
+    for frame in frames_of(source, settings, SequencerCounters()):
+        result = tracker.track(frame)
+        T, breaks = result.T_odom_body, result.new_stretch
+        seen.append(
+            Seen(
+                at_ns=frame.stamp_ns - clock_offset_ns,
+                T_odom_body=T,
+                error_cm=None if error is None else error.after(frame.stamp_ns, T, breaks),
+                candidate=tracker.keyframe(frame) if result.keyframe else None,
+                stamp_ns=frame.stamp_ns,
+                state=result.state,
+                breaks=breaks,
+            )
+        )
+    return source.rig, seen
+
+
+def _coming(looks: list[Seen], began_ns: int, terms: Terms) -> Iterator[Seen]:
+    """Counted from the first frame of all."""
+    for look in looks:
+        error_cm = look.error_cm if terms.true_error else None
+        yield dataclasses.replace(look, at_ns=look.at_ns - began_ns, error_cm=error_cm)
+
+
+class _Observer:
+    """Writes what agents and edge would have written."""
+
+    def __init__(self, folders: dict[str, Path], edge: Path, show: Callable[[Progress], None]) -> None:
+        self._show, self._edge = show, edge
+        self._files = {name: AgentFiles(folder, _full) for name, folder in folders.items()}
+        self._events = LineFile(edge / "events.jsonl", _full)
+        self._frames = dict.fromkeys(folders, 0)
+        self._maps: dict[str, str] = {}
+        self._corrections = 0
+
+    def watch(self, name: str, effect: ev.AgentEffect) -> None:
+        files = self._files[name]
+        match effect:
+            case ev.Localised():
+                files.odom(effect.stamp_ns, effect.T_odom_body)
+                if effect.T_map_odom is not None and effect.map_id is not None:
+                    files.map(effect.stamp_ns, effect.T_map_odom @ effect.T_odom_body, effect.map_id)
+            case ev.FrameDone():
+                self._frames[name] += 1
+                if self._frames[name] % _SHOW_EVERY == 0:
+                    self._tell()
+
+    def record(self, fields: dict[str, Any]) -> None:
+        self._events.write(json.dumps(fields))
+        if fields["event"] == "correction":
+            self._maps[fields["agent"]] = fields["map_id"]
+            self._corrections += 1
+
+    def finish(self, world: World, settings: Config) -> None:
+        """The reports. Raises ShareError if the disk was full."""
+        common = {"version": __version__, "config": to_mapping(settings)}
+        for name, machine in world.reports().items():
+            counted = {key: machine[key] for key in ("corrections", "bytes_up", "bytes_down")}
+            unknown = dict.fromkeys(("cpu_ms_per_frame", "decode_ms_per_frame"))
+            report = {**world.logs[name].report(), **unknown, **counted, "protocol": machine, **common}
+            self._files[name].finish(world.logs[name], report)
+            self._files[name].release()
+        report = {**world.edge.report(world.mapper.report()), "series": world.edge.series()}
+        self._events.close()
+        atomic_write(self._edge / "edge.json", json.dumps(report, indent=2) + "\n")
+        self._events.check()
+
+    def _tell(self) -> None:
+        shared = [map_id for map_id, count in Counter(self._maps.values()).items() if count > 1]
+        joined = sum(map_id in shared for map_id in self._maps.values())
+        self._show(Progress(dict(self._frames), joined, self._corrections))
+
+
+def _full(text: str) -> None:
+    """A file that could not be written is said by its `check`, at the end."""
