@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,13 +25,23 @@ if TYPE_CHECKING:
 
 BASE = "covins-g"  # what the others are told as a part of
 
-_link = click.option(
-    "--link", metavar="NAME|FILE", help="Through an emulated network, as share agent --link."
+_TERMS = (
+    click.option("--link", metavar="NAME|FILE", help="Through an emulated network, as share agent --link."),
+    click.option("--true-error", is_flag=True, help="Agents tell the edge their true error."),
+    click.option(
+        "--virtual", is_flag=True, help="In virtual time: tracked once, how long things take is drawn."
+    ),
+    click.option(
+        "--agents-first", is_flag=True, help="The edge gets what agents leave, as if they had own machines."
+    ),
 )
-_virtual = click.option(
-    "--virtual", is_flag=True, help="In virtual time: tracked once, how long things take is drawn."
-)
-_true_error = click.option("--true-error", is_flag=True, help="Agents tell the edge their true error.")
+
+
+def _on_terms(command: Callable[..., None]) -> Callable[..., None]:
+    """The options on which any run is played; by name as fields of `share.run.play.Terms`."""
+    for option in reversed(_TERMS):
+        command = option(command)
+    return command
 
 
 @click.group()
@@ -48,21 +59,17 @@ def evaluate() -> None:
 @evaluate.command(short_help="Play a session, and keep everything.")
 @click.argument("session", type=click.Path(path_type=Path))
 @click.option("--policy", type=click.Choice(POLICIES), default=POLICIES[0], show_default=True)
-@_link
+@_on_terms
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of link and scheduler.")
-@_true_error
-@_virtual
 @options.config
 @click.option("--out", required=True, metavar="RUN", type=click.Path(path_type=Path), help="A new folder.")
 def run(
     session: Path,
     policy: str,
-    link: str | None,
     seed: int,
-    true_error: bool,
-    virtual: bool,
     config_file: str | None,
     out: Path,
+    **told: Any,
 ) -> None:
     """Play SESSION in real time: an edge and its agents, each a process of its own. Or, with --virtual, by
     the same trackers and machines in virtual time, whatever else this machine does.
@@ -73,13 +80,13 @@ def run(
     \b
     Example:  share evaluate run room1 --policy covins-g --link wifi5 --out runs/covins
     """
-    config, live = _settings(config_file, link), LiveLine()
+    config, live = _settings(config_file, told["link"]), LiveLine()
     from share.io.session import read_session
     from share.run.figures import figures
     from share.run.play import Terms
     from share.run.trial import run_trial
 
-    terms = Terms(policy, link, seed, true_error, virtual)
+    terms = Terms(policy, seed=seed, **told)
     trial = run_trial(read_session(session), terms, config, out, lambda now: live.write(str(now)))
     live.end()
     click.echo(table(figures(trial)))
@@ -129,10 +136,8 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, as_json: bool) -> None:
     multiple=True,
     help="May be repeated.  [default: all that share a map]",
 )
-@_link
+@_on_terms
 @click.option("--seeds", type=click.IntRange(1), default=1, show_default=True, help="How many: 0, 1, …")
-@_true_error
-@_virtual
 @click.option(
     "--workers",
     type=click.IntRange(1, 64),
@@ -145,13 +150,11 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, as_json: bool) -> None:
 def ablation(
     sessions: tuple[Path, ...],
     chosen: tuple[str, ...],
-    link: str | None,
     seeds: int,
-    true_error: bool,
-    virtual: bool,
     workers: int,
     config_file: str | None,
     out: Path,
+    **told: Any,
 ) -> None:
     """Play SESSIONS by each policy with each seed, and compare the policies.
 
@@ -162,8 +165,8 @@ def ablation(
     \b
     Example:  share evaluate ablation room1 room2 --policy share --policy covins-g --link wifi5 --out two
     """
-    config, live = _settings(config_file, link), LiveLine()
-    if workers > 1 and not virtual:
+    config, live = _settings(config_file, told["link"]), LiveLine()
+    if workers > 1 and not told["virtual"]:
         raise UsageError("--workers: runs in real time would slow each other down; it goes with --virtual")
     from share.io.files import writable_dir
     from share.io.session import read_session
@@ -173,7 +176,7 @@ def ablation(
 
     policies = chosen or tuple(policy for policy in POLICIES if policy != "streamed")
     opened = [read_session(folder) for folder in sessions]
-    planned = plan(opened, policies, range(seeds), Terms("", link, 0, true_error, virtual), out / "runs")
+    planned = plan(opened, policies, range(seeds), Terms("", **told), out / "runs")
     writable_dir(out)
     played: dict[Path, Trial] = {}
     failed: list[str] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import time
@@ -20,6 +21,7 @@ from share.run.processes import child, end
 
 START_S = 20.0  # how long the edge may take until it listens
 PATIENCE_S = 60.0  # how much longer than its recording an agent may take
+_AFTER_AGENTS = 10  # niceness: a tenth of an agent's part of a core that both want
 Processes = dict[str, subprocess.Popen[bytes]]
 
 
@@ -40,13 +42,15 @@ class Progress:
 class Terms:
     """On which a session is played. link: an emulated network, by name or file; seed: of what it does.
     true_error: agents tell the edge how wrong they are by the truth. virtual: in virtual time
-    (`share.run.virtual`). config: a file, for all."""
+    (`share.run.virtual`). agents_first: the edge gets what the agents leave of this machine, as if they had
+    their own. config: a file, for all."""
 
     policy: str
     link: str | None = None
     seed: int = 0
     true_error: bool = False
     virtual: bool = False
+    agents_first: bool = False
     config: str | None = None
 
     def of_edge(self) -> tuple[str, ...]:
@@ -78,6 +82,8 @@ def play(
     with ExitStack() as stack:
         bind = ("--bind", "tcp://127.0.0.1:0", "--out", str(out / "edge"), *terms.of_edge())
         edge = stack.enter_context(child(logs["edge"], "edge", *bind))
+        if terms.agents_first:
+            os.setpriority(os.PRIO_PROCESS, edge.pid, _AFTER_AGENTS)  # before it has processes of its own
         address = _address(edge, logs["edge"])
         agents: Processes = {}
         for number, (name, agent) in enumerate(session.agents.items()):

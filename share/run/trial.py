@@ -27,6 +27,7 @@ from share.strict import to_mapping
 RUN = "run.json"
 SETTINGS = "config.yaml"
 SCHEMA = 1
+_TERMS = [field.name for field in dataclasses.fields(Terms) if field.name != "config"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +63,7 @@ def run_trial(
             "schema": SCHEMA,
             "session": str(session.folder.resolve()),
             "provenance": session.provenance,
-            "policy": terms.policy,
-            "link": terms.link,
-            "seed": terms.seed,
-            "true_error": terms.true_error,
-            "virtual": terms.virtual,
+            **{name: getattr(terms, name) for name in _TERMS},
             "seconds": seconds,
             "began": began.isoformat(timespec="seconds"),
             "took_s": round((datetime.now(UTC) - began).total_seconds(), 1),
@@ -84,7 +81,7 @@ def read_trial(folder: Path) -> Trial:
         raise UsageError(f"{folder}: has no {RUN}; it is not a run by `share evaluate run`")
     try:
         record = json.loads(path.read_text())
-        terms = Terms(*(record[name] for name in ("policy", "link", "seed", "true_error", "virtual")))
+        terms = Terms(**{name: record[name] for name in _TERMS})
         session = record["session"]
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}: is damaged: {error!r}") from None
