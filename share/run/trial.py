@@ -81,7 +81,7 @@ def read_trial(folder: Path) -> Trial:
         raise UsageError(f"{folder}: has no {RUN}; it is not a run by `share evaluate run`")
     try:
         record = json.loads(path.read_text())
-        terms = Terms(**{name: record[name] for name in _TERMS})
+        terms = Terms(**{name: record[name] for name in _TERMS if name in record})
         session = record["session"]
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}: is damaged: {error!r}") from None
