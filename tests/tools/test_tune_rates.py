@@ -41,9 +41,10 @@ def test_what_is_no_setting_is_said() -> None:
 
 @pytest.mark.slow
 def test_agents_may_move_as_told_at_fixed_rates(tmp_path: Path) -> None:
-    one = ("--scenes", "warehouse", "--rooms", "501:502", "--workers", "1", "--json", str(tmp_path / "a.json"))
+    one = ("--scenes", "warehouse", "--rooms", "501:502", "--workers", "1")
+    where = ("--json", str(tmp_path / "a.json"))
     motions = ("--motions", "ann=walk:speed=0.3,pauses=8", "bob=robot:speed=0.7")
-    done = tuned("control.rate_min_hz+control.rate_max_hz=1,2", *one, *motions)
+    done = tuned("control.rate_min_hz+control.rate_max_hz=1,2", *one, *where, *motions)
     assert done.returncode == 0, done.stderr
     runs = json.loads((tmp_path / "a.json").read_text())
     assert [run["settings"][1:] for run in runs[1:]] == [
