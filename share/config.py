@@ -264,7 +264,7 @@ class EdgeConfig:
     max_keyframes: int = 2000  # kept; beyond, those go of which there are others like them
     max_waiting: int = 12  # keyframes that queue to be looked up; beyond, the oldest is only stored
     each_waiting: int = 3  # the same, of one agent
-    hurry_waiting: int = 3  # so many queue: the look-up at hand tries fewer candidates,
+    hurry_waiting: int = 1  # so many queue: the look-up at hand tries fewer candidates,
     hurry_candidates: int = 3  # at most these, and one that is verified is enough
 
     def __post_init__(self) -> None:

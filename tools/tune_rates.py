@@ -1,14 +1,16 @@
 """What a setting of the scheduler costs and gains: a grid of settings, in virtual time with modelled mapping.
 
     python tools/tune_rates.py control.kp=0.2,0.8,3.2 control.kd=0,0.2 [--policy share] [--link wifi5] \\
-        [--scenes warehouse firestation] [--rooms 401:404] [--agents ar ar robot] [--workers 2] \\
-        [--json FILE] [--picture FILE]
+        [--scenes warehouse firestation] [--rooms 401:404] [--agents ar ar robot] [--motions NAME=SPEC …] \\
+        [--workers 2] [--json FILE] [--picture FILE]
 
-Each room is one of a scene, by its seed, in which everybody walks for a minute; motions as `share emulate`
-draws them, odometry as tools/keyframe_odometry.py does. The first row is `covins-g`. Prints a Markdown table,
-means over rooms with the standard error of the mean: latency of headsets and of robots as a part of
-`covins-g`'s in the same room, the same of their errors in the map and of merges, the share of headsets'
-evaluations that reach their target. Of two settings a picture is drawn: heat maps of latency and error.
+Settings joined by + have the same value: control.rate_min_hz+control.rate_max_hz=1.5,2 are fixed rates.
+Each room is one of a scene, by its seed, in which everybody moves for a minute as `--agents` usually do, or
+as `--motions` say in the words of `share emulate` (ar0=walk:speed=0.3,pauses=8); odometry as
+tools/keyframe_odometry.py draws it. The first row is `covins-g`. Prints a Markdown table, means over rooms
+with the standard error of the mean: latency of headsets and of robots as a part of `covins-g`'s in the same
+room, the same of their errors in the map and of merges, then the QoE of headsets and of who has least. Of
+two settings a picture is drawn: heat maps of latency and error.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import argparse
 import itertools
 import json
 import sys
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from multiprocessing import get_context
@@ -38,7 +41,9 @@ from share.emulate.recipe import Recipe  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 
 FIGURES = ("AR latency", "robot latency", "AR error", "robot error", "merges")
-Room = tuple[str, int, tuple[str, ...]]  # scene, seed, kinds
+USUAL = {"ar": "walk:", "robot": "robot:"}
+LARGEST_M = (30.0, 20.0, 4.0)  # of the scenes
+Room = tuple[str, int, tuple[str, ...]]  # scene, seed, motions
 
 
 def main() -> int:
@@ -48,7 +53,8 @@ def main() -> int:
     parser.add_argument("--link", default="wifi5")
     parser.add_argument("--scenes", nargs="+", default=["warehouse", "firestation"])
     parser.add_argument("--rooms", default="401:404", metavar="FIRST:END")
-    parser.add_argument("--agents", nargs="+", choices=("ar", "robot"), default=["ar", "ar", "robot"])
+    parser.add_argument("--agents", nargs="+", choices=tuple(USUAL), default=["ar", "ar", "robot"])
+    parser.add_argument("--motions", nargs="+", metavar="NAME=SPEC")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--picture", type=Path)
@@ -63,28 +69,28 @@ def tune(options: argparse.Namespace) -> None:
         raise UsageError("--picture: of two settings or more")
     points = list(itertools.product(*values))
     first, end = map(int, options.rooms.split(":"))
-    rooms: list[Room] = [
-        (scene, seed, tuple(options.agents)) for scene in options.scenes for seed in range(first, end)
-    ]
+    usual = (f"{kind}{k}={USUAL[kind]}" for k, kind in enumerate(options.agents))
+    motions = tuple(options.motions or usual)
+    rooms: list[Room] = [(scene, seed, motions) for scene in options.scenes for seed in range(first, end)]
     sets = [("edge.policy=" + json.dumps("covins-g"),)] + [
-        ("edge.policy=" + json.dumps(options.policy), *map("=".join, zip(names, point, strict=True)))
-        for point in points
+        ("edge.policy=" + json.dumps(options.policy), *_settings(names, point)) for point in points
     ]
     jobs = [(room, settings, options.link) for room in rooms for settings in sets]  # a room stays in memory
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
         rows = list(pool.map(_play, jobs, chunksize=len(sets)))
     runs = dict(zip(jobs, rows, strict=True))
-    print("\n".join(line(cells) for cells in ((*names, *FIGURES, "QoE"), ["---"] * (len(names) + 6))))
+    head = (*names, *FIGURES, "AR QoE", "least QoE")
+    print("\n".join(line(cells) for cells in (head, ["---"] * len(head))))
     table = []
     for settings, point in zip(sets[1:], points, strict=True):
         ratios = [
             _ratios(runs[room, settings, options.link], runs[room, sets[0], options.link]) for room in rooms
         ]
         mean, sem = np.nanmean(ratios, axis=0), np.nanstd(ratios, axis=0) / np.sqrt(len(ratios))
-        qoe = float(np.mean([_qoe(runs[room, settings, options.link]) for room in rooms]))
+        qoe = np.mean([_qoe(runs[room, settings, options.link]) for room in rooms], axis=0)
         table.append(mean.tolist())
         told = [f"{m:.3f} ± {s:.3f}" for m, s in zip(mean, sem, strict=True)]
-        print(line([*point, *told, f"{qoe:.2f}"]), flush=True)
+        print(line([*point, *told, *(f"{q:.2f}" for q in qoe)]), flush=True)
     if options.json:
         kept = [
             {"settings": job[1], "scene": job[0][0], "room": job[0][1], **row} for job, row in runs.items()
@@ -100,23 +106,32 @@ def _grid(words: list[str]) -> tuple[list[str], list[list[str]]]:
     return [w.split("=")[0] for w in words], [w.split("=", 1)[1].split(",") for w in words]
 
 
+def _settings(names: list[str], point: tuple[str, ...]) -> Iterator[str]:
+    for name, value in zip(names, point, strict=True):
+        yield from (f"{one}={value}" for one in name.split("+"))
+
+
 @cache
-def _room(scene: str, seed: int, kinds: tuple[str, ...]) -> KeyframeSet:
-    motions = tuple(f"{kind}{k}={'walk' if kind == 'ar' else 'robot'}:" for k, kind in enumerate(kinds))
-    size = None if len(kinds) <= 4 else (3.0 * len(kinds) ** 0.5 + 3, 3.0 * len(kinds) ** 0.5 + 3, 4.0)
+def _room(scene: str, seed: int, motions: tuple[str, ...]) -> KeyframeSet:
+    """The scene's own size for up to four, else larger with them."""
+    side = 3.0 * len(motions) ** 0.5 + 3
+    longer = max(side, side**2 / LARGEST_M[1])
+    size = (min(longer, LARGEST_M[0]), min(side, LARGEST_M[1]), LARGEST_M[2]) if len(motions) > 4 else None
     return make_unseen(Recipe(scene, motions, 60.0, seed=seed, size=size), Spacing())
 
 
 def _play(job: tuple[Room, tuple[str, ...], str]) -> Row:
     room, settings, link = job
     made = _room(*room)
-    return play(made, configured(list(settings)), link, room[1], modelled=True)
+    row = play(made, configured(list(settings)), link, room[1], modelled=True)
+    for name, agent in row["agents"].items():
+        agent["kind"] = str(made.agents[name].hello.kind)
+    return row
 
 
 def _of(row: Row, kind: str, figure: str) -> float:
-    return float(
-        np.nanmean([a[figure] for name, a in row["agents"].items() if name.startswith(kind)] or [np.nan])
-    )
+    agents = row["agents"].values()
+    return float(np.nanmean([agent[figure] for agent in agents if agent["kind"] == kind] or [np.nan]))
 
 
 def _ratios(row: Row, base: Row) -> list[float]:
@@ -125,8 +140,9 @@ def _ratios(row: Row, base: Row) -> list[float]:
     return [*(_of(row, *pair) / _of(base, *pair) for pair in pairs), row["done"] / max(1, base["done"])]
 
 
-def _qoe(row: Row) -> float:
-    return _of(row, "ar", "qoe")
+def _qoe(row: Row) -> tuple[float, float]:
+    """Of headsets, mean; of the agent that has least."""
+    return _of(row, "ar", "qoe"), float(np.nanmin([agent["qoe"] for agent in row["agents"].values()]))
 
 
 def _draw(path: Path, names: list[str], values: list[list[str]], table: np.ndarray[Any, Any]) -> None:

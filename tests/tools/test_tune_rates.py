@@ -37,3 +37,19 @@ def test_fewer_keyframes_save_latency_and_a_picture_shows_it(tmp_path: Path) -> 
 def test_what_is_no_setting_is_said() -> None:
     done = tuned("control.kp")
     assert (done.returncode, done.stderr) == (2, "tune_rates: 'control.kp': give SECTION.NAME=VALUE,VALUE…\n")
+
+
+@pytest.mark.slow
+def test_agents_may_move_as_told_at_fixed_rates(tmp_path: Path) -> None:
+    one = ("--scenes", "warehouse", "--rooms", "501:502", "--workers", "1")
+    where = ("--json", str(tmp_path / "a.json"))
+    motions = ("--motions", "ann=walk:speed=0.3,pauses=8", "bob=robot:speed=0.7")
+    done = tuned("control.rate_min_hz+control.rate_max_hz=1,2", *one, *where, *motions)
+    assert done.returncode == 0, done.stderr
+    runs = json.loads((tmp_path / "a.json").read_text())
+    assert [run["settings"][1:] for run in runs[1:]] == [
+        [f"control.rate_min_hz={hz}", f"control.rate_max_hz={hz}"] for hz in (1, 2)
+    ]
+    slow, quick = ([run["agents"][name]["sent"] for run in runs] for name in ("ann", "bob"))
+    assert [run["agents"]["bob"]["kind"] for run in runs] == ["robot"] * 3
+    assert 45 <= quick[1] <= 65 < quick[2] and slow[2] < slow[0] < quick[0]
