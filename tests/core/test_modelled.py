@@ -12,7 +12,7 @@ from test_world import MS, seen
 
 from share.config import Config, EdgeConfig
 from share.core.channel import NETWORKS
-from share.core.modelled import ModelledMapper, Odds
+from share.core.modelled import ModelledMapper, Odds, Truth
 from share.core.world import Costs, Seen, World
 from share.geometry import se3
 
@@ -25,12 +25,12 @@ def played(policy: str = "covins-g", seed: int = 0, odds: Odds | None = USUAL) -
     """Ann and Bob in one room, half a wall apart. odds: None for a real mapper."""
     people = {name: Person(name, ROOM, at, run) for name, at, run in (("ann", 0.0, 11), ("bob", 0.5, 22))}
     frames = {name: list(seen(person, SECONDS)) for name, person in people.items()}
-    where = {
-        name: dict(zip([f.at_ns for f in frames[name] if f.candidate], person.T_world_body, strict=True))
-        for name, person in people.items()
-    }
+    stamps_ns = {name: [f.at_ns for f in frames[name] if f.candidate] for name in people}
     config = Config(edge=EdgeConfig(policy=policy))
-    mapper = odds and ModelledMapper(config, lambda name, stamp_ns: where[name][stamp_ns], odds, seed)
+    rigs = {name: person.hello.rig for name, person in people.items()}
+    there = {name: np.array(person.T_world_body) for name, person in people.items()}
+    truth = Truth(config.control.near_m, config.control.far_m, rigs, there)
+    mapper = odds and ModelledMapper(config, truth, lambda name, ns: stamps_ns[name].index(ns), odds, seed)
     agents: list[tuple[object, Iterator[Seen]]] = [(p.hello, iter(frames[n])) for n, p in people.items()]
     made = World(config, agents, NETWORKS["wifi5"], Costs(), seed, mapper)
     made.run(SECONDS + 1.0)
