@@ -40,6 +40,7 @@ from share.geometry.align import umeyama  # noqa: E402
 from share.geometry.se3 import transform  # noqa: E402
 from share.io.transport.shaped import network  # noqa: E402
 from share.metrics.association import Trajectory  # noqa: E402
+from share.metrics.latency import summary as summarised  # noqa: E402
 from share.metrics.local_error import LocalError  # noqa: E402
 from share.types import F64, Candidate  # noqa: E402
 
@@ -79,7 +80,8 @@ def simulate(options: argparse.Namespace) -> None:
 
 
 def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool = False) -> Row:
-    """One run. modelled: by a mapper that knows the truth, which takes no views."""
+    """One run. modelled: by a mapper that knows the truth, which takes no views. busy, solving: of the edge's
+    mapper and solver, in seconds a second; passed_over: keyframes that were not looked up."""
     began = time.monotonic()
     who = list(made.agents.values())
     first_ns = min(agent.keyframes[0].stamp_ns for agent in who)
@@ -117,7 +119,17 @@ def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool
         row["error_cm"] = errors_cm.get(name, float("nan"))
     metres = sum(float(np.linalg.norm(np.diff(a.T_world_body[:, :3, 3], axis=0), axis=1).sum()) for a in who)
     joined = max(Counter(own["map_id"] for own in report["agents"].values()).values())
-    whole = {"metres": metres, "joined": joined, "took_s": time.monotonic() - began}
+    late_ms = [r.corrected_ms for log in world.logs.values() for r in log.rows if r.corrected_ms > 0]
+    whole = {
+        "metres": metres,
+        "joined": joined,
+        "maps": len({own["map_id"] for own in report["agents"].values()}),
+        "corrected_ms": summarised(late_ms).report(),
+        "busy": world.mapping_ns / world.now_ns,
+        "solving": world.solving_ns / world.now_ns,
+        "passed_over": sum(own["queries_skipped"] for own in report["agents"].values()),
+        "took_s": time.monotonic() - began,
+    }
     return {"policy": config.edge.policy, "seed": seed, "agents": agents, **report["merges"], **whole}
 
 

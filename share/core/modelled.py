@@ -192,7 +192,10 @@ class ModelledMapper:
     def report(self) -> dict[str, Any]:
         merges = sum((run.merges for run in self._runs.values()), Counter[str]())
         return {
-            "agents": {agent: {"map_id": run.map_of} for agent, run in self._runs.items()},
+            "agents": {
+                agent: {"map_id": run.map_of, "queries_skipped": self._lookups.skipped[agent]}
+                for agent, run in self._runs.items()
+            },
             "merges": {what: merges[what] for what in ("requested", "skipped", "done")},
             "maps": dict(Counter(self._runs[stored.agent].map_of for stored in self._stored)),
         }

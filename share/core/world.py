@@ -106,6 +106,7 @@ class World:
         """mapper: by default a real one."""
         self.now_ns = 0
         self.stamps_ns: dict[Key, int] = {}  # of the keyframes that the mapper has had
+        self.mapping_ns = self.solving_ns = 0  # that the mapper and the solver have worked
         self.logs = {hello.name: RunLog() for hello, _ in agents}
         self.placed: dict[str, list[ev.Localised]] = {hello.name: [] for hello, _ in agents}  # in a map
         rng = np.random.default_rng(seed)
@@ -228,6 +229,7 @@ class World:
             cost, what = self._inbox.popleft()
             findings += what()
             spent_ns += self._draw(cost)
+        self.mapping_ns += spent_ns
         self._begin_solving(spent_ns)
         self._in(spent_ns, lambda: self._tell_front(findings))
         look = self.mapper.next_look()
@@ -235,7 +237,9 @@ class World:
             self._in(spent_ns, self._rest)
             return
         seen = _result(look.run)
-        self._in(spent_ns + self._draw(self._cost_of(look, seen)), lambda: self._looked(look, seen))
+        look_ns = self._draw(self._cost_of(look, seen))
+        self.mapping_ns += look_ns
+        self._in(spent_ns + look_ns, lambda: self._looked(look, seen))
 
     def _looked(self, look: Any, seen: object) -> None:
         self._tell_front(self.mapper.done(look, seen, 0.0))
@@ -250,10 +254,9 @@ class World:
         if (step := self.mapper.next_solve()) is not None:
             result = _result(partial(step.run, self._solver))
             taken_in = partial(self.mapper.done, step, result, 0.0)
-            self._in(
-                after_ns + self._draw(self._costs.solve),
-                lambda: self._tell_mapper(self._costs.apply, taken_in),
-            )
+            solve_ns = self._draw(self._costs.solve)
+            self.solving_ns += solve_ns
+            self._in(after_ns + solve_ns, lambda: self._tell_mapper(self._costs.apply, taken_in))
 
     def _cost_of(self, look: Any, seen: object) -> Cost:
         if look.kind == "place":
