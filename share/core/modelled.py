@@ -239,7 +239,7 @@ class ModelledMapper:
         a, b = self._stored[candidate], self._stored[number]
         shared = float(self._shared(number, self._runs[a.agent])[a.k])
         chance = (1 + math.tanh((shared - self._odds.half) / (2 * self._odds.width))) / 2
-        if self._rng.random() >= chance:
+        if self._rng.random() >= chance or not shared:
             return Refusal("drawn")
         return Verified(se3.inverse(a.T_world_body) @ b.T_world_body, _COV, 40, 30)
 
