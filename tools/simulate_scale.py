@@ -96,11 +96,13 @@ def _played(job: Job) -> list[Row]:
 
 
 def _room(seed: int, agents: int) -> KeyframeSet:
-    """As many square metres for each."""
+    """About as many square metres for each, as far as a warehouse can have them."""
     kinds = [KINDS[k % len(KINDS)] for k in range(agents)]
     motions = tuple(f"{kind}{k}={'walk' if kind == 'ar' else 'robot'}:" for k, kind in enumerate(kinds))
-    side = 3.0 * agents**0.5 + 3
-    return make_unseen(Recipe("warehouse", motions, 60.0, seed=seed, size=(side, side, 4.0)), Spacing())
+    side = max(8.0, 3.0 * agents**0.5 + 3)
+    width = min(side, 20.0)
+    size = side**2 / width, width, 4.0
+    return make_unseen(Recipe("warehouse", motions, 60.0, seed=seed, size=size), Spacing())
 
 
 def apart(rooms: Sequence[KeyframeSet]) -> KeyframeSet:
