@@ -18,6 +18,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +34,13 @@ from tool_main import exit_code, line  # noqa: E402
 
 from share.config import POLICIES, STREAMED, Config  # noqa: E402
 from share.core.events import Localised  # noqa: E402
-from share.core.modelled import ModelledMapper, Odds  # noqa: E402
+from share.core.modelled import ModelledMapper, Odds, Truth  # noqa: E402
 from share.core.world import Costs, Seen, World  # noqa: E402
 from share.geometry.align import umeyama  # noqa: E402
 from share.geometry.se3 import transform  # noqa: E402
 from share.io.transport.shaped import network  # noqa: E402
 from share.metrics.association import Trajectory  # noqa: E402
+from share.metrics.latency import summary as summarised  # noqa: E402
 from share.metrics.local_error import LocalError  # noqa: E402
 from share.types import F64, Candidate  # noqa: E402
 
@@ -78,7 +80,8 @@ def simulate(options: argparse.Namespace) -> None:
 
 
 def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool = False) -> Row:
-    """One run. modelled: by a mapper that knows the truth, which takes no views."""
+    """One run. modelled: by a mapper that knows the truth, which takes no views. busy, solving: of the edge's
+    mapper and solver, in seconds a second; passed_over: keyframes that were not looked up."""
     began = time.monotonic()
     who = list(made.agents.values())
     first_ns = min(agent.keyframes[0].stamp_ns for agent in who)
@@ -90,7 +93,10 @@ def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool
         a.hello.name: (np.array([k.stamp_ns - zero_ns for k in a.keyframes]), a.T_world_body)
         for a, zero_ns in zip(who, zeros_ns, strict=True)
     }
-    mapper = ModelledMapper(config, where(truth), Odds(), seed) if modelled else None
+    mapper = None
+    if modelled:
+        known = truth_of(made, config.control.near_m, config.control.far_m)
+        mapper = ModelledMapper(config, known, which(truth), Odds(), seed)
     members = list(zip((a.hello for a in who), seen, strict=True))
     world = World(config, members, network(link), Costs(), seed, mapper)
     world.run((last_ns - first_ns) / 1e9 + 2.0)
@@ -113,34 +119,58 @@ def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool
         row["error_cm"] = errors_cm.get(name, float("nan"))
     metres = sum(float(np.linalg.norm(np.diff(a.T_world_body[:, :3, 3], axis=0), axis=1).sum()) for a in who)
     joined = max(Counter(own["map_id"] for own in report["agents"].values()).values())
-    whole = {"metres": metres, "joined": joined, "took_s": time.monotonic() - began}
+    late_ms = [r.corrected_ms for log in world.logs.values() for r in log.rows if r.corrected_ms > 0]
+    whole = {
+        "metres": metres,
+        "joined": joined,
+        "maps": len({own["map_id"] for own in report["agents"].values()}),
+        "corrected_ms": summarised(late_ms).report(),
+        "busy": world.mapping_ns / world.now_ns,
+        "solving": world.solving_ns / world.now_ns,
+        "passed_over": sum(own["queries_skipped"] for own in report["agents"].values()),
+        "took_s": time.monotonic() - began,
+    }
     return {"policy": config.edge.policy, "seed": seed, "agents": agents, **report["merges"], **whole}
 
 
-def where(truth: dict[str, Trajectory]) -> Callable[[str, int], F64]:
-    """T_world_body by name and stamp."""
-    at = {name: dict(zip(stamps_ns.tolist(), T, strict=True)) for name, (stamps_ns, T) in truth.items()}
+@lru_cache(1)  # runs in a room follow each other
+def truth_of(made: KeyframeSet, near_m: float, far_m: float) -> Truth:
+    who = made.agents.items()
+    return Truth(near_m, far_m, {n: a.hello.rig for n, a in who}, {n: a.T_world_body for n, a in who})
+
+
+def which(truth: dict[str, Trajectory]) -> Callable[[str, int], int]:
+    """The number of an agent's keyframe, by its stamp."""
+    at = {name: {ns: k for k, ns in enumerate(stamps_ns.tolist())} for name, (stamps_ns, _) in truth.items()}
     return lambda name, stamp_ns: at[name][stamp_ns]
 
 
 def looks(agent: AgentKeyframes, first_ns: int, last_ns: int) -> Iterator[Seen]:
     """Frames at 30 Hz since `first_ns`; a keyframe takes the place of the frame that is due by then."""
+    at_ns, error_before_cm = first_ns, None
+    for stamp_ns, candidate, error_cm in offered(agent):
+        T = candidate.T_odom_body
+        while at_ns < stamp_ns - FRAME_NS // 2:
+            yield Seen(at_ns - first_ns, T, error_before_cm)
+            at_ns += FRAME_NS
+        yield Seen(stamp_ns - first_ns, T, error_cm, candidate)
+        at_ns, error_before_cm = stamp_ns + FRAME_NS, error_cm
+    while at_ns < last_ns:
+        yield Seen(at_ns - first_ns, agent.T_odom_body[-1], error_before_cm)
+        at_ns += FRAME_NS
+
+
+@lru_cache(64)
+def offered(agent: AgentKeyframes) -> list[tuple[int, Candidate, float | None]]:
+    """Every keyframe as its tracker offers it, its stamp, and odometry's error (cm) by then."""
     stamps = np.array([k.stamp_ns for k in agent.keyframes])
     error = LocalError((stamps, agent.T_world_body))
-    at_ns, error_cm = first_ns, None
+    out = []
     for keyframe, T in zip(agent.keyframes, agent.T_odom_body, strict=True):
-        while at_ns < keyframe.stamp_ns - FRAME_NS // 2:
-            yield Seen(at_ns - first_ns, T, error_cm)
-            at_ns += FRAME_NS
-        error_cm = error.after(keyframe.stamp_ns, T)
-        fresh = keyframe.reference < 0
-        up = keyframe.up, keyframe.up_sigma
+        up, fresh = (keyframe.up, keyframe.up_sigma), keyframe.reference < 0
         candidate = Candidate(T, keyframe.T_ref_body, keyframe.cov, *up, keyframe.view, fresh)
-        yield Seen(keyframe.stamp_ns - first_ns, T, error_cm, candidate)
-        at_ns = keyframe.stamp_ns + FRAME_NS
-    while at_ns < last_ns:
-        yield Seen(at_ns - first_ns, agent.T_odom_body[-1], error_cm)
-        at_ns += FRAME_NS
+        out.append((keyframe.stamp_ns, candidate, error.after(keyframe.stamp_ns, T)))
+    return out
 
 
 def shared_errors(placed: dict[str, list[Localised]], truth: dict[str, Trajectory]) -> dict[str, float]:

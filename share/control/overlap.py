@@ -86,8 +86,9 @@ class Seen:
 
     def inside(self, other: Seen, T_other_self: F64) -> F64:
         """How much of it, m^3, lies in `other`, from where it stands at T_other_self (N, 4, 4): (N,)."""
-        distances = (other.planes @ T_other_self) @ self.points
-        count: I64 = (distances.min(axis=1) >= -_SLACK_M).sum(axis=-1)
+        planes = (other.planes @ T_other_self).transpose(1, 0, 2)  # (6, N, 4): first, so that min is quick
+        distances = (planes.reshape(-1, 4) @ self.points).reshape(6, len(T_other_self), -1)
+        count: I64 = np.count_nonzero(distances.min(axis=0) >= -_SLACK_M, axis=-1)
         volume: F64 = count * (self.frustum.volume / self.points.shape[1])
         return volume
 

@@ -57,6 +57,7 @@ class Agent:
         self._connected = False
         self._session: int | None = None
         self._sessions: deque[int] = deque(maxlen=_REMEMBERED)
+        self._silent_ns = seconds(link.silent_s)
         self._heard_ns: int | None = None  # or when waiting for the edge began
         self._silence_said = False
         self._revision = -1
@@ -312,7 +313,7 @@ class Agent:
 
     def _watch_silence(self, now_ns: int) -> None:
         assert self._heard_ns is not None
-        if now_ns - self._heard_ns <= seconds(self._config.link.silent_s):
+        if now_ns - self._heard_ns <= self._silent_ns:
             return
         self._connected = False
         if not self._silence_said:

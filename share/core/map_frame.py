@@ -46,6 +46,6 @@ class MapFrame:
         self._target = None
 
     def _is_large(self, T_old: F64, T_new: F64, T_odom_body: F64) -> bool:
-        jump = se3.log(se3.inverse(T_old @ T_odom_body) @ T_new @ T_odom_body)
-        turn, shift = np.linalg.norm(jump[:3]), np.linalg.norm(jump[3:])
+        jump = se3.inverse(T_old @ T_odom_body) @ T_new @ T_odom_body
+        shift, turn = np.linalg.norm(jump[:3, 3]), se3.angle(jump)
         return bool(shift > self._config.blend_jump_m or turn > self._config.blend_jump_rad)

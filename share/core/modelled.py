@@ -9,9 +9,11 @@ with what it knows.
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -23,12 +25,14 @@ from share.core.gating import Gating
 from share.core.keeping import Change
 from share.core.lookups import Lookups, served_as
 from share.geometry import se3
+from share.geometry.camera import Rig
 from share.place.verify import Refusal, Verified
 from share.types import F64, Correction, Keyframe
 from share.wire.messages import Hello
 
 _COARSE_M = 1.0  # between the points by which overlap is found here
 _COV = np.diag([1e-5] * 3 + [1e-4] * 3)
+_REMEMBERED = 50_000  # keyframes, each with all of one agent: some 100 MB
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,28 @@ class Odds:
     witnesses: int = 2
 
 
+class Truth:
+    """Where everybody's keyframes are, sent or not, and what they have in common. It is the same in all runs
+    in a room, and best passed from one to the next: what was worked out once is remembered.
+    """
+
+    def __init__(
+        self, near_m: float, far_m: float, rigs: Mapping[str, Rig], T_world_body: Mapping[str, F64]
+    ) -> None:
+        """By agent, T_world_body (N, 4, 4). near_m, far_m: of what cameras see."""
+        self.T_world_body = T_world_body
+        self._T_world_cam = {name: T @ rigs[name].T_body_cam0 for name, T in T_world_body.items()}
+        self._seen = {
+            name: Seen(Frustum.of(rig.cam0, near_m, far_m), _COARSE_M) for name, rig in rigs.items()
+        }
+        self.shared = lru_cache(_REMEMBERED)(self._shared)
+
+    def _shared(self, agent: str, k: int, other: str) -> F64:
+        """Overlap of the agent's keyframe k with each of another's (N,), in parts of its view's volume."""
+        one, two, T = self._seen[agent], self._seen[other], self._T_world_cam
+        return volumes(one, T[agent][k], two, T[other]) / one.frustum.volume
+
+
 @dataclass(frozen=True)
 class Step:
     """To be run by whoever keeps the time. candidate: for kind `verify`."""
@@ -65,21 +91,22 @@ class Step:
 
 @dataclass
 class _Stored:
+    """k: which of the agent's keyframes in truth."""
+
     agent: str
     keyframe: Keyframe
+    k: int
     T_world_body: F64
-    T_world_cam: F64
 
 
 @dataclass
 class _Run:
-    """Of one agent. seen: what its views see. numbers, T_world_cam: of its keyframes. told: the map that it
-    was last corrected into. answer: its newest keyframe that a loop came from, -1 none."""
+    """Of one agent. numbers, ks: of its keyframes. told: the map that it was last corrected into. answer: its
+    newest keyframe that a loop came from, -1 none."""
 
     hello: Hello
-    seen: Seen
     numbers: list[int] = field(default_factory=list)
-    T_world_cam: list[F64] = field(default_factory=list)
+    ks: list[int] = field(default_factory=list)
     map_of: str = ""
     told: str = ""
     answer: int = -1
@@ -87,10 +114,12 @@ class _Run:
 
 
 class ModelledMapper:
-    """where: T_world_body (4, 4) of an agent's body, by its name and the stamp of a keyframe."""
+    """which: of an agent's keyframes in truth, by its name and the stamp of a keyframe."""
 
-    def __init__(self, config: Config, where: Callable[[str, int], F64], odds: Odds, seed: int) -> None:
-        self._config, self._where, self._odds = config, where, odds
+    def __init__(
+        self, config: Config, truth: Truth, which: Callable[[str, int], int], odds: Odds, seed: int
+    ) -> None:
+        self._config, self._truth, self._which, self._odds = config, truth, which, odds
         self._rng = np.random.default_rng(seed)
         self._stored: list[_Stored] = []
         self._runs: dict[str, _Run] = {}
@@ -105,16 +134,15 @@ class ModelledMapper:
     # ------------------------------------------------------------------ as share.core.mapper.Mapper
 
     def join(self, agent: str, hello: Hello) -> None:
-        control = self._config.control
-        frustum = Frustum.of(hello.rig.cam0, control.near_m, control.far_m)
-        self._runs[agent] = _Run(hello, Seen(frustum, _COARSE_M))
+        self._runs[agent] = _Run(hello)
 
     def add(self, agent: str, keyframe: Keyframe) -> list[Finding]:
         run, number = self._runs[agent], len(self._stored)
-        T = self._where(run.hello.name, keyframe.stamp_ns)
-        self._stored.append(_Stored(agent, keyframe, T, T @ run.hello.rig.T_body_cam0))
+        k = self._which(run.hello.name, keyframe.stamp_ns)
+        T = self._truth.T_world_body[run.hello.name][k]
+        self._stored.append(_Stored(agent, keyframe, k, T))
         run.numbers.append(number)
-        run.T_world_cam.append(self._stored[number].T_world_cam)
+        run.ks.append(k)
         self._lookups.add(agent, served_as(self._config, run.hello), number)
         if keyframe.reference >= 0:
             return []
@@ -156,7 +184,7 @@ class ModelledMapper:
             most = self._config.edge.hurry_candidates if hurried else len(result)
             self._search = step.number, deque(result[:most]), wanted
             return []
-        return self._verified(step) if isinstance(result, Verified) else []
+        return self._verified(step, result.T_c_q) if isinstance(result, Verified) else []
 
     def take_changes(self) -> tuple[Change, ...]:
         return ()
@@ -164,7 +192,10 @@ class ModelledMapper:
     def report(self) -> dict[str, Any]:
         merges = sum((run.merges for run in self._runs.values()), Counter[str]())
         return {
-            "agents": {agent: {"map_id": run.map_of} for agent, run in self._runs.items()},
+            "agents": {
+                agent: {"map_id": run.map_of, "queries_skipped": self._lookups.skipped[agent]}
+                for agent, run in self._runs.items()
+            },
             "merges": {what: merges[what] for what in ("requested", "skipped", "done")},
             "maps": dict(Counter(self._runs[stored.agent].map_of for stored in self._stored)),
         }
@@ -172,10 +203,9 @@ class ModelledMapper:
     # ------------------------------------------------------------------ what is drawn
 
     def _shared(self, number: int, run: _Run) -> F64:
-        """Overlap, in parts of its view, of a keyframe with all of an agent (N,)."""
+        """Overlap, in parts of its view, of a keyframe with each of an agent in truth (N,)."""
         mine = self._stored[number]
-        seen = self._runs[mine.agent].seen
-        return volumes(seen, mine.T_world_cam, run.seen, np.array(run.T_world_cam)) / seen.frustum.volume
+        return self._truth.shared(self._runs[mine.agent].hello.name, mine.k, run.hello.name)
 
     def _candidates(self, number: int) -> list[int]:
         """Best first."""
@@ -184,7 +214,8 @@ class ModelledMapper:
         for other, run in self._runs.items():
             if not (numbers := run.numbers):
                 continue
-            looks = self._shared(number, run) + self._odds.blur * self._rng.standard_normal(len(numbers))
+            looks = self._shared(number, run)[run.ks]
+            looks += self._odds.blur * self._rng.standard_normal(len(numbers))
             looks[self._rng.random(len(looks)) < self._odds.strange] += 0.5
             end = len(numbers)
             if other == agent:  # odometry's business
@@ -206,21 +237,19 @@ class ModelledMapper:
 
     def _verify(self, number: int, candidate: int) -> Verified | Refusal:
         a, b = self._stored[candidate], self._stored[number]
-        T_a_b, seen = se3.inverse(a.T_world_cam) @ b.T_world_cam, self._runs[b.agent].seen
-        shared = (
-            float(volumes(self._runs[a.agent].seen, np.eye(4), seen, T_a_b[None])[0]) / seen.frustum.volume
-        )
-        chance = 1 / (1 + np.exp((self._odds.half - shared) / self._odds.width))
-        return Verified(T_a_b, _COV, 40, 30) if self._rng.random() < chance else Refusal("drawn")
+        shared = float(self._shared(number, self._runs[a.agent])[a.k])
+        chance = (1 + math.tanh((shared - self._odds.half) / (2 * self._odds.width))) / 2
+        if self._rng.random() >= chance or not shared:
+            return Refusal("drawn")
+        return Verified(se3.inverse(a.T_world_body) @ b.T_world_body, _COV, 40, 30)
 
-    def _verified(self, step: Step) -> list[Finding]:
+    def _verified(self, step: Step, T_a_b: F64) -> list[Finding]:
         a, b = self._stored[step.candidate], self._stored[step.number]
         one, other = self._runs[a.agent], self._runs[b.agent]
         if self._search is not None:
             number, left, wanted = self._search
             self._search = number, left, wanted - 1
         other.merges["requested"] += 1
-        T_a_b = se3.inverse(a.T_world_body) @ b.T_world_body
         volume = self._gating.volume(one.hello.rig, other.hello.rig, T_a_b)
         if self._gating.refuses(volume, one.map_of == other.map_of):
             other.merges["skipped"] += 1

@@ -35,6 +35,7 @@ from share.wire.messages import Hello, peer_id
 
 _MS = 1_000_000
 _TICK_MS = 50
+_AT_ONCE = 1000  # random numbers
 
 
 @dataclass(frozen=True)
@@ -44,9 +45,10 @@ class Cost:
     p50: float
     p95: float
 
-    def draw_ns(self, rng: np.random.Generator) -> int:
+    def draw_ns(self, normal: float) -> int:
+        """normal: drawn from a standard normal distribution."""
         sigma = math.log(max(1.0, self.p95 / self.p50)) / 1.645
-        return round(self.p50 * math.exp(sigma * rng.standard_normal()) * _MS)
+        return round(self.p50 * math.exp(sigma * normal) * _MS)
 
 
 @dataclass(frozen=True)
@@ -110,15 +112,17 @@ class World:
         decides."""
         self.now_ns = 0
         self.stamps_ns: dict[Key, int] = {}  # of the keyframes that the mapper has had
+        self.mapping_ns = self.solving_ns = 0  # that the mapper and the solver have worked
         self.logs = {hello.name: RunLog() for hello, _ in agents}
         self.placed: dict[str, list[ev.Localised]] = {hello.name: [] for hello, _ in agents}  # in a map
         self._watch, self._record = watch, record
-        self._costs, self._rng = costs, np.random.default_rng(seed)
+        rng = np.random.default_rng(seed)
+        self._costs, self._normals = costs, _normals(rng)
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._order = count()
         self._members: dict[bytes, _Member] = {}
         for hello, looks in agents:
-            member = _Member(hello, Agent(hello, config), looks, network, self._rng.spawn(2))
+            member = _Member(hello, Agent(hello, config), looks, network, rng.spawn(2))
             self._members[member.peer] = member
             self._next_look(member)
         self.edge = ed.Edge(config, session=1)
@@ -143,7 +147,7 @@ class World:
         heapq.heappush(self._events, (self.now_ns + ns, next(self._order), act))
 
     def _draw(self, cost: Cost) -> int:
-        return cost.draw_ns(self._rng)
+        return cost.draw_ns(next(self._normals))
 
     def _tick(self) -> None:
         for member in self._members.values():
@@ -197,9 +201,8 @@ class World:
                         log.mark_corrected(effect.stamp_ns, effect.corrected_ms)
 
     def _send_up(self, member: _Member, frames: Sequence[Bytes]) -> None:
-        copy = [bytes(frame) for frame in frames]
-        arrival_ns = member.up.arrival_ns(size(copy), self.now_ns) + self._draw(self._costs.front)
-        self._in(arrival_ns - self.now_ns, lambda: self._to_edge(ed.Received(member.peer, copy)))
+        arrival_ns = member.up.arrival_ns(size(frames), self.now_ns) + self._draw(self._costs.front)
+        self._in(arrival_ns - self.now_ns, lambda: self._to_edge(ed.Received(member.peer, frames)))
 
     # ------------------------------------------------------------------ the edge
 
@@ -214,9 +217,9 @@ class World:
                     self._record(effect.fields)
 
     def _send_down(self, effect: ed.Send) -> None:
-        member, copy = self._members[effect.peer], [bytes(frame) for frame in effect.frames]
-        arrival_ns = member.down.arrival_ns(size(copy), self.now_ns)
-        self._in(arrival_ns - self.now_ns, lambda: self._to_agent(member, ev.Received(copy)))
+        member, frames = self._members[effect.peer], effect.frames
+        arrival_ns = member.down.arrival_ns(size(frames), self.now_ns)
+        self._in(arrival_ns - self.now_ns, lambda: self._to_agent(member, ev.Received(frames)))
 
     def _hear(self, message: ed.Join | ed.Add) -> list[Finding]:
         if isinstance(message, ed.Add):
@@ -240,6 +243,7 @@ class World:
             cost, what = self._inbox.popleft()
             findings += what()
             spent_ns += self._draw(cost)
+        self.mapping_ns += spent_ns
         self._begin_solving(spent_ns)
         self._in(spent_ns, lambda: self._tell_front(findings))
         look = self.mapper.next_look()
@@ -247,7 +251,9 @@ class World:
             self._in(spent_ns, self._rest)
             return
         seen = _result(look.run)
-        self._in(spent_ns + self._draw(self._cost_of(look, seen)), lambda: self._looked(look, seen))
+        look_ns = self._draw(self._cost_of(look, seen))
+        self.mapping_ns += look_ns
+        self._in(spent_ns + look_ns, lambda: self._looked(look, seen))
 
     def _looked(self, look: Any, seen: object) -> None:
         self._tell_front(self.mapper.done(look, seen, 0.0))
@@ -262,10 +268,9 @@ class World:
         if (step := self.mapper.next_solve()) is not None:
             result = _result(partial(step.run, self._solver))
             taken_in = partial(self.mapper.done, step, result, 0.0)
-            self._in(
-                after_ns + self._draw(self._costs.solve),
-                lambda: self._tell_mapper(self._costs.apply, taken_in),
-            )
+            solve_ns = self._draw(self._costs.solve)
+            self.solving_ns += solve_ns
+            self._in(after_ns + solve_ns, lambda: self._tell_mapper(self._costs.apply, taken_in))
 
     def _cost_of(self, look: Any, seen: object) -> Cost:
         if look.kind == "place":
@@ -279,6 +284,12 @@ class World:
         changes = self.mapper.take_changes()
         if findings or changes:
             self._to_edge(ed.Found(tuple(findings), changes))
+
+
+def _normals(rng: np.random.Generator) -> Iterator[float]:
+    """One by one, drawn many at a time."""
+    while True:
+        yield from rng.standard_normal(_AT_ONCE).tolist()
 
 
 def _result(work: Callable[[], object]) -> object:

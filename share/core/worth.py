@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from statistics import median
 
 import numpy as np
 
@@ -32,4 +33,4 @@ class Worth:
         """Whether it is worth no less than half of those of late."""
         worth = reach_m(view)
         self._recent.append(worth)
-        return worth >= float(np.median(self._recent))
+        return worth >= median(self._recent)

@@ -103,7 +103,7 @@ def from_quat(t: F64, q: F64) -> F64:
 
 def inverse(T: F64) -> F64:
     """T_b_a of T_a_b: (..., 4, 4)."""
-    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    Rt = T[..., :3, :3].swapaxes(-1, -2)
     return compose(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
 
 

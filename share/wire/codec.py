@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from math import isfinite, prod
 from operator import attrgetter
 from typing import Annotated, Any
@@ -74,23 +75,26 @@ _read_header = msgspec.msgpack.Decoder(_Header).decode
 class _Scalars:
     """Scalar fields by their paths, checked alike on the way out and in."""
 
-    paths: tuple[str, ...]
+    names: tuple[str, ...]
+    getters: tuple[Callable[[object], Any], ...]
     decoder: msgspec.msgpack.Decoder[Any]
 
     @staticmethod
     def of(**fields: Any) -> _Scalars:
-        return _Scalars(tuple(fields), msgspec.msgpack.Decoder(tuple[tuple(fields.values())]))  # type: ignore[misc]
+        decoder = msgspec.msgpack.Decoder(tuple[tuple(fields.values())])  # type: ignore[misc]
+        return _Scalars(tuple(map(_name, fields)), tuple(map(attrgetter, fields)), decoder)
 
     def encode(self, message: object) -> bytes:
-        raw = _encoder.encode([attrgetter(path)(message) for path in self.paths])
+        raw = _encoder.encode([get(message) for get in self.getters])
         self.decode(raw)
         return raw
 
     def decode(self, raw: msgspec.Raw | bytes) -> dict[str, Any]:
         values = self.decoder.decode(raw)
-        if not all(isfinite(value) for value in values if isinstance(value, float)):
-            raise ValueError("a number is not finite")
-        return dict(zip(map(_name, self.paths), values, strict=True))
+        for value in values:
+            if isinstance(value, float) and not isfinite(value):
+                raise ValueError("a number is not finite")
+        return dict(zip(self.names, values, strict=True))
 
 
 @dataclass(frozen=True)
@@ -104,8 +108,16 @@ class _Array:
     optional: bool = False
     most: int = MAX_KEYPOINTS
 
+    @cached_property
+    def name(self) -> str:
+        return _name(self.path)
+
+    @cached_property
+    def _getter(self) -> Callable[[object], Any]:
+        return attrgetter(self.path)
+
     def get(self, message: object) -> NDArray[Any]:
-        value = attrgetter(self.path)(message)
+        value = self._getter(message)
         absent = self.optional and value is None
         return np.ascontiguousarray(() if absent else value, _DTYPES[self.dtype])
 
@@ -123,15 +135,16 @@ class _Array:
         if not size:
             return None if self._is_absent(shape) else np.empty(shape, _DTYPES[dtype])
         # a short frame lies unaligned in its message: only then is it copied
-        return np.require(np.frombuffer(data, _DTYPES[dtype]).reshape(shape), requirements="A")
+        array = np.frombuffer(data, _DTYPES[dtype]).reshape(shape)
+        return array if array.flags.aligned else array.copy()
 
     def _admits(self, shape: tuple[int, ...]) -> bool:
-        return self._is_absent(shape) or (
-            len(shape) == len(self.shape)
-            and all(
-                0 <= have <= self.most if want is None else have == want
-                for want, have in zip(self.shape, shape, strict=True)
-            )
+        return shape == self.shape or self._is_absent(shape) or self._fits(shape)
+
+    def _fits(self, shape: tuple[int, ...]) -> bool:
+        return len(shape) == len(self.shape) and all(
+            0 <= have <= self.most if want is None else have == want
+            for want, have in zip(self.shape, shape, strict=True)
         )
 
     def _is_absent(self, shape: tuple[int, ...]) -> bool:
@@ -309,7 +322,7 @@ def decode(frames: Sequence[Bytes]) -> m.Message:
 
 def size(frames: Sequence[Bytes]) -> int:
     """Bytes of a message, without what the transport adds (ZMTP: 2 or 9 bytes a frame)."""
-    return sum(memoryview(frame).nbytes for frame in frames)
+    return sum([memoryview(frame).nbytes for frame in frames])
 
 
 def _wire_error(where: str, error: Exception) -> WireError:
@@ -329,6 +342,6 @@ def _arrays(layout: _Layout, header: _Header, frames: Sequence[Bytes]) -> dict[s
             f"{len(frames) - 1} array frames, {len(header.arrays)} declared, {len(layout.arrays)} expected"
         )
     return {
-        _name(spec.path): spec.decode(dtype, shape, frame)
+        spec.name: spec.decode(dtype, shape, frame)
         for spec, (dtype, shape), frame in zip(layout.arrays, header.arrays, frames[1:], strict=True)
     }

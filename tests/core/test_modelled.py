@@ -12,7 +12,7 @@ from test_world import MS, seen
 
 from share.config import Config, EdgeConfig
 from share.core.channel import NETWORKS
-from share.core.modelled import ModelledMapper, Odds
+from share.core.modelled import ModelledMapper, Odds, Truth
 from share.core.world import Costs, Seen, World
 from share.geometry import se3
 
@@ -21,16 +21,17 @@ SECONDS = 6.0
 USUAL = Odds()
 
 
-def played(policy: str = "covins-g", seed: int = 0, odds: Odds | None = USUAL) -> World:
-    """Ann and Bob in one room, half a wall apart. odds: None for a real mapper."""
+def played(policy: str = "covins-g", seed: int = 0, odds: Odds | None = USUAL, apart_m: float = 0.0) -> World:
+    """Ann and Bob in one room, half a wall and apart_m apart. odds: None for a real mapper."""
     people = {name: Person(name, ROOM, at, run) for name, at, run in (("ann", 0.0, 11), ("bob", 0.5, 22))}
     frames = {name: list(seen(person, SECONDS)) for name, person in people.items()}
-    where = {
-        name: dict(zip([f.at_ns for f in frames[name] if f.candidate], person.T_world_body, strict=True))
-        for name, person in people.items()
-    }
+    stamps_ns = {name: [f.at_ns for f in frames[name] if f.candidate] for name in people}
     config = Config(edge=EdgeConfig(policy=policy))
-    mapper = odds and ModelledMapper(config, lambda name, stamp_ns: where[name][stamp_ns], odds, seed)
+    rigs = {name: person.hello.rig for name, person in people.items()}
+    there = {name: np.array(person.T_world_body) for name, person in people.items()}
+    there["bob"][:, 0, 3] += apart_m
+    truth = Truth(config.control.near_m, config.control.far_m, rigs, there)
+    mapper = odds and ModelledMapper(config, truth, lambda name, ns: stamps_ns[name].index(ns), odds, seed)
     agents: list[tuple[object, Iterator[Seen]]] = [(p.hello, iter(frames[n])) for n, p in people.items()]
     made = World(config, agents, NETWORKS["wifi5"], Costs(), seed, mapper)
     made.run(SECONDS + 1.0)
@@ -73,6 +74,13 @@ def test_views_that_share_nothing_are_never_merged() -> None:
     room = played(odds=Odds(half=5.0, width=0.01))
     report = room.edge.report(room.mapper.report())
     assert report["merges"] == {"requested": 0, "skipped": 0, "done": 0}
+    assert sorted(report["maps"].values()) == [24, 24]
+
+
+def test_nor_by_chance_where_all_that_share_something_are() -> None:
+    room = played(odds=Odds(half=-1.0), apart_m=1000.0)
+    report = room.edge.report(room.mapper.report())
+    assert report["merges"]["done"] > 0
     assert sorted(report["maps"].values()) == [24, 24]
 
 

@@ -1,0 +1,31 @@
+"""Several rooms in one world."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TOOL = Path(__file__).parents[2] / "tools" / "simulate_scale.py"
+
+
+@pytest.mark.slow
+def test_rooms_that_are_apart_are_a_map_each(tmp_path: Path) -> None:
+    kept = tmp_path / "rows.json"
+    only = ["--agents", "--rooms-of", "2x2", "--seeds", "401:402", "--workers", "1", "--json", str(kept)]
+    done = subprocess.run([sys.executable, str(TOOL), *only], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(kept.read_text())
+    assert [row["policy"] for row in rows] == ["covins-g", "share"]
+    assert all(row["maps"] == 2 and len(row["agents"]) == 4 for row in rows)
+    assert all(0 < row["solving"] < row["busy"] < 1 and row["passed_over"] == 0 for row in rows)
+    assert len(done.stdout.splitlines()) == 4
+
+
+def test_a_size_that_is_none_is_said() -> None:
+    done = subprocess.run([sys.executable, str(TOOL), "--rooms-of", "10"], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "'10': give ROOMSxAGENTS" in done.stderr
