@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 
-from share.config import Config
+from share.config import Config, EdgeConfig
 from share.control.policies import POLICIES
 from share.control.qoe import Needs
 from share.types import AgentKind
@@ -23,16 +23,16 @@ def served_as(config: Config, hello: Hello) -> AgentKind:
 
 
 class Lookups:
-    """Keyframes that wait to be looked up, at most `most`, and `each` of an agent: what waits longer is
-    answered when nobody asks any more.
+    """Keyframes that wait to be looked up, at most `edge.max_waiting`, and `each_waiting` of an agent: what
+    waits longer is answered when nobody asks any more.
 
     One too many: the oldest, of this agent or of the one with most of them, is passed over (policy
     skip_oldest_query).
     """
 
-    def __init__(self, most: int, each: int) -> None:
+    def __init__(self, config: EdgeConfig) -> None:
         self.skipped: Counter[str] = Counter()  # by agent
-        self._most, self._each = most, each
+        self._config = config
         self._waiting: dict[str, deque[int]] = {}
         self._weight: dict[str, int] = {}
         self._served: dict[str, int] = {}  # when, in turns
@@ -42,13 +42,18 @@ class Lookups:
     def __len__(self) -> int:
         return sum(map(len, self._waiting.values()))
 
+    @property
+    def in_a_hurry(self) -> bool:
+        """So many wait that the one at hand should soon be done."""
+        return len(self) >= self._config.hurry_waiting
+
     def add(self, agent: str, kind: AgentKind, number: int) -> None:
         self._weight[agent] = _WEIGHT[kind]
         self._served.setdefault(agent, self._turn)
         self._waiting.setdefault(agent, deque()).append(number)
-        if len(self._waiting[agent]) > self._each:
+        if len(self._waiting[agent]) > self._config.each_waiting:
             self._skip(agent)
-        elif len(self) > self._most:
+        elif len(self) > self._config.max_waiting:
             self._skip(max(self._waiting, key=lambda name: len(self._waiting[name])))
 
     def next(self) -> int | None:

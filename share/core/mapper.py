@@ -27,6 +27,7 @@ from share.core.keeping import (
     edge_to,
 )
 from share.core.lookups import Lookups, served_as
+from share.core.search import Effort, Search
 from share.core.steps import Look, Query, Solve, Step, Verify
 from share.graph.change import Solution
 from share.merge.atlas import Applied, Atlas, Placed
@@ -52,15 +53,6 @@ class _Account:
     merges: Counter[str] = field(default_factory=Counter)  # requested, skipped, done
 
 
-@dataclass
-class _Search:
-    """For the place of a keyframe. left: candidates, best first; wanted: so many that are it, and no more."""
-
-    query: Query
-    left: deque[int]
-    wanted: int
-
-
 class Mapper:
     """The maps of all agents. `agent` names one run of an agent everywhere here."""
 
@@ -72,10 +64,12 @@ class Mapper:
         self._sights: dict[int, Sight] = {}  # by the number of a keyframe in atlas and index
         self._atlas = Atlas(config.merge, self._sights)
         self._unseen: list[tuple[int, KeptKeyframe]] = []  # restored
-        self._lookups = Lookups(config.edge.max_waiting, config.edge.each_waiting)
+        self._lookups = Lookups(config.edge)
         self._gating = Gating(config.control, config.edge.policy)
         self._concern = Concern()
-        self._search: _Search | None = None
+        self._effort = Effort.of(config)
+        self._search: Search | None = None
+        self._query: Query | None = None  # that the search is about
         self._looking = self._solving = False
         self._leaving: list[int] = []  # keyframes that go next
         self._changes: list[Change] = []
@@ -135,7 +129,7 @@ class Mapper:
         step: Look | None = self._next_verify()
         while step is None and (number := self._next_number()) is not None:
             if number in self._sights:
-                step = self._query(number)
+                step = self._ask(number)
         self._looking = step is not None
         return step
 
@@ -169,7 +163,7 @@ class Mapper:
         """What the result leads to. Raises what the step raised."""
         match step:
             case Query() if isinstance(result, list):
-                self._search = self._search_among(step, [c.id for c in result])
+                self._begin_search(step, [c.id for c in result])
                 return self._review(step.number)
             case Verify() if isinstance(result, Verified | Refusal):
                 return self._judge(step, result)
@@ -206,27 +200,26 @@ class Mapper:
 
     # ------------------------------------------------------------------ steps
 
-    def _query(self, number: int) -> Query:
+    def _ask(self, number: int) -> Query:
         near = self._atlas.neighbours(number)
         return Query(self._index, number, self._sights[number], self._config.place.candidates, near)
 
-    def _search_among(self, query: Query, found: list[int]) -> _Search:
-        place, edge = self._config.place, self._config.edge
-        if len(self._lookups) < edge.hurry_waiting:
-            return _Search(query, deque(found), place.enough)
-        known = [n for n in found if n in self._sights]
-        most = self._atlas.promising_first(query.number, known)[: edge.hurry_candidates]
-        return _Search(query, deque(most), 1)
+    def _begin_search(self, query: Query, found: list[int]) -> None:
+        if self._lookups.in_a_hurry:
+            found = self._atlas.promising_first(query.number, [n for n in found if n in self._sights])
+        self._query, self._search = query, Search(query.number, found, self._effort)
 
     def _next_verify(self) -> Verify | None:
         """Those that have been taken out meanwhile are passed over."""
-        search = self._search
-        while search is not None and search.left and search.wanted:
-            query, candidate = search.query, search.left.popleft()
+        search, query = self._search, self._query
+        while search is not None and query is not None:
+            candidate = search.next(self._lookups.in_a_hurry)
+            if candidate is None:
+                break
             if {query.number, candidate} <= self._sights.keys():
                 seen = self._sights[candidate]
                 return Verify(query.number, query.sight, candidate, seen, self._config.place)
-        self._search = None
+        self._search = self._query = None
         return None
 
     def _judge(self, step: Verify, outcome: Verified | Refusal) -> list[Finding]:
@@ -238,7 +231,7 @@ class Mapper:
         if isinstance(outcome, Refusal):
             return [Finding(b.agent, "loop refused", f"{a} - {b}: {outcome.reason}")]
         if self._search is not None:
-            self._search.wanted -= 1
+            self._search.verified()
         loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers)
         account.merges["requested"] += 1
         volume = self._gating.volume(self._hellos[a.agent].rig, self._hellos[b.agent].rig, loop.T_a_b)

@@ -10,7 +10,7 @@ with what it knows.
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -24,6 +24,7 @@ from share.core.finding import Finding, in_map
 from share.core.gating import Gating
 from share.core.keeping import Change
 from share.core.lookups import Lookups, served_as
+from share.core.search import Effort, Search
 from share.geometry import se3
 from share.geometry.camera import Rig
 from share.place.verify import Refusal, Verified
@@ -124,9 +125,10 @@ class ModelledMapper:
         self._stored: list[_Stored] = []
         self._runs: dict[str, _Run] = {}
         self._T_map_world: dict[str, F64] = {}
-        self._lookups = Lookups(config.edge.max_waiting, config.edge.each_waiting)
+        self._lookups = Lookups(config.edge)
         self._gating = Gating(config.control, config.edge.policy)
-        self._search: tuple[int, deque[int], int] | None = None  # number, candidates, how many are wanted
+        self._effort = Effort.of(config)
+        self._search: Search | None = None
         self._looking = self._solving = False
         self._due: dict[str, None] = {}  # maps
         self._pairs: dict[frozenset[str], int] = {}  # verified ones between two maps
@@ -179,10 +181,7 @@ class ModelledMapper:
             return self._solved(*result)
         self._looking = False
         if step.kind == "place":
-            hurried = len(self._lookups) >= self._config.edge.hurry_waiting
-            wanted = 1 if hurried else self._config.place.enough
-            most = self._config.edge.hurry_candidates if hurried else len(result)
-            self._search = step.number, deque(result[:most]), wanted
+            self._search = Search(step.number, result, self._effort)
             return []
         return self._verified(step, result.T_c_q) if isinstance(result, Verified) else []
 
@@ -226,13 +225,12 @@ class ModelledMapper:
         return [n for _, n in ranked[: self._config.place.candidates]]
 
     def _next_verify(self) -> Step | None:
-        if self._search is None:
-            return None
-        number, left, wanted = self._search
-        if not left or not wanted:
+        search = self._search
+        candidate = None if search is None else search.next(self._lookups.in_a_hurry)
+        if search is None or candidate is None:
             self._search = None
             return None
-        candidate = left.popleft()
+        number = search.number
         return Step("verify", number, lambda: self._verify(number, candidate), candidate)
 
     def _verify(self, number: int, candidate: int) -> Verified | Refusal:
@@ -247,8 +245,7 @@ class ModelledMapper:
         a, b = self._stored[step.candidate], self._stored[step.number]
         one, other = self._runs[a.agent], self._runs[b.agent]
         if self._search is not None:
-            number, left, wanted = self._search
-            self._search = number, left, wanted - 1
+            self._search.verified()
         other.merges["requested"] += 1
         volume = self._gating.volume(one.hello.rig, other.hello.rig, T_a_b)
         if self._gating.refuses(volume, one.map_of == other.map_of):

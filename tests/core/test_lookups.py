@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
+from share.config import EdgeConfig
 from share.core.lookups import Lookups
 from share.types import AgentKind
 
@@ -11,14 +12,14 @@ AR, ROBOT = AgentKind.AR, AgentKind.ROBOT
 
 
 def test_one_agent_newest_first() -> None:
-    queue = Lookups(10, 10)
+    queue = Lookups(EdgeConfig(max_waiting=10, each_waiting=10))
     for number in range(3):
         queue.add("ann", AR, number)
     assert [queue.next() for _ in range(4)] == [2, 1, 0, None]
 
 
 def test_who_sends_more_is_not_served_more() -> None:
-    queue = Lookups(1000, 1000)
+    queue = Lookups(EdgeConfig(max_waiting=1000, each_waiting=1000))
     for number in range(90):
         queue.add("ann", AR, number)
     for number in range(100, 110):
@@ -28,7 +29,7 @@ def test_who_sends_more_is_not_served_more() -> None:
 
 
 def test_headsets_before_robots_but_robots_too() -> None:
-    queue = Lookups(1000, 1000)
+    queue = Lookups(EdgeConfig(max_waiting=1000, each_waiting=1000))
     who = Counter[str]()
     for number in range(200):
         queue.add("ann", AR, number)
@@ -41,7 +42,7 @@ def test_headsets_before_robots_but_robots_too() -> None:
 
 
 def test_one_too_many_costs_the_longest_queue_its_oldest() -> None:
-    queue = Lookups(4, 4)
+    queue = Lookups(EdgeConfig(max_waiting=4, each_waiting=4))
     for number in range(4):
         queue.add("ann", AR, number)
     queue.add("bob", AR, 10)
@@ -51,7 +52,7 @@ def test_one_too_many_costs_the_longest_queue_its_oldest() -> None:
 
 
 def test_one_that_sends_much_is_answered_soon_or_not_at_all() -> None:
-    queue = Lookups(12, 3)
+    queue = Lookups(EdgeConfig(max_waiting=12, each_waiting=3))
     for number in range(8):
         queue.add("ann", AR, number)
     queue.add("bob", AR, 10)
@@ -62,7 +63,7 @@ def test_one_that_sends_much_is_answered_soon_or_not_at_all() -> None:
 def test_of_many_agents_the_newest_are_answered_and_nobody_starves() -> None:
     """Twenty agents in turn, half as many look-ups as keyframes: none is looked up that is older than a few
     others, and everybody has its turn."""
-    queue, served, age = Lookups(12, 3), Counter[int](), []
+    queue, served, age = Lookups(EdgeConfig(max_waiting=12, each_waiting=3)), Counter[int](), []
     for number in range(2000):
         queue.add(f"agent{number % 20}", AR, number)
         if number % 2:
@@ -75,7 +76,7 @@ def test_of_many_agents_the_newest_are_answered_and_nobody_starves() -> None:
 
 
 def test_those_passed_over_are_there_for_later_newest_first() -> None:
-    queue = Lookups(12, 3)
+    queue = Lookups(EdgeConfig(max_waiting=12, each_waiting=3))
     for number in range(300):
         queue.add("ann", AR, number)
     assert [queue.next() for _ in range(4)] == [299, 298, 297, None]
