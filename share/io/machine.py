@@ -16,7 +16,7 @@ def describe_machine() -> dict[str, Any]:
     return {
         "cpu": _cpu() or platform.processor() or platform.machine(),
         "cores": len(os.sched_getaffinity(0)),
-        "system": platform.platform(),
+        "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         **{name: version(name) for name in _LIBRARIES},
         "load": round(os.getloadavg()[0], 2),

@@ -113,7 +113,7 @@ def test_a_result_that_cannot_be_used_costs_its_step(monkeypatch):
     def bad(*_):
         raise ValueError("no such thing")
 
-    monkeypatch.setattr(mapper, "_search_among", bad)
+    monkeypatch.setattr(mapper, "_begin_search", bad)
     (finding,) = mapper.done(step, step.run(), 1.0)
     assert (finding.what, finding.reason) == ("job failed", "place: ValueError: no such thing")
     monkeypatch.undo()
