@@ -318,7 +318,7 @@ class ControlConfig:
     far_m: float = 5.0  # to here, its field of view as calibrated
     interval_m: float = 0.5  # between points at which overlap is sampled
     merges: int = 20  # completed ones, with whose mean overlap a new one is compared
-    eagerness: float = 0.75  # a merge of mean overlap is done with this chance, less overlap with less
+    eagerness: float = 1.5  # a merge is done with this chance, times its overlap as a part of their mean
 
     def __post_init__(self) -> None:
         _require_positive(self, "ar_gamma", "robot_gamma", "robot_theta_ms", "rate_min_hz", "merges")
