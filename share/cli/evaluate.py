@@ -32,6 +32,9 @@ _TERMS = (
         "--virtual", is_flag=True, help="In virtual time: tracked once, how long things take is drawn."
     ),
     click.option(
+        "--costs", metavar="RUN", help="With --virtual: things take as long as in this run in real time."
+    ),
+    click.option(
         "--agents-first", is_flag=True, help="The edge gets what agents leave, as if they had own machines."
     ),
 )
@@ -80,7 +83,7 @@ def run(
     \b
     Example:  share evaluate run room1 --policy covins-g --link wifi5 --out runs/covins
     """
-    config, live = _settings(config_file, told["link"]), LiveLine()
+    config, live = _settings(config_file, told), LiveLine()
     from share.io.session import read_session
     from share.run.figures import figures
     from share.run.play import Terms
@@ -165,7 +168,7 @@ def ablation(
     \b
     Example:  share evaluate ablation room1 room2 --policy share --policy covins-g --link wifi5 --out two
     """
-    config, live = _settings(config_file, told["link"]), LiveLine()
+    config, live = _settings(config_file, told), LiveLine()
     if workers > 1 and not told["virtual"]:
         raise UsageError("--workers: runs in real time would slow each other down; it goes with --virtual")
     from share.io.files import writable_dir
@@ -215,13 +218,19 @@ def _write(out: Path, found: list[RunFigures], trials: list[Trial]) -> None:
     click.echo(f"report: {out / 'report.md'}   pictures: {', '.join(map(str, pictures))}")
 
 
-def _settings(config_file: str | None, link: str | None) -> Config:
-    """What is wrong with either is said before anything is played."""
+def _settings(config_file: str | None, told: dict[str, Any]) -> Config:
+    """What is wrong with them or with the terms is said before anything is played."""
     config = options.load_config(config_file)
-    if link is not None:
+    if told["link"] is not None:
         from share.io.transport.shaped import network
 
-        network(link)
+        network(told["link"])
+    if told["costs"] is not None:
+        from share.run.costs import costs_of
+
+        if not told["virtual"]:
+            raise UsageError("--costs: in real time things take as long as they take; it goes with --virtual")
+        costs_of(Path(told["costs"]))
     return config
 
 

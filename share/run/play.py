@@ -42,8 +42,8 @@ class Progress:
 class Terms:
     """On which a session is played. link: an emulated network, by name or file; seed: of what it does.
     true_error: agents tell the edge how wrong they are by the truth. virtual: in virtual time
-    (`share.run.virtual`). agents_first: the edge gets what the agents leave of this machine, as if they had
-    their own. config: a file, for all."""
+    (`share.run.virtual`), where things take as long as in the run in folder `costs`. agents_first: the edge
+    gets what the agents leave of this machine, as if they had their own. config: a file, for all."""
 
     policy: str
     link: str | None = None
@@ -51,6 +51,7 @@ class Terms:
     true_error: bool = False
     virtual: bool = False
     agents_first: bool = False
+    costs: str | None = None
     config: str | None = None
 
     def of_edge(self) -> tuple[str, ...]:

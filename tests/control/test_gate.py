@@ -59,7 +59,7 @@ def test_it_is_a_probability_that_falls_with_overlap(
 def test_how_many_of_evenly_spread_overlaps_pass(
     eagerness: float, part: float, rng: np.random.Generator
 ) -> None:
-    """All beyond t = mean / eagerness, and below it v / t of them; so the mean is (1/2 - t^2 / 6) / (1 - t / 2)
+    """All beyond t = mean / eagerness, below it v / t of them: so the mean is (1/2 - t^2 / 6) / (1 - t / 2),
     and 1 - t / 2 pass. 0.75: the paper's merges per metre, 0.06 of 0.11."""
     gate, passed, n = Gate(eagerness, 20), 0, 20_000
     for volume, draw in rng.random((n, 2)).tolist():

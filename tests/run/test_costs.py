@@ -1,0 +1,54 @@
+"""How long things took in a run, for runs in virtual time."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from share.core.world import Cost, Costs
+from share.errors import DataError, ShareError, UsageError
+from share.run.costs import costs_of
+
+
+def spread(p50: float, p95: float, n: int = 10) -> dict[str, float | None]:
+    return {"n": n, "p50": p50 if n else None, "p95": p95 if n else None}
+
+
+def run(folder: Path, solved: int = 10) -> Path:
+    """Two agents, twice as slow as usual, and an edge that verifies in half the usual time."""
+    edge = {
+        "place_ms": spread(6.0, 9.0),
+        "verify_ms": spread(2.0, 5.0),
+        "solve_ms": spread(20.0, 50.0, solved),
+    }
+    files = {
+        "ann": {"track_ms": spread(15.0, 30.0)},
+        "bob": {"track_ms": spread(25.0, 50.0)},
+        "edge": edge,
+    }
+    for name, report in files.items():
+        (folder / name).mkdir()
+        (folder / name / ("edge.json" if name == "edge" else "report.json")).write_text(json.dumps(report))
+    return folder
+
+
+def test_what_was_measured_and_the_rest_in_proportion(tmp_path):
+    costs, usual = costs_of(run(tmp_path)), Costs()
+    assert costs.frame == Cost(20.0, 40.0)
+    assert costs.query == Cost(6.0, 9.0)
+    assert costs.accepted == costs.refused == Cost(2.0, 5.0)
+    assert costs.solve == Cost(20.0, 50.0)
+    assert costs.keyframe == Cost(2 * usual.keyframe.p50, 2 * usual.keyframe.p95)
+    for name in ("front", "add", "judge", "apply"):
+        assert getattr(costs, name).p50 == pytest.approx(0.5 * getattr(usual, name).p50)
+
+
+def test_what_is_not_there_is_said(tmp_path):
+    with pytest.raises(UsageError, match="is not a run by"):
+        costs_of(tmp_path)
+    folder = run(tmp_path, solved=0)
+    with pytest.raises(DataError, match="nothing was measured"):
+        costs_of(folder)
+    (folder / "ann" / "report.json").write_text("{")
+    with pytest.raises(ShareError, match="is damaged"):
+        costs_of(folder)
