@@ -15,7 +15,7 @@ _USUAL = Costs()
 
 
 def costs_of(run: Path) -> Costs:
-    """By the reports in `run`, a folder by `share evaluate run`: of frames, queries, verifications, solutions.
+    """By the reports in `run`, a folder by `share evaluate run`: frames, queries, verifications, solutions.
 
     What is not measured, a keyframe at the agent and the edge's small steps, is as much slower or quicker
     than usual as frames and verifications are. Raises UsageError or DataError.
