@@ -42,6 +42,7 @@ def draw_bars(
         axis.grid(axis="y", alpha=0.3)
         axis.set_axisbelow(True)
     axes[-1, 0].set_xticks(at, groups, rotation=30, ha="right")
-    axes[0, 0].legend(ncols=len(axes[0, 0].get_legend_handles_labels()[0]), fontsize=8, loc="upper right")
+    handles, names = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper right", ncols=len(names), fontsize=8)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
