@@ -86,7 +86,7 @@ def _provenance(runs: Sequence[RunFigures], trials: Sequence[Trial]) -> str:
     }
     loads = [r["machine"]["load"] for r in records]
     told = [
-        f"{len(runs)} runs in real time, every agent and the edge a process, "
+        f"{len(runs)} runs {_how(trials[0])}, "
         f"{min(r['began'] for r in records)} to {max(r['began'] for r in records)}.",
         f"Sessions: {', '.join(sorted({run.conditions.session for run in runs}))}; "
         f"links: {', '.join(sorted({run.conditions.link or 'loopback' for run in runs}))}; "
@@ -101,6 +101,15 @@ def _provenance(runs: Sequence[RunFigures], trials: Sequence[Trial]) -> str:
         + ".",
     ]
     return "\n".join(f"* {line}" for line in (*told, *(f"{text[0].upper()}{text[1:]}." for text in PROTOCOL)))
+
+
+def _how(trial: Trial) -> str:
+    terms = trial.terms
+    if terms.virtual:
+        return "in virtual time" + (f", things as long as in {Path(terms.costs).name}" if terms.costs else "")
+    return "in real time, every agent and the edge a process" + (
+        ", agents first" if terms.agents_first else ""
+    )
 
 
 def _comparison(runs: Sequence[RunFigures], names: Sequence[str], base: str) -> str:
