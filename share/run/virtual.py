@@ -30,6 +30,7 @@ from share.io.source import Source, open_source
 from share.io.transport.shaped import network
 from share.metrics.local_error import LocalError
 from share.run.agent_files import AgentFiles
+from share.run.costs import costs_of
 from share.run.pipeline import frames_of, tracker_for
 from share.run.play import Progress, Terms
 from share.strict import to_mapping
@@ -59,7 +60,8 @@ def play_virtually(
     folders = {name: out / name for name in session.agents}
     observer = _Observer(folders, writable_dir(out / "edge"), show)
     link = Network() if terms.link is None else network(terms.link)
-    world = World(settings, members, link, Costs(), terms.seed, watch=observer.watch, record=observer.record)
+    costs = Costs() if terms.costs is None else costs_of(Path(terms.costs))
+    world = World(settings, members, link, costs, terms.seed, watch=observer.watch, record=observer.record)
     world.run(seconds + _AFTER_S)
     observer.finish(world, settings)
     return folders

@@ -117,6 +117,18 @@ def test_in_virtual_time_the_same_seed_gives_the_same_run(evaluate, plain_sessio
         assert evaluate("run", plain_session, *virtual, "--out", tmp_path / name).code == 0
     assert evaluate("run", plain_session, *virtual, "--seed", 1, "--out", tmp_path / "other").code == 0
     assert evaluate("run", plain_session, "--out", tmp_path / "real").code == 0
+    slow = tmp_path / "slow"
+    shutil.copytree(tmp_path / "real", slow)
+    times = {f"{step}_ms": {"n": 1, "p50": 5.0, "p95": 9.0} for step in ("place", "verify", "solve")}
+    (slow / "edge" / "edge.json").write_text(json.dumps(times))  # so short a run may solve nothing
+    for agent in ("ar1", "ar2", "robot"):
+        report = json.loads((slow / agent / "report.json").read_text())
+        report["track_ms"] |= {"p50": 30.0, "p95": 30.0}
+        (slow / agent / "report.json").write_text(json.dumps(report))
+    assert evaluate("run", plain_session, *virtual, "--costs", slow, "--out", tmp_path / "as").code == 0
+    assert {row.split(",")[1] for row in (tmp_path / "as/ar1/latency.csv").read_text().split()[1:]} == {
+        "30.000"
+    }
     for agent in ("ar1", "ar2", "robot"):
         for file in ("odom.tum", "map.tum", "latency.csv"):
             one, two, other = (
