@@ -71,9 +71,8 @@ def _truth(source: Source) -> dict[str, Any] | None:
     truth = source.truth()
     if truth is None:
         return None
-    steps = np.linalg.norm(np.diff(truth.T[:, :3, 3], axis=0), axis=1)
     return {
         "poses": len(truth.stamps_ns),
-        "length_m": round(float(steps.sum()), 3),
+        "length_m": round(truth.metres, 3),
         "duration_s": float(truth.stamps_ns[-1] - truth.stamps_ns[0]) / 1e9,
     }

@@ -23,6 +23,11 @@ class Trajectory(NamedTuple):
     stamps_ns: I64
     T: F64
 
+    @property
+    def metres(self) -> float:
+        """The length of its way."""
+        return float(np.linalg.norm(np.diff(self.T[:, :3, 3], axis=0), axis=1).sum())
+
 
 def format_pose(stamp_ns: int, T: F64) -> str:
     """One line of a TUM file, without line end; poses to nine decimals (1 nm)."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 from share.core.world import Cost, Costs
 from share.errors import DataError, UsageError
+from share.io.json_file import read_json
 
 _USUAL = Costs()
 
@@ -23,8 +23,8 @@ def costs_of(run: Path) -> Costs:
     edge, agents = run / "edge" / "edge.json", sorted(run.glob("*/report.json"))
     if not edge.is_file() or not agents:
         raise UsageError(f"--costs {run}: is not a run by `share evaluate run`")
-    told = _read(edge)
-    frame = _cost([_read(path)["track_ms"] for path in agents], edge)
+    told = read_json(edge)
+    frame = _cost([read_json(path)["track_ms"] for path in agents], edge)
     query, verify, solve = (
         _cost([told.get(f"{kind}_ms", {})], edge) for kind in ("place", "verify", "solve")
     )
@@ -51,11 +51,3 @@ def _cost(summaries: Sequence[Mapping[str, Any]], where: Path) -> Cost:
 
 def _times(cost: Cost, factor: float) -> Cost:
     return Cost(factor * cost.p50, factor * cost.p95)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        found: dict[str, Any] = json.loads(path.read_text())
-    except ValueError:
-        raise DataError(f"{path}: is damaged") from None
-    return found

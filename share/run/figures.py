@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -10,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from share.errors import DataError
+from share.io.json_file import read_json, read_json_lines
 from share.metrics.ate import Ate
 from share.metrics.figures import AgentFigures, Conditions, RunFigures
 from share.metrics.rpe import Rpe, rpe_frames, rpe_time
+from share.metrics.together import Together
 from share.run.score import AgentScore, SessionScore, score
 from share.run.trial import Trial
 
@@ -20,7 +21,7 @@ from share.run.trial import Trial
 def figures(trial: Trial) -> RunFigures:
     """Raises DataError on damaged files."""
     found = score(trial.session, trial.folders)
-    edge = _read(trial.folder / "edge" / "edge.json")
+    edge = read_json(trial.folder / "edge" / "edge.json")
     joined_s = _joined(trial.folder / "edge" / "events.jsonl")
     agents = tuple(
         _of_agent(name, str(trial.session.agents[name].kind), one, found, edge, joined_s.get(name, math.nan))
@@ -68,7 +69,7 @@ def _of_agent(
         rpe_frame_deg=frame[1],
         rpe_1s_cm=second[0],
         rpe_1s_deg=second[1],
-        metres=float(np.linalg.norm(np.diff(one.truth.T[:, :3, 3], axis=0), axis=1).sum()),
+        metres=one.truth.metres,
         joined_s=joined_s,
         keyframes=report["keyframes"],
         sent=report["sent"],
@@ -94,26 +95,16 @@ def _rpe(one: AgentScore, measure: Any) -> tuple[float, float]:
 def _joined(events: Path) -> dict[str, float]:
     """When each agent was first in one map with another, s since the first of all came to the edge."""
     began: float | None = None
-    where: dict[str, str] = {}
+    together = Together()
     joined: dict[str, float] = {}
-    for line in events.read_text().splitlines():
-        event = json.loads(line)
+    for event in read_json_lines(events):
         if event["event"] == "joined the edge" and began is None:
             began = event["t_s"]
         if event["event"] == "correction":
-            where[event["agent"]] = event["map_id"]
-            together = [name for name, map_id in where.items() if map_id == event["map_id"]]
-            for name in together if len(together) > 1 else ():
+            together.corrected(event["agent"], event["map_id"])
+            for name in together.agents:
                 joined.setdefault(name, event["t_s"] - (began or 0.0))
     return joined
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        found: dict[str, Any] = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read: {error}") from None
-    return found
 
 
 def _cm(ate: Ate | None) -> float:

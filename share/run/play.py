@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import subprocess
 import time
-from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -16,7 +14,9 @@ from pathlib import Path
 from share.config import STREAMED
 from share.errors import ShareError
 from share.io.files import writable_dir
+from share.io.json_file import read_json_lines
 from share.io.session import Session
+from share.metrics.together import Together
 from share.run.processes import child, end
 
 START_S = 20.0  # how long the edge may take until it listens
@@ -133,16 +133,16 @@ def _watch(
 
 
 def _progress(folders: dict[str, Path], events: Path) -> Progress:
-    lines = _lines(events)
-    decided = [json.loads(line) for line in lines if line.endswith("}")]
-    maps = {event["agent"]: event["map_id"] for event in decided if event["event"] == "correction"}
-    shared = [map_id for map_id, count in Counter(maps.values()).items() if count > 1]
+    decided = read_json_lines(events) if events.exists() else []
+    corrections = [event for event in decided if event["event"] == "correction"]
+    together = Together()
+    for event in corrections:
+        together.corrected(event["agent"], event["map_id"])
     frames = {
         name: max(len(_lines(folder / "odom.tum.partial")), len(_lines(folder / "odom.tum")))
         for name, folder in folders.items()
     }
-    joined = sum(map_id in shared for map_id in maps.values())
-    return Progress(frames, joined, sum(event["event"] == "correction" for event in decided))
+    return Progress(frames, len(together.agents), len(corrections))
 
 
 def _lines(path: Path) -> list[str]:

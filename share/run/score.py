@@ -1,13 +1,13 @@
-"""What agents of one session came to, against their truth: for `share demo`'s table and picture."""
+"""What agents of one session came to, against their truth: for `share demo` and `share evaluate`."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from share.errors import DataError
+from share.io.json_file import read_json
 from share.io.session import Session
 from share.io.trajectory import Trajectory, read_tum
 from share.metrics.ate import Ate, JointAte, ate, joint_ate
@@ -36,7 +36,7 @@ def score(session: Session, folders: dict[str, Path]) -> SessionScore:
     agents = {}
     for name, folder in folders.items():
         truth = read_tum(session.folder / "truth" / f"{name}.tum")
-        report = json.loads((folder / "report.json").read_text())
+        report = read_json(folder / "report.json")
         odometry = _ate(_trajectory(folder / "odom.tum"), truth)
         agents[name] = AgentScore(report, odometry, _trajectory(folder / "map.tum"), truth)
     return SessionScore(agents, _joint(agents))

@@ -17,6 +17,7 @@ from share import __version__
 from share.config import Config
 from share.errors import DataError, UsageError
 from share.io.files import atomic_write, new_folder
+from share.io.json_file import read_json
 from share.io.machine import describe_machine
 from share.io.session import Session, read_session
 from share.io.trajectory import read_tum
@@ -79,11 +80,11 @@ def read_trial(folder: Path) -> Trial:
     path = folder / RUN
     if not path.is_file():
         raise UsageError(f"{folder}: has no {RUN}; it is not a run by `share evaluate run`")
+    record = read_json(path)
     try:
-        record = json.loads(path.read_text())
         terms = Terms(**{name: record[name] for name in _TERMS if name in record})
         session = record["session"]
-    except (ValueError, KeyError, TypeError) as error:
+    except (KeyError, TypeError) as error:
         raise DataError(f"{path}: is damaged: {error!r}") from None
     if not Path(session).is_dir():
         raise UsageError(f"{path}: its session {session} is not there any more, and with it the truth")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -29,6 +28,7 @@ from share.io.session import Session, read_session
 from share.io.source import Source, open_source
 from share.io.transport.shaped import network
 from share.metrics.local_error import LocalError
+from share.metrics.together import Together
 from share.run.agent_files import AgentFiles
 from share.run.costs import costs_of
 from share.run.pipeline import frames_of, tracker_for
@@ -116,7 +116,7 @@ class _Observer:
         self._files = {name: AgentFiles(folder, _full) for name, folder in folders.items()}
         self._events = LineFile(edge / "events.jsonl", _full)
         self._frames = dict.fromkeys(folders, 0)
-        self._maps: dict[str, str] = {}
+        self._together = Together()
         self._corrections = 0
 
     def watch(self, name: str, effect: ev.AgentEffect) -> None:
@@ -134,7 +134,7 @@ class _Observer:
     def record(self, fields: dict[str, Any]) -> None:
         self._events.write(json.dumps(fields))
         if fields["event"] == "correction":
-            self._maps[fields["agent"]] = fields["map_id"]
+            self._together.corrected(fields["agent"], fields["map_id"])
             self._corrections += 1
 
     def finish(self, world: World, settings: Config) -> None:
@@ -152,9 +152,7 @@ class _Observer:
         self._events.check()
 
     def _tell(self) -> None:
-        shared = [map_id for map_id, count in Counter(self._maps.values()).items() if count > 1]
-        joined = sum(map_id in shared for map_id in self._maps.values())
-        self._show(Progress(dict(self._frames), joined, self._corrections))
+        self._show(Progress(dict(self._frames), len(self._together.agents), self._corrections))
 
 
 def _full(text: str) -> None:

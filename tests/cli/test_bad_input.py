@@ -14,12 +14,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 from recordings import make_euroc, make_tum
-
-from share.cli.main import main
+from shell import Done
 
 SHARE = [sys.executable, "-m", "share"]
 NOBODY = "tcp://127.0.0.1:1"  # a port that nothing listens on
@@ -30,25 +28,6 @@ cam0: {camera_model: pinhole, intrinsics: [385, 385, 320.4, 239.6], resolution: 
 cam1: {camera_model: pinhole, intrinsics: [385, 385, 320.4, 239.6], resolution: [640, 480],
        T_cn_cnm1: [[1, 0, 0, -0.05], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
 """
-
-
-class Done(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-
-@pytest.fixture
-def share(capsys) -> Callable[..., Done]:
-    """`share ARGUMENTS` within this process."""
-
-    def run(*arguments: object) -> Done:
-        with pytest.raises(SystemExit) as end:
-            main([str(argument) for argument in arguments])
-        assert isinstance(end.value.code, int)
-        return Done(end.value.code, *capsys.readouterr())
-
-    return run
 
 
 def complaint(done: Done, code: int) -> str:

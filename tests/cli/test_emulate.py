@@ -8,40 +8,27 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 import pytest
 from recordings import make_euroc
+from shell import Done
 from small_session import small_profile
 
-from share.cli.main import main
 from share.emulate.types import START_NS
 
 SHARE = [sys.executable, "-m", "share"]
 QUICK = ["--scene", "plain", "--seconds", "3", "--workers", "1", "--effect", "blur=off"]
 
 
-class Done(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-
 @pytest.fixture
-def emulate(capsys, tmp_path, monkeypatch) -> Callable[..., Done]:
+def emulate(share, tmp_path, monkeypatch) -> Callable[..., Done]:
     """`share emulate ARGUMENTS` in an empty folder."""
     monkeypatch.chdir(tmp_path)
-
-    def run(*arguments: object) -> Done:
-        with pytest.raises(SystemExit) as end:
-            main(["emulate", *map(str, arguments)])
-        assert isinstance(end.value.code, int)
-        return Done(end.value.code, *capsys.readouterr())
-
-    return run
+    return partial(share, "emulate")
 
 
 @pytest.fixture(scope="module")

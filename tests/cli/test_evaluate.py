@@ -4,31 +4,17 @@ import csv
 import json
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
-
-from share.cli.main import main
-
-
-class Done(NamedTuple):
-    code: int
-    out: str
-    err: str
+from shell import Done
 
 
 @pytest.fixture
-def evaluate(capsys) -> Callable[..., Done]:
+def evaluate(share) -> Callable[..., Done]:
     """`share evaluate ARGUMENTS`."""
-
-    def run(*arguments: object) -> Done:
-        with pytest.raises(SystemExit) as end:
-            main(["evaluate", *map(str, arguments)])
-        assert isinstance(end.value.code, int)
-        return Done(end.value.code, *capsys.readouterr())
-
-    return run
+    return partial(share, "evaluate")
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:

@@ -1,0 +1,43 @@
+"""JSON that our own commands wrote, read again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from share.errors import DataError
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """One object, the whole file. Raises DataError that names it."""
+    return _object(_text(path), str(path))
+
+
+def read_json_lines(path: Path) -> list[dict[str, Any]]:
+    """An object a line; the last one may still be being written, and is then left out.
+
+    Raises DataError that names file and line.
+    """
+    text = _text(path)
+    whole = text[: text.rfind("\n") + 1].splitlines()
+    return [_object(line, f"{path}, line {number}") for number, line in enumerate(whole, 1)]
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: is damaged: {error}") from None
+
+
+def _object(text: str, where: str) -> dict[str, Any]:
+    try:
+        value = json.loads(text)
+    except ValueError as error:
+        raise DataError(f"{where}: is damaged: {error}") from None
+    if not isinstance(value, dict):
+        raise DataError(f"{where}: is damaged: it is no JSON object")
+    return value
