@@ -38,7 +38,7 @@ from share.core.modelled import ModelledMapper, Odds, Truth  # noqa: E402
 from share.core.world import Costs, Seen, World  # noqa: E402
 from share.geometry.align import umeyama  # noqa: E402
 from share.geometry.se3 import transform  # noqa: E402
-from share.io.transport.shaped import network  # noqa: E402
+from share.io.transport.links import Links  # noqa: E402
 from share.metrics.association import Trajectory  # noqa: E402
 from share.metrics.latency import summary as summarised  # noqa: E402
 from share.metrics.local_error import LocalError  # noqa: E402
@@ -97,8 +97,11 @@ def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool
     if modelled:
         known = truth_of(made, config.control.near_m, config.control.far_m)
         mapper = ModelledMapper(config, known, which(truth), Odds(), seed)
-    members = list(zip((a.hello for a in who), seen, strict=True))
-    world = World(config, members, network(link), Costs(), seed, mapper)
+    links = Links.parse(link)
+    links.check(made.agents)
+    networks = [links.network(agent.hello.name) for agent in who]
+    members = list(zip((a.hello for a in who), seen, networks, strict=True))
+    world = World(config, members, Costs(), seed, mapper)
     world.run((last_ns - first_ns) / 1e9 + 2.0)
     report = world.edge.report(world.mapper.report())
     agents = {}

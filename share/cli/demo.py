@@ -34,7 +34,11 @@ class _Seconds(click.FloatRange):
 @click.command()
 @click.option("--seconds", type=_Seconds(3, 600), default=20, show_default=True)
 @click.option("--policy", type=click.Choice(POLICIES), default=POLICIES[0], show_default=True)
-@click.option("--link", metavar="NAME|FILE", help="Through an emulated network, as share agent --link.")
+@click.option(
+    "--link",
+    metavar="LINK[,AGENT=LINK…]",
+    help="Through emulated networks, as share agent --link; one for all, or an agent its own.",
+)
 @click.option("--true-error", is_flag=True, help="Agents tell the edge their true error, as share agent.")
 @options.config
 @click.option("--out", metavar="DIR", default="share-demo", show_default=True, help="Everything it leaves.")
@@ -63,17 +67,15 @@ def demo(
     options.load_config(config_file)  # what is wrong with this and the link is said before anything is made
     if policy == STREAMED and true_error:
         raise UsageError("--true-error: is of agents that track themselves; leave it out by policy streamed")
-    if link is not None:
-        from share.io.transport.shaped import network
-
-        network(link)
-    from share.emulate.demo import recipe
+    from share.emulate.demo import AGENTS, recipe
     from share.emulate.session import cached_session
     from share.io.files import writable_dir
     from share.io.session import read_session
+    from share.io.transport.links import Links
     from share.run.play import Terms, play
     from share.run.score import score
 
+    Links.parse(link).check(AGENTS)
     writable_dir(folder)
     with Stages() as stages:
         session = read_session(cached_session(recipe(_drawable(scene), seconds, seed), progress=stages))

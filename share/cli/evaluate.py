@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,7 @@ from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
     from share.config import Config
+    from share.io.session import Session
     from share.metrics.figures import RunFigures
     from share.run.play import Progress
     from share.run.trial import Trial
@@ -26,7 +27,11 @@ if TYPE_CHECKING:
 BASE = "covins-g"  # what the others are told as a part of
 
 _TERMS = (
-    click.option("--link", metavar="NAME|FILE", help="Through an emulated network, as share agent --link."),
+    click.option(
+        "--link",
+        metavar="LINK[,AGENT=LINK…]",
+        help="Through emulated networks, as share agent --link; one for all, or an agent its own.",
+    ),
     click.option("--true-error", is_flag=True, help="Agents tell the edge their true error."),
     click.option(
         "--virtual", is_flag=True, help="In virtual time: tracked once, how long things take is drawn."
@@ -83,14 +88,14 @@ def run(
     \b
     Example:  share evaluate run room1 --policy covins-g --link wifi5 --out runs/covins
     """
-    config, live = _settings(config_file, told), LiveLine()
     from share.io.session import read_session
     from share.run.figures import figures
     from share.run.play import Terms
     from share.run.trial import run_trial
 
-    terms = Terms(policy, seed=seed, **told)
-    trial = run_trial(read_session(session), terms, config, out, lambda now: live.write(str(now)))
+    opened, live = read_session(session), LiveLine()
+    config, terms = _settings(config_file, told, [opened]), Terms(policy, seed=seed, **told)
+    trial = run_trial(opened, terms, config, out, lambda now: live.write(str(now)))
     live.end()
     click.echo(table(figures(trial)))
 
@@ -168,7 +173,6 @@ def ablation(
     \b
     Example:  share evaluate ablation room1 room2 --policy share --policy covins-g --link wifi5 --out two
     """
-    config, live = _settings(config_file, told), LiveLine()
     if workers > 1 and not told["virtual"]:
         raise UsageError("--workers: runs in real time would slow each other down; it goes with --virtual")
     from share.io.files import writable_dir
@@ -178,7 +182,8 @@ def ablation(
     from share.run.play import Terms
 
     policies = chosen or tuple(policy for policy in POLICIES if policy != "streamed")
-    opened = [read_session(folder) for folder in sessions]
+    opened, live = [read_session(folder) for folder in sessions], LiveLine()
+    config = _settings(config_file, told, opened)
     planned = plan(opened, policies, range(seeds), Terms("", **told), out / "runs")
     writable_dir(out)
     played: dict[Path, Trial] = {}
@@ -218,13 +223,13 @@ def _write(out: Path, found: list[RunFigures], trials: list[Trial]) -> None:
     click.echo(f"report: {out / 'report.md'}   pictures: {', '.join(map(str, pictures))}")
 
 
-def _settings(config_file: str | None, told: dict[str, Any]) -> Config:
+def _settings(config_file: str | None, told: dict[str, Any], sessions: Sequence[Session]) -> Config:
     """What is wrong with them or with the terms is said before anything is played."""
-    config = options.load_config(config_file)
-    if told["link"] is not None:
-        from share.io.transport.shaped import network
+    from share.io.transport.links import Links
 
-        network(told["link"])
+    config, links = options.load_config(config_file), Links.parse(told["link"])
+    for session in sessions:
+        links.check(session.agents)
     if told["costs"] is not None:
         from share.run.costs import costs_of
 

@@ -95,13 +95,13 @@ class AnyMapper(Protocol):
 
 
 class World:
-    """Everybody in one room. agents: what each says of itself and sees. The clock of all is the world's."""
+    """Everybody in one room. agents: what each says of itself and sees, and its network. The clock of all
+    is the world's."""
 
     def __init__(
         self,
         config: Config,
-        agents: Sequence[tuple[Hello, Iterator[Seen]]],
-        network: Network,
+        agents: Sequence[tuple[Hello, Iterator[Seen], Network]],
         costs: Costs,
         seed: int,
         mapper: AnyMapper | None = None,
@@ -113,15 +113,15 @@ class World:
         self.now_ns = 0
         self.stamps_ns: dict[Key, int] = {}  # of the keyframes that the mapper has had
         self.mapping_ns = self.solving_ns = 0  # that the mapper and the solver have worked
-        self.logs = {hello.name: RunLog() for hello, _ in agents}
-        self.placed: dict[str, list[ev.Localised]] = {hello.name: [] for hello, _ in agents}  # in a map
+        self.logs = {hello.name: RunLog() for hello, *_ in agents}
+        self.placed: dict[str, list[ev.Localised]] = {hello.name: [] for hello, *_ in agents}  # in a map
         self._watch, self._record = watch, record
         rng = np.random.default_rng(seed)
         self._costs, self._normals = costs, _normals(rng)
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._order = count()
         self._members: dict[bytes, _Member] = {}
-        for hello, looks in agents:
+        for hello, looks, network in agents:
             member = _Member(hello, Agent(hello, config), looks, network, rng.spawn(2))
             self._members[member.peer] = member
             self._next_look(member)

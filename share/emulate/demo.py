@@ -5,6 +5,7 @@ from __future__ import annotations
 from share.emulate.recipe import Recipe
 
 MOTIONS = ("ar1=walk:speed=0.65", "ar2=walk:speed=0.55", "robot=robot:speed=0.3")
+AGENTS = tuple(motion.partition("=")[0] for motion in MOTIONS)
 PROFILE = "d435i:640x480@15"  # four processes share two cores: half of what the device can do
 SCENE, FALLBACK = "warehouse", "plain"
 

@@ -16,6 +16,7 @@ from share.errors import ShareError
 from share.io.files import writable_dir
 from share.io.json_file import read_json_lines
 from share.io.session import Session
+from share.io.transport.links import Links
 from share.metrics.together import Together
 from share.run.processes import child, end
 
@@ -40,7 +41,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Terms:
-    """On which a session is played. link: an emulated network, by name or file; seed: of what it does.
+    """On which a session is played. link: emulated networks, as `Links` reads them; seed: of what they do.
     true_error: agents tell the edge how wrong they are by the truth. virtual: in virtual time
     (`share.run.virtual`), where things take as long as in the run in folder `costs`. agents_first: the edge
     gets what the agents leave of this machine, as if they had their own. config: a file, for all."""
@@ -58,13 +59,11 @@ class Terms:
         """What `share edge` is told."""
         return ("--policy", self.policy, *self._settings())
 
-    def of_agent(self, number: int) -> tuple[str, ...]:
-        """What `share agent` is told, each another seed."""
-        link = (
-            () if self.link is None else ("--link", self.link, "--link-seed", str(1000 * self.seed + number))
-        )
+    def of_agent(self, number: int, link: str | None) -> tuple[str, ...]:
+        """What `share agent` is told, each another seed. link: its own."""
+        shaped = () if link is None else ("--link", link, "--link-seed", str(1000 * self.seed + number))
         flags = (("--true-error", self.true_error), ("--streamed", self.policy == STREAMED))
-        return (*link, *(flag for flag, wanted in flags if wanted), *self._settings())
+        return (*shaped, *(flag for flag, wanted in flags if wanted), *self._settings())
 
     def _settings(self) -> tuple[str, ...]:
         return () if self.config is None else ("--config", self.config)
@@ -75,8 +74,10 @@ def play(
 ) -> dict[str, Path]:
     """Runs `session` in real time. The folder of each agent's files, by name.
 
-    Raises ShareError naming the process that failed and what it said last.
+    Raises ShareError naming the process that failed and what it said last, UsageError for a link of nobody.
     """
+    links = Links.parse(terms.link)
+    links.check(session.agents)
     folders = {name: out / name for name in session.agents}
     logs = {name: out / f"{name}.log" for name in (*folders, "edge")}
     writable_dir(out)
@@ -91,7 +92,7 @@ def play(
             who = (f"{session.folder}/{name}", "--name", name, "--kind", str(agent.kind))
             where = ("--edge", address, "--out", str(folders[name]))
             agents[name] = stack.enter_context(
-                child(logs[name], "agent", *who, *where, *terms.of_agent(number))
+                child(logs[name], "agent", *who, *where, *terms.of_agent(number, links.of(name)))
             )
         _watch(agents, folders, out / "edge" / "events.jsonl", seconds + PATIENCE_S, show)
         for name, process in {**agents, "edge": edge}.items():

@@ -17,7 +17,6 @@ from typing import Any
 from share import __version__, config
 from share.config import Config, InertialConfig, SequencerConfig, TrackerConfig
 from share.core import events as ev
-from share.core.channel import Network
 from share.core.sequencer import SequencerCounters
 from share.core.world import Costs, Seen, World
 from share.errors import UsageError
@@ -26,7 +25,7 @@ from share.io.files import atomic_write, writable_dir
 from share.io.line_file import LineFile
 from share.io.session import Session, read_session
 from share.io.source import Source, open_source
-from share.io.transport.shaped import network
+from share.io.transport.links import Links
 from share.metrics.local_error import LocalError
 from share.metrics.together import Together
 from share.run.agent_files import AgentFiles
@@ -52,16 +51,21 @@ def play_virtually(
     if terms.policy == config.STREAMED:
         raise UsageError("policy streamed is not played in virtual time: its agents do not track")
     tracked = _tracked(session.folder.resolve(), settings.tracker, settings.inertial, settings.sequencer)
+    links = Links.parse(terms.link)
+    links.check(session.agents)
     began_ns = min(looks[0].at_ns for _, looks in tracked.values() if looks)
     members = [
-        (Hello(name, agent.kind, number + 1, tracked[name][0]), _coming(tracked[name][1], began_ns, terms))
+        (
+            Hello(name, agent.kind, number + 1, tracked[name][0]),
+            _coming(tracked[name][1], began_ns, terms),
+            links.network(name),
+        )
         for number, (name, agent) in enumerate(session.agents.items())
     ]
     folders = {name: out / name for name in session.agents}
     observer = _Observer(folders, writable_dir(out / "edge"), show)
-    link = Network() if terms.link is None else network(terms.link)
     costs = Costs() if terms.costs is None else costs_of(Path(terms.costs))
-    world = World(settings, members, link, costs, terms.seed, watch=observer.watch, record=observer.record)
+    world = World(settings, members, costs, terms.seed, watch=observer.watch, record=observer.record)
     world.run(seconds + _AFTER_S)
     observer.finish(world, settings)
     return folders

@@ -77,6 +77,7 @@ def test_what_is_missing_is_played_the_next_time(evaluate, plain_session, tmp_pa
 def test_what_is_wrong_is_said_before_anything_is_played(evaluate, plain_session, tmp_path):
     for arguments, what in (
         (("run", plain_session, "--link", "wifi6", "--out", tmp_path / "r"), "wifi6"),
+        (("run", plain_session, "--link", "bob=wifi5", "--out", tmp_path / "r"), "are ar1, ar2, robot"),
         (("run", tmp_path, "--out", tmp_path / "r"), "session.yaml"),
         (("score", tmp_path), "has no run.json"),
         (("ablation", plain_session, plain_session, "--out", tmp_path / "r"), "two sessions are called"),
@@ -93,6 +94,20 @@ def test_what_is_wrong_is_said_before_anything_is_played(evaluate, plain_session
     assert done.code == 2
     assert "without the truth of all agents nothing can be scored" in done.err
     assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("clock", ["--virtual", "--agents-first"])  # the latter is in real time
+def test_an_agent_has_its_own_link(evaluate, plain_session, tmp_path, clock):
+    far, out = tmp_path / "far.yaml", tmp_path / "run"
+    far.write_text("up: {delay_ms: 150}\ndown: {delay_ms: 150}\n")
+    assert evaluate("run", plain_session, clock, "--link", f"wifi5,robot={far}", "--out", out).code == 0
+    rtt_ms = {
+        agent: json.loads((out / agent / "report.json").read_text())["protocol"]["rtt_ms"]
+        for agent in ("ar1", "ar2", "robot")
+    }
+    assert rtt_ms["robot"] > 300
+    assert max(rtt_ms["ar1"], rtt_ms["ar2"]) < 150
 
 
 @pytest.mark.slow

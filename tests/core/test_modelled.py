@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,7 @@ from test_world import MS, seen
 from share.config import Config, EdgeConfig
 from share.core.channel import NETWORKS
 from share.core.modelled import ModelledMapper, Odds, Truth
-from share.core.world import Costs, Seen, World
+from share.core.world import Costs, World
 from share.geometry import se3
 
 ROOM = walls(1)
@@ -32,8 +31,8 @@ def played(policy: str = "covins-g", seed: int = 0, odds: Odds | None = USUAL, a
     there["bob"][:, 0, 3] += apart_m
     truth = Truth(config.control.near_m, config.control.far_m, rigs, there)
     mapper = odds and ModelledMapper(config, truth, lambda name, ns: stamps_ns[name].index(ns), odds, seed)
-    agents: list[tuple[object, Iterator[Seen]]] = [(p.hello, iter(frames[n])) for n, p in people.items()]
-    made = World(config, agents, NETWORKS["wifi5"], Costs(), seed, mapper)
+    agents = [(p.hello, iter(frames[n]), NETWORKS["wifi5"]) for n, p in people.items()]
+    made = World(config, agents, Costs(), seed, mapper)
     made.run(SECONDS + 1.0)
     return made
 

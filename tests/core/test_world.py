@@ -34,8 +34,8 @@ def seen(person: Person, seconds: float) -> Iterator[Seen]:
 
 def world(policy: str = "covins-g", seed: int = 0, seconds: float = 6.0, **costs: Cost) -> World:
     people = [Person("ann", ROOM, 0.0, 11), Person("bob", ROOM, 0.5, 22)]
-    agents = [(person.hello, seen(person, seconds)) for person in people]
-    made = World(Config(edge=EdgeConfig(policy=policy)), agents, NETWORKS["wifi5"], Costs(**costs), seed)
+    agents = [(person.hello, seen(person, seconds), NETWORKS["wifi5"]) for person in people]
+    made = World(Config(edge=EdgeConfig(policy=policy)), agents, Costs(**costs), seed)
     made.run(seconds + 1.0)
     return made
 
