@@ -201,6 +201,30 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
+class Footing:
+    """What the pose of a frame stands on: the features that its tracker found in cam0's image.
+
+    px (N, 2) float32. believed (N,) bool: those that agreed with the pose. depth (N,) m in cam0, NaN unknown.
+    sought: how many should have been in view. known: how many points of the tracker's map have a depth.
+    """
+
+    px: F32
+    believed: NDArray[np.bool_]
+    depth: F64
+    sought: int
+    known: int
+
+    def __post_init__(self) -> None:
+        n = len(self.px)
+        _set(
+            self,
+            px=checked("px", self.px, (n, 2), np.float32),
+            believed=checked("believed", self.believed, (n,), np.bool_),
+            depth=checked("depth", self.depth, (n,), np.float64, finite=False),
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class View:
     """What one camera image looks like to another agent: enough to recognise and verify a place.
 

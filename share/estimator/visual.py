@@ -21,7 +21,7 @@ from share.estimator.pose import PoseEstimate, consensus, refine
 from share.estimator.result import TrackResult
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
-from share.types import F32, F64, I64, U8, Candidate, Frame, TrackState, Wait
+from share.types import F32, F64, I64, U8, Candidate, Footing, Frame, TrackState, Wait
 from share.vision import corners, klt
 from share.vision.view import depth_at, make_view
 
@@ -51,6 +51,7 @@ class VisualTracker:
         self._gravity = gravity.AtRest() if rig.imu else None
         self._map = LocalMap(config.max_keyframes)
         self._tracks = _NO_TRACKS
+        self._found, self._sought = _NO_TRACKS, 0  # in the last frame, of so many that were followed
         self._image: U8 | None = None
         self._stamp_ns = 0
         self._T_odom_cam: F64 | None = None  # last believed pose
@@ -94,6 +95,16 @@ class VisualTracker:
         cov = se3.compose_cov(self._T_cam_body, self._cov, np.zeros((6, 6)))
         return Candidate(T_odom_body, T_last_body, cov, up, gravity.SIGMA_RAD, view, self._new_stretch)
 
+    def footing(self) -> Footing:
+        """Of the frame just tracked, one with a pose."""
+        assert self._T_odom_cam is not None
+        found = self._tracks.join(self._found.take(~np.isin(self._found.ids, self._tracks.ids)))
+        rows = self._map.rows(found.ids)
+        points = np.where(rows[:, None] >= 0, self._map.points[rows], np.nan)
+        z = se3.transform(se3.inverse(self._T_odom_cam), points)[:, 2]
+        believed = np.arange(len(rows)) < len(self._tracks.ids)
+        return Footing(found.px, believed, z, max(self._sought, len(rows)), len(self._map.ids))
+
     # ------------------------------------------------------------------ the usual frame
 
     def _follow(self, frame: Frame, T_last: F64) -> TrackResult:
@@ -124,7 +135,8 @@ class VisualTracker:
         expected = self._project(se3.inverse(T_predicted), rows[rows >= 0])
         guess = np.where(np.isnan(expected), tracks.px, expected).astype(np.float32)
         px, found = klt.follow(self._image, image, tracks.px, guess, levels=2)
-        return _Tracks(tracks.ids, px).take(found)
+        self._found, self._sought = _Tracks(tracks.ids, px).take(found), len(tracks.ids)
+        return self._found
 
     def _project(self, T_cam_odom: F64, rows: I64) -> F64:
         """Where the map's points should be seen, (N, 2) px, NaN behind the camera."""

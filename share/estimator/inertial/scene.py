@@ -16,7 +16,7 @@ from share.estimator.inertial.memory import Memory
 from share.estimator.inertial.state import State
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
-from share.types import F32, F64, I64, U8, Frame
+from share.types import F32, F64, I64, U8, Footing, Frame
 from share.vision import corners, epipolar
 from share.vision.depth import from_depth_camera, from_stereo
 from share.vision.view import measures_depth
@@ -48,6 +48,7 @@ class Scene:
         self._probation = 0  # frames that _PROBATION_S are
         self._wary = 0  # frames for which new features have to prove themselves
         self._next_feature = self._next_keyframe = 0
+        self._last: tuple[Sought, NDArray[np.bool_], I64] | None = None  # frame: sought, believed, their ids
 
     def add_keyframe(self, frame: Frame, rate: F64) -> None:
         """The frame just tracked: its pose, features seen from about here before, and new ones."""
@@ -77,15 +78,39 @@ class Scene:
         features.learn_slant(self.looks, now, left.error[now], left.along[now])
         self._memory.sleep(self.state, self.looks, np.flatnonzero(~left.found))
         self.keep(seen)
+        self._last = left, seen, self.state.ids
 
     def depths(self, frame: Frame) -> tuple[F32, F64]:
         """px (N, 2) and depth (N,) m of the features in `frame`, the last one; only of those whose depth is
         known well, where nothing else in the frame tells."""
+        sure = self._is_sure() | measures_depth(frame, self._rig)
+        return self.looks.px[sure], self._distance()[sure]
+
+    def footing(self) -> Footing:
+        """Of the last frame; nothing for the first one, whose pose rests on nothing it shows."""
+        sure = self._is_sure()
+        if self._last is None:
+            return Footing(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0), 0, int(sure.sum()))
+        left, seen, ids = self._last
+        due = int(self._rig.cam0.inside(np.nan_to_num(left.expected, nan=-1e6), 0.0).sum())
+        depth = np.full(len(seen), np.nan)
+        _, was, now = np.intersect1d(ids, self.state.ids, return_indices=True)  # it may be a keyframe by now
+        depth[np.flatnonzero(seen)[was]] = np.where(sure, self._distance(), np.nan)[now]
+        found = left.found | seen
+        return Footing(left.px[found], seen[found], depth[found], due, int(sure.sum()))
+
+    def _distance(self) -> F64:
+        """z (N,) m in cam0 of the features."""
         s = self.state
         T = observe.hosts_in_camera(s)
         z = (T[:, 2, :3] * rays(s.ray)).sum(axis=1) / np.maximum(s.rho, _FARTHEST) + T[:, 2, 3]
-        sure = (s.rho_variance < (_SURE * s.rho) ** 2) | measures_depth(frame, self._rig)
-        return self.looks.px[sure], np.maximum(z, _NEAREST_M)[sure]
+        out: F64 = np.maximum(z, _NEAREST_M)
+        return out
+
+    def _is_sure(self) -> NDArray[np.bool_]:
+        """Which features' depth (N,) is known well."""
+        out: NDArray[np.bool_] = self.state.rho_variance < (_SURE * self.state.rho) ** 2
+        return out
 
     def _shun(self, px: F32) -> None:
         """No new feature near px (N, 2) for a while: there goes somebody."""

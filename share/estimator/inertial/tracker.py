@@ -29,7 +29,7 @@ from share.estimator.localmap import LocalKeyframe, LocalMap
 from share.estimator.result import TrackResult
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
-from share.types import F64, U8, Candidate, Frame, ImuBatch, TrackState, Wait
+from share.types import F64, U8, Candidate, Footing, Frame, ImuBatch, TrackState, Wait
 from share.vision import corners
 from share.vision.view import make_view, measures_depth
 
@@ -60,7 +60,7 @@ class InertialTracker:
         self._scene: Scene | None = None
         self._window: Window | None = None  # of a single camera, until its scale is known
         self._image: U8 | None = None
-        self._stamp_ns = 0
+        self._stamp_ns = self._keyframe_ns = self._keyframe_count = 0
         self._rate = np.zeros(3)
         self._astray, self._refused_s = 0, 0.0  # see `_stray`
         self._agreement, self._surprise = Agreement(), np.zeros(0)  # of the frame
@@ -68,9 +68,7 @@ class InertialTracker:
         self._ready = False
         self._knows_up = False  # the IMU said so
         self._new_stretch = False  # the next keyframe begins one
-        self._keyframe_ns = 0
         self._T_keyframe = np.eye(4)
-        self._keyframe_count = 0
         self._shown = Shown()
         self._places = LocalMap(places.max_keyframes)  # where to look for oneself when LOST
         self._places_config, self._seed, self._places_tried = places, seed, 0
@@ -109,6 +107,11 @@ class InertialTracker:
         up = s.T[2, :3] if self._knows_up and tilt < _LEVEL_RAD else np.zeros(3)
         T_last_body, cov = self._shown.motion(s, new_stretch)
         return Candidate(s.T, T_last_body, cov, up, tilt / np.sqrt(2), view, new_stretch)
+
+    def footing(self) -> Footing:
+        """Of the frame just tracked, one with a pose."""
+        assert self._scene is not None
+        return self._scene.footing()
 
     def predict(self, t_ns: int, imu: ImuBatch | None = None) -> F64 | None:
         """T_odom_body (4, 4) at a time after the last frame's, IMU time: for renderers, between frames.

@@ -1,0 +1,64 @@
+"""What both trackers say that the pose of a keyframe rests on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from share.config import Config, InertialConfig, TrackerConfig
+from share.core.sequencer import SequencerCounters
+from share.estimator.inertial.tracker import InertialTracker
+from share.estimator.visual import VisualTracker
+from share.io.source import open_source
+from share.run.pipeline import frames_of
+from share.types import Footing, Frame
+from share.vision.depth import from_stereo
+
+Walk = tuple[list[Frame], list[tuple[Frame, Footing, int]]]
+
+
+@pytest.fixture(scope="module", params=["inertial", "visual"])
+def walk(request, plain_session):
+    """Rig, and of each keyframe: the frame, its footing and how many points the tracker counts."""
+    source = open_source(f"{plain_session}/ar1")
+    rig = source.rig
+    tracker = (
+        InertialTracker(rig, InertialConfig(), TrackerConfig())
+        if request.param == "inertial"
+        else VisualTracker(rig, TrackerConfig())
+    )
+    told = []
+    for frame in frames_of(source, Config(), SequencerCounters()):
+        result = tracker.track(frame)
+        if result.keyframe:
+            told.append((frame, tracker.footing(), result.points))
+            before = tracker.footing()
+            tracker.keyframe(frame)
+            again = tracker.footing()  # what joined since is not what the pose rests on
+            if request.param == "inertial":
+                assert again.px.tobytes() == before.px.tobytes()
+    return rig, told
+
+
+def test_what_a_pose_rests_on_is_counted_and_in_the_image(walk):
+    rig, told = walk
+    assert len(told) >= 5
+    for _, footing, points in told[1:]:
+        assert footing.believed.sum() == points > 20
+        assert points / footing.sought > 0.5
+        assert rig.cam0.inside(footing.px).all()
+        assert footing.known > 20
+
+
+def test_depths_are_those_that_stereo_measures(walk):
+    rig, told = walk
+    off = []
+    for frame, footing, _ in told[2:]:
+        known = footing.believed & np.isfinite(footing.depth)
+        assert known.sum() > 0.5 * footing.believed.sum()
+        px = footing.px[known]
+        uv = rig.cam0.normalise(px.astype(np.float64))
+        z = from_stereo(frame.image0, frame.image1, rig, px, uv, footing.depth[known])
+        off += np.abs(z / footing.depth[known] - 1).tolist()
+    assert np.nanmedian(off) < 0.02
+    assert np.nanpercentile(off, 90) < 0.2

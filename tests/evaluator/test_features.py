@@ -1,0 +1,106 @@
+"""What the error model is told of a keyframe, on images and points whose numbers are known."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from share.evaluator.features import PICTURE_PX, Features, features
+from share.evaluator.psd import psd
+from share.evaluator.scalars import NAMES, scalars
+from share.types import U8, Footing
+
+SIZE = (640, 480)
+GREY: U8 = np.full((240, 320), 128, np.uint8)
+
+
+def footing(px=(), believed=None, depth=None, sought=0, known=0) -> Footing:
+    px = np.array(px, np.float32).reshape(-1, 2)
+    believed = np.ones(len(px), bool) if believed is None else np.array(believed, bool)
+    depth = np.full(len(px), 2.0) if depth is None else np.array(depth, float)
+    return Footing(px, believed, depth, sought, known)
+
+
+def told(image: U8 = GREY, sigma_cm: float = 1.0, **points) -> dict[str, float]:
+    return dict(zip(NAMES, scalars(image, footing(**points), sigma_cm).tolist(), strict=True))
+
+
+def test_a_plain_wall_without_points_is_nothing():
+    assert (psd(GREY, footing(), SIZE) == 0).all()
+    plain = told(sigma_cm=0.0)
+    assert plain.pop("brightness") == pytest.approx(128 / 255)
+    assert set(plain.values()) == {0.0}
+
+
+def test_a_corner_is_strong_in_its_own_cell():
+    image = GREY.copy()
+    image[:, 170:] = 40  # cells 20 px wide: an edge within column 8
+    image[130:, :] = 40  # and row 6
+    strength = psd(image, footing(), SIZE)[0]
+    assert np.argwhere(strength > 0.3).tolist() == [[6, 8]]
+    assert strength.max() <= 1
+    fainter = psd(((image.astype(int) - 128) // 4 + 128).astype(np.uint8), footing(), SIZE)[0]
+    assert 0 < fainter[6, 8] < strength[6, 8]
+
+
+def test_points_count_where_they_are_whatever_the_size_of_the_image():
+    for size in (SIZE, (752, 480), (320, 240)):
+        at = np.array([[0.5 / 16, 0.5 / 12], [0.6 / 16, 0.4 / 12], [15.5 / 16, 11.5 / 12]]) * size
+        grid = psd(GREY, footing(at, depth=[1.0, 2.0, np.nan]), size)
+        assert np.argwhere(grid[1]).tolist() == [[0, 0], [11, 15]]
+        assert grid[1, 0, 0] == pytest.approx(2 / 4)
+        assert grid[2, 0, 0] == pytest.approx((1 / 1 + 1 / 2) / 2 * 0.5)
+        assert grid[2, 11, 15] == 0  # its depth is unknown
+
+
+def test_points_that_were_refused_do_not_count():
+    grid = psd(GREY, footing([[10, 10], [11, 11]], believed=[True, False]), SIZE)
+    assert grid[1, 0, 0] == pytest.approx(1 / 4)
+
+
+def test_channels_stay_between_0_and_1(rng):
+    image = rng.integers(0, 256, (240, 320), np.uint8)
+    px = rng.uniform(0, 479, (500, 2))
+    grid = psd(image, footing(px, depth=rng.uniform(0.05, 12, 500)), SIZE)
+    assert grid.min() >= 0
+    assert grid.max() <= 1
+
+
+def test_what_is_counted_of_the_tracker():
+    numbers = told(px=[[1, 1], [2, 2], [3, 3]], believed=[1, 0, 1], sought=8, known=200, sigma_cm=1.0)
+    assert numbers["keypoints"] == pytest.approx(math.log(9) / math.log(201))
+    assert numbers["matches"] == pytest.approx(2 / 8)
+    assert numbers["active map points"] == pytest.approx(1)
+    assert numbers["tracking score"] == pytest.approx(0.5)  # 1 cm is in the middle of 0.1 mm to 1 m
+    assert told(sigma_cm=1e-9)["tracking score"] == 0
+    assert told(px=[[1, 1]], sought=0)["matches"] == 1
+
+
+def test_what_is_counted_of_the_image(rng):
+    half = GREY.copy()
+    half[:, ::2], half[:, 1::2] = 0, 255
+    striped = told(half)
+    assert striped["entropy"] == pytest.approx(1 / 8)
+    assert striped["contrast"] == pytest.approx(127.5 / 128)
+    noise = rng.integers(0, 256, (240, 320), np.uint8)
+    assert told(noise)["entropy"] == pytest.approx(1, abs=1e-3)
+    blurred = cv2.GaussianBlur(noise, (0, 0), 3)
+    assert told(blurred)["laplacian variance"] < told(noise)["laplacian variance"] - 0.3
+
+
+def test_all_of_it_is_made_of_any_camera(rng):
+    for shape in ((480, 640), (480, 752), (240, 320)):
+        image = rng.integers(0, 256, shape, np.uint8)
+        made = features(image, footing([[5, 5]], sought=1, known=1), 0.3)
+        assert made.picture.shape == (PICTURE_PX, PICTURE_PX)
+        assert abs(made.picture.mean() - image.mean()) < 1.5
+        assert made.psd[1, 0, 0] == 0.25
+
+
+def test_features_of_another_shape_are_refused():
+    right = features(np.zeros((480, 640), np.uint8), footing(), 0.3)
+    with pytest.raises(ValueError, match="scalars: shape"):
+        Features(right.picture, right.psd, right.scalars[:-1])
