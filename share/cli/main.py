@@ -27,6 +27,7 @@ COMMANDS = {
     "dataset": ("share.cli.dataset", "dataset", "Look into, convert and recover recordings; export maps."),
     "emulate": ("share.cli.emulate", "emulate", "Record agents that move through a virtual room."),
     "evaluate": ("share.cli.evaluate", "evaluate", "Play sessions on stated terms, score and compare them."),
+    "train": ("share.cli.train", "train", "Teach the model that estimates a tracker's error."),
     "keys": ("share.cli.keys", "keys", "Who may connect to an edge from another machine."),
 }
 

@@ -95,7 +95,8 @@ def from_stereo(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, guess_m: F64
 
 
 def _two_rays(rig: Rig, rays0: F64, uv1: F64) -> tuple[F64, F64]:
-    """Depth in cam0 that best explains uv1 on the epipolar line, and the distance from it in px.
+    """Depth in cam0 that best explains uv1 on the epipolar line, and the distance from it in px, NaN where
+    cam1 cannot see it.
 
     With p1 = z R r0 + t, uv1 p1_z = p1_xy is two equations linear in z; we take their least squares.
     """
@@ -105,5 +106,6 @@ def _two_rays(rig: Rig, rays0: F64, uv1: F64) -> tuple[F64, F64]:
     b = uv1 * t[2] - t[:2]
     z = (A * b).sum(axis=1) / np.maximum((A * A).sum(axis=1), 1e-12)
     p1 = z[:, None] * a + t
-    error: F64 = np.linalg.norm(p1[:, :2] / p1[:, 2:] - uv1, axis=1) * rig.cam1.focal
+    ahead = np.where(p1[:, 2:] > 0, p1[:, 2:], np.nan)
+    error: F64 = np.linalg.norm(p1[:, :2] / ahead - uv1, axis=1) * rig.cam1.focal
     return z, error

@@ -92,6 +92,14 @@ def test_stereo_depth(scene):
     assert (disparity_error < 1).mean() > 0.95
 
 
+def test_what_is_infinitely_far_has_no_depth(scene):
+    """Nor does it warn: a lens that is covered shows both cameras the same."""
+    left, *_ = scene
+    rig = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
+    px = corners.detect(left, np.zeros((0, 2), np.float32), 50, 15)
+    assert np.isnan(depth.from_stereo(left, left, rig, px, CAMERA.normalise(px.astype(float)))).all()
+
+
 def test_the_whole_line_is_searched(scene):
     known, disparity_error = stereo_by(epipolar.search, scene)
     assert known.mean() > 0.7

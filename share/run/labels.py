@@ -1,0 +1,117 @@
+"""`share train labels`: our own tracker over sessions with truth, and how wrong it was at each keyframe."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from share import __version__
+from share.config import Config
+from share.core.sequencer import SequencerCounters
+from share.errors import UsageError
+from share.evaluator.doubt import Doubt
+from share.evaluator.features import features
+from share.io.pool import Pool
+from share.io.session import Session, read_session
+from share.io.source import Source, open_source
+from share.metrics.local_error import WINDOW_S, LocalError
+from share.process import prepare
+from share.run.pipeline import frames_of, tracker_for
+from share.train.label_file import Labels, read_labels, write_labels
+from share.train.spoil import KINDS, Spell, draw, spoiled
+
+_MOST_KINDS = 3  # that come together in one run
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of one agent. number: 0 is as recorded, each other one spoiled in its own way."""
+
+    session: Path
+    agent: str
+    number: int
+    seed: int
+    out: Path
+
+
+def plan(sessions: Sequence[Session], runs: int, seed: int, out: Path) -> list[Job]:
+    """Everything, done or not. Raises UsageError where there is no truth, or two sessions have one name."""
+    names = [session.folder.resolve().name for session in sessions]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise UsageError(f"two sessions are called {twice[0]}; rename a folder")
+    jobs = []
+    for session, name in zip(sessions, names, strict=True):
+        for agent in session.agents:
+            if not (session.folder / "truth" / f"{agent}.tum").is_file():
+                raise UsageError(f"{session.folder}: has no truth/{agent}.tum to tell how wrong it is")
+            jobs += [
+                Job(session.folder, agent, number, seed, out / f"{name}-{agent}-{number}.npz")
+                for number in range(runs)
+            ]
+    return jobs
+
+
+def make(jobs: Sequence[Job], config: Config, workers: int) -> Iterator[tuple[Job, Labels]]:
+    """Those that are not there yet are made; each of `jobs` with its labels, as they come. Raises UsageError
+    where one is there that was spoiled otherwise."""
+    left = [job for job in jobs if not job.out.exists()]
+    for job in jobs:
+        if job.out.exists():
+            found = read_labels(job.out)
+            if found.about["seed"] != job.seed:
+                raise UsageError(f"{job.out}: is of seed {found.about['seed']}; give another --out")
+            yield job, found
+    if workers == 1:
+        for job in left:
+            _make((job, config))
+            yield job, read_labels(job.out)
+        return
+    with Pool(min(workers, max(1, len(left))), prepare, ()) as pool:
+        for (job, _), _ in pool.run(_make, [(job, config) for job in left]):
+            yield job, read_labels(job.out)
+
+
+def _make(work: tuple[Job, Config]) -> None:
+    job, config = work
+    session = read_session(job.session)
+    source = open_source(f"{job.session}/{job.agent}")
+    truth = source.truth()
+    assert truth is not None
+    rng = np.random.default_rng((job.seed, job.number, zlib.crc32(job.out.name.encode())))
+    kinds = rng.permutation(KINDS)[: rng.integers(1, _MOST_KINDS + 1)].tolist() if job.number else []
+    spells = draw(rng, int(truth.stamps_ns[0]), int(truth.stamps_ns[-1]), kinds)
+    about = {
+        "session": job.session.resolve().name,
+        "agent": job.agent,
+        "kind": str(session.agents[job.agent].kind),
+        "sensors": session.agents[job.agent].sensors,
+        "provenance": session.provenance,
+        "number": job.number,
+        "seed": job.seed,
+        "spells": [asdict(spell) for spell in spells],
+        "window_s": WINDOW_S,
+        "version": __version__,
+    }
+    write_labels(job.out, _labelled(source, spells, about, config))
+
+
+def _labelled(source: Source, spells: list[Spell], about: dict[str, Any], config: Config) -> Labels:
+    truth = source.truth()
+    assert truth is not None
+    tracker, error, doubt = tracker_for(source, config), LocalError(truth), Doubt()
+    rows = []
+    frames = frames_of(source, config, SequencerCounters())
+    for frame in spoiled(frames, spells, about["seed"]):
+        result = tracker.track(frame)
+        error_cm = error.after(frame.stamp_ns, result.T_odom_body, result.new_stretch)
+        if result.keyframe:
+            footing = tracker.footing()
+            sigma_cm = doubt.after(frame.stamp_ns, tracker.keyframe(frame))
+            told = np.nan if error_cm is None else error_cm
+            rows.append((frame.stamp_ns, told, sigma_cm, features(frame.image0, footing, sigma_cm)))
+    return Labels.of(about, rows)

@@ -1,0 +1,67 @@
+"""`share train` as a user types it."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+
+from share.metrics.local_error import LocalError
+from share.train.label_file import read_labels
+
+
+def test_labels_of_a_session(share, plain_session, tmp_path):
+    out = tmp_path / "labels"
+    arguments = ("train", "labels", plain_session, "--runs", 2, "--workers", 1, "--out", out)
+    done = share(*arguments)
+    assert done.code == 0, done.err
+    assert done.err == ""
+    assert done.out.startswith("6 runs, ")
+    assert len(list(out.iterdir())) == 6
+    (clean,) = (path for path in out.iterdir() if path.name.endswith("ar1-0.npz"))
+    labels = read_labels(clean)
+    assert labels.about["spells"] == []
+    assert labels.about["agent"] == "ar1"
+    known = np.isfinite(labels.error_cm)
+    assert not known[labels.stamps_ns < labels.stamps_ns[0] + 2.4e9].any()  # half a window first
+    assert (labels.error_cm[known] < 1).all()
+
+    made = {path: path.stat().st_mtime_ns for path in out.iterdir()}
+    next(iter(made)).unlink()
+    assert share(*arguments).code == 0  # goes on where it was broken off
+    assert sum(path.stat().st_mtime_ns == was for path, was in made.items()) == 5
+
+    other = share(*arguments[:-2], "--seed", 1, "--out", out)
+    assert other.code == 2
+    assert "is of seed 0; give another --out" in other.err
+
+
+def test_without_a_truth_there_is_nothing_to_learn(share, plain_session, tmp_path):
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for path in plain_session.glob("*.*"):
+        shutil.copy(path, bare)
+    done = share("train", "labels", bare, "--out", tmp_path / "labels")
+    assert done.code == 2
+    assert "has no truth/ar1.tum to tell how wrong it is" in done.err
+    assert not (tmp_path / "labels").exists()
+
+
+@pytest.mark.slow
+def test_labels_are_the_errors_of_the_run(share, plain_session, tmp_path):
+    """As `share track` and the truth give them, frame by frame."""
+    from share.io.source import open_source
+    from share.io.trajectory import read_tum
+
+    out = tmp_path / "labels"
+    assert share("train", "labels", plain_session, "--runs", 1, "--out", out).code == 0
+    for agent in ("ar1", "ar2", "robot"):
+        tum = tmp_path / f"{agent}.tum"
+        assert share("track", f"{plain_session}/{agent}", "--out", tum).code == 0
+        (path,) = out.glob(f"*-{agent}-0.npz")
+        labels, told = read_labels(path), read_tum(tum)
+        error = LocalError(open_source(f"{plain_session}/{agent}").truth())
+        errors = {int(ns): error.after(int(ns), T) for ns, T in zip(told.stamps_ns, told.T, strict=True)}
+        wanted = [np.nan if errors[int(ns)] is None else errors[int(ns)] for ns in labels.stamps_ns]
+        assert labels.error_cm == pytest.approx(wanted, abs=1e-3, nan_ok=True)

@@ -1,0 +1,87 @@
+"""Frames that went right, spoiled: what is done to them, when, and that nothing else is."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from share.train.spoil import KINDS, Spell, draw, spoiled
+from share.types import Frame, ImuBatch
+
+S = 1_000_000_000
+HZ = 10
+
+
+def frames(seconds: float = 3.0) -> list[Frame]:
+    """Textured stereo at 10 Hz, with two IMU samples each."""
+    rng = np.random.default_rng(3)
+    image = rng.integers(0, 256, (48, 64), np.uint8)
+    out = []
+    for k in range(round(seconds * HZ)):
+        stamp_ns = S + k * S // HZ
+        stamps = np.array([stamp_ns - S // 20, stamp_ns])
+        out.append(
+            Frame(stamp_ns, k, image, image[:, ::-1], imu=ImuBatch(stamps, np.ones((2, 3)), np.ones((2, 3))))
+        )
+    return out
+
+
+def during(how: str, much: float, begin_s: float = 2.0, end_s: float = 3.0) -> list[Frame]:
+    return list(spoiled(frames(), [Spell(how, round(begin_s * S), round(end_s * S), much)], seed=1))
+
+
+@pytest.mark.parametrize("how", ["dark", "blur", "haze", "cover"])
+def test_images_are_spoiled_in_a_spell_and_only_then(how):
+    for before, after in zip(frames(), during(how, 0.7), strict=True):
+        same = (before.image0 == after.image0).all() and (before.image1 == after.image1).all()
+        assert same == (not 2 * S <= before.stamp_ns < 3 * S)
+        assert len(after.imu) == 2
+
+
+@pytest.mark.parametrize("how", ["dark", "blur", "haze"])
+def test_the_worse_the_less_is_to_be_seen(how):
+    contrast = [during(how, much)[15].image0.std() for much in (0.1, 0.4, 0.7, 1.0)]
+    assert contrast == sorted(contrast, reverse=True)
+    assert contrast[-1] < 0.2 * contrast[0]
+
+
+def test_a_cover_hides_what_it_says():
+    seen = frames()[15].image0
+    for much, hidden in ((0.0, 0.33), (1.0, 0.98)):
+        covered = during("cover", much)[15].image0
+        assert (covered != seen).mean() == pytest.approx(hidden, abs=0.05)
+
+
+def test_imu_samples_of_frames_that_are_missing_come_with_the_next():
+    given = during("drop", 1.0)
+    assert [frame.index for frame in given] == [*range(10), *range(20, 30)]
+    late = given[10]
+    assert len(late.imu) == 22
+    assert (np.diff(late.imu.stamps_ns) > 0).all()
+    assert late.gap_ns == S
+    assert {frame.gap_ns for frame in given if frame is not late} == {0}
+
+
+def test_an_imu_is_silent_in_its_spell():
+    heard = [len(frame.imu) for frame in during("deaf", 0.5)]
+    assert heard == [2] * 10 + [0] * 10 + [2] * 10
+
+
+def test_the_same_seed_spoils_alike():
+    spells = [Spell("dark", S, 4 * S, 0.5)]
+    one, two, other = (list(spoiled(frames(), spells, seed)) for seed in (1, 1, 2))
+    assert all((a.image0 == b.image0).all() for a, b in zip(one, two, strict=True))
+    assert any((a.image0 != b.image0).any() for a, b in zip(one, other, strict=True))
+
+
+def test_spells_are_drawn_within_the_run_and_of_all_strengths(rng):
+    spells = draw(rng, 0, 3000 * S, KINDS)
+    assert {spell.how for spell in spells} == set(KINDS)
+    for how in KINDS:
+        mine = [spell for spell in spells if spell.how == how]
+        assert mine[0].begin_ns >= 2 * S
+        assert all(a.end_ns < b.begin_ns for a, b in pairwise(mine))
+        assert all(1.0 <= (spell.end_ns - spell.begin_ns) / S <= 8.0 for spell in mine)
+        assert min(spell.much for spell in mine) < 0.1 < 0.9 < max(spell.much for spell in mine)
