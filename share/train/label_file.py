@@ -45,12 +45,12 @@ class Labels:
     @classmethod
     def of(cls, about: dict[str, Any], rows: Sequence[tuple[int, float, float, Features]]) -> Labels:
         """rows: stamp_ns, error_cm, sigma_cm and features of each keyframe."""
-        stamps, errors, sigmas, told = ([row[i] for row in rows] for i in range(4))
+        told = [features for *_, features in rows]
         return cls(
             about,
-            np.array(stamps, np.int64),
-            np.array(errors, np.float32),
-            np.array(sigmas, np.float32),
+            np.array([row[0] for row in rows], np.int64),
+            np.array([row[1] for row in rows], np.float32),
+            np.array([row[2] for row in rows], np.float32),
             np.array([f.picture for f in told], np.uint8).reshape(-1, PICTURE_PX, PICTURE_PX),
             np.array([f.psd for f in told], np.float32).reshape(-1, CHANNELS, GRID[1], GRID[0]),
             np.array([f.scalars for f in told], np.float32).reshape(-1, len(NAMES)),
