@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,42 +13,17 @@ import click
 from share.cli import options
 from share.cli.progress import LiveLine
 from share.cli.run_table import table
+from share.cli.sweep import sweep
+from share.cli.terms import on_terms, settings
 from share.config import POLICIES
 from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
-    from share.config import Config
-    from share.io.session import Session
     from share.metrics.figures import RunFigures
     from share.run.play import Progress
     from share.run.trial import Trial
 
 BASE = "covins-g"  # what the others are told as a part of
-
-_TERMS = (
-    click.option(
-        "--link",
-        metavar="LINK[,AGENT=LINK…]",
-        help="Through emulated networks, as share agent --link; one for all, or an agent its own.",
-    ),
-    click.option("--true-error", is_flag=True, help="Agents tell the edge their true error."),
-    click.option(
-        "--virtual", is_flag=True, help="In virtual time: tracked once, how long things take is drawn."
-    ),
-    click.option(
-        "--costs", metavar="RUN", help="With --virtual: things take as long as in this run in real time."
-    ),
-    click.option(
-        "--agents-first", is_flag=True, help="The edge gets what agents leave, as if they had own machines."
-    ),
-)
-
-
-def _on_terms(command: Callable[..., None]) -> Callable[..., None]:
-    """The options on which any run is played; by name as fields of `share.run.play.Terms`."""
-    for option in reversed(_TERMS):
-        command = option(command)
-    return command
 
 
 @click.group()
@@ -64,10 +38,13 @@ def evaluate() -> None:
     """
 
 
+evaluate.add_command(sweep)
+
+
 @evaluate.command(short_help="Play a session, and keep everything.")
 @click.argument("session", type=click.Path(path_type=Path))
 @click.option("--policy", type=click.Choice(POLICIES), default=POLICIES[0], show_default=True)
-@_on_terms
+@on_terms
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of link and scheduler.")
 @options.config
 @click.option("--out", required=True, metavar="RUN", type=click.Path(path_type=Path), help="A new folder.")
@@ -94,7 +71,7 @@ def run(
     from share.run.trial import run_trial
 
     opened, live = read_session(session), LiveLine()
-    config, terms = _settings(config_file, told, [opened]), Terms(policy, seed=seed, **told)
+    config, terms = settings(config_file, told, [opened]), Terms(policy, seed=seed, **told)
     trial = run_trial(opened, terms, config, out, lambda now: live.write(str(now)))
     live.end()
     click.echo(table(figures(trial)))
@@ -144,7 +121,7 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, as_json: bool) -> None:
     multiple=True,
     help="May be repeated.  [default: all that share a map]",
 )
-@_on_terms
+@on_terms
 @click.option("--seeds", type=click.IntRange(1), default=1, show_default=True, help="How many: 0, 1, …")
 @click.option(
     "--workers",
@@ -167,8 +144,8 @@ def ablation(
     """Play SESSIONS by each policy with each seed, and compare the policies.
 
     Policies follow each other on each session, so that a machine that slows down does so for all. In DIR:
-    a folder a run, agents.csv, runs.csv, report.md and pictures. Broken off, the same command goes on
-    where it stopped.
+    a folder a run, report.html (opens offline), report.md, agents.csv, runs.csv and pictures. Broken off,
+    the same command goes on where it stopped.
 
     \b
     Example:  share evaluate ablation room1 room2 --policy share --policy covins-g --link wifi5 --out two
@@ -177,14 +154,15 @@ def ablation(
         raise UsageError("--workers: runs in real time would slow each other down; it goes with --virtual")
     from share.io.files import writable_dir
     from share.io.session import read_session
-    from share.run.ablation import go_through, plan
+    from share.run.ablation import plan
+    from share.run.campaign import go_through, side_by_side
     from share.run.figures import figures
     from share.run.play import Terms
 
     policies = chosen or tuple(policy for policy in POLICIES if policy != "streamed")
     opened, live = [read_session(folder) for folder in sessions], LiveLine()
-    config = _settings(config_file, told, opened)
-    planned = plan(opened, policies, range(seeds), Terms("", **told), out / "runs")
+    config = settings(config_file, told, opened)
+    planned = plan(opened, policies, range(seeds), Terms("", **told), out / "runs", config)
     writable_dir(out)
     played: dict[Path, Trial] = {}
     failed: list[str] = []
@@ -193,7 +171,7 @@ def ablation(
         name = planned[number].out.name
         live.write(f"{number + 1} of {len(planned)}: {name}  {now or ''}")
 
-    for one, came in go_through(planned, config, show, workers):
+    for one, came in go_through(planned, show, side_by_side(workers, len(opened))):
         if isinstance(came, ShareError):
             failed.append(one.out.name)
             live.end()
@@ -210,33 +188,21 @@ def ablation(
 
 def _write(out: Path, found: list[RunFigures], trials: list[Trial]) -> None:
     from share.io.files import atomic_write
+    from share.io.page import page
     from share.metrics.comparison import policies
-    from share.run.report import agents_csv, draw, markdown, runs_csv
+    from share.run.pictures import draw
+    from share.run.report import agents_csv, markdown, runs_csv
 
     names = policies(found)
-    report = markdown(found, trials, BASE if BASE in names else names[0])
+    base = BASE if BASE in names else names[0]
+    report = markdown(found, trials, base)
     atomic_write(out / "agents.csv", agents_csv(found))
     atomic_write(out / "runs.csv", runs_csv(found))
     atomic_write(out / "report.md", report)
-    pictures = draw(out, found)
+    pictures = draw(out, found, trials, base)
+    atomic_write(out / "report.html", page("Policies compared", report, pictures))
     click.echo(report)
-    click.echo(f"report: {out / 'report.md'}   pictures: {', '.join(map(str, pictures))}")
-
-
-def _settings(config_file: str | None, told: dict[str, Any], sessions: Sequence[Session]) -> Config:
-    """What is wrong with them or with the terms is said before anything is played."""
-    from share.io.transport.links import Links
-
-    config, links = options.load_config(config_file), Links.parse(told["link"])
-    for session in sessions:
-        links.check(session.agents)
-    if told["costs"] is not None:
-        from share.run.costs import costs_of
-
-        if not told["virtual"]:
-            raise UsageError("--costs: in real time things take as long as they take; it goes with --virtual")
-        costs_of(Path(told["costs"]))
-    return config
+    click.echo(f"report: {out / 'report.html'}, {out / 'report.md'}   tables: {out}/*.csv")
 
 
 def _plain(run: RunFigures) -> dict[str, Any]:

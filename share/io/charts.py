@@ -1,12 +1,18 @@
-"""Figures of an evaluation: bars side by side, one group a trajectory."""
+"""Figures of an evaluation: bars side by side, parts of a base and their intervals, lines, heat maps."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from share.metrics.bootstrap import Interval
+from share.types import F64
+
+_NOTHING = Interval(float("nan"), float("nan"), float("nan"))
 _COLOURS = ("#00798c", "#d1495b", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
 
 
@@ -21,11 +27,7 @@ def draw_bars(
 
     line: a level to be told from, drawn across.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
+    pyplot = _pyplot()
     width = max(6.0, 0.16 * len(groups) * max(map(len, panels.values())) + 2)
     figure, axes = pyplot.subplots(
         len(panels), 1, figsize=(width, 2.6 * len(panels)), layout="constrained", sharex=True, squeeze=False
@@ -46,3 +48,79 @@ def draw_bars(
     figure.legend(handles, names, loc="outside upper right", ncols=len(names), fontsize=8)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
+
+
+def draw_parts(path: Path, series: Mapping[str, Mapping[str, Interval]], base: str) -> None:
+    """PNG: for each of `series` a bar a measure, as parts of `base`, which is 1; whiskers are intervals."""
+    pyplot = _pyplot()
+    measures = list(dict.fromkeys(name for values in series.values() for name in values))
+    figure, axis = pyplot.subplots(figsize=(9, 0.5 + 0.5 * len(measures)), layout="constrained")
+    at, wide = np.arange(len(measures)), 0.8 / len(series)
+    for k, (name, values) in enumerate(series.items()):
+        here = [values.get(measure, _NOTHING) for measure in measures]
+        value, low, high = (np.array([getattr(one, of) for one in here]) for of in ("value", "low", "high"))
+        off = np.nan_to_num(np.stack([value - low, high - value])).clip(0)
+        y = at + (k - (len(series) - 1) / 2) * wide
+        axis.barh(y, value, wide, xerr=off, label=name, color=_COLOURS[k % len(_COLOURS)], ecolor="#555")
+    axis.axvline(1, color="black", linewidth=1, linestyle="--")
+    axis.set_yticks(at, measures)
+    axis.invert_yaxis()
+    axis.set(xlabel=f"part of {base}", xlim=(0, None))
+    axis.grid(axis="x", alpha=0.3)
+    axis.set_axisbelow(True)
+    figure.legend(loc="outside upper right", ncols=len(series), fontsize=8)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+def draw_lines(
+    path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]], across: str, units: Sequence[str]
+) -> None:
+    """PNG, a panel for each of `panels`, of one of `units`: {series: (x (N,), y (N,))}. across: what x is."""
+    pyplot = _pyplot()
+    figure, axes = pyplot.subplots(
+        len(panels), 1, figsize=(9, 2.4 * len(panels)), layout="constrained", sharex=True, squeeze=False
+    )
+    names = list(dict.fromkeys(name for series in panels.values() for name in series))
+    for axis, unit, (title, series) in zip(axes[:, 0], units, panels.items(), strict=True):
+        for name, (x, y) in series.items():
+            axis.step(x, y, where="post", label=name, color=_COLOURS[names.index(name) % len(_COLOURS)])
+        axis.set(title=title, ylabel=unit)
+        axis.grid(alpha=0.3)
+    axes[-1, 0].set_xlabel(across)
+    handles = [pyplot.Line2D([], [], color=_COLOURS[k % len(_COLOURS)]) for k in range(len(names))]
+    figure.legend(handles, names, loc="outside upper right", ncols=max(1, len(names)), fontsize=8)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+def draw_heat(
+    path: Path,
+    maps: Mapping[str, NDArray[np.floating[Any]]],
+    down: tuple[str, Sequence[str]],
+    across: tuple[str, Sequence[str]],
+) -> None:
+    """PNG: a map for each of `maps`, (V, W) over V values down and W across, each with what it is of."""
+    pyplot = _pyplot()
+    figure, axes = pyplot.subplots(
+        1, len(maps), figsize=(1 + 3.2 * len(maps), 3.4), layout="constrained", squeeze=False
+    )
+    for axis, (title, cells) in zip(axes[0], maps.items(), strict=True):
+        image = axis.imshow(cells, cmap="Blues", aspect="auto", origin="lower")
+        axis.set_xticks(range(len(across[1])), across[1])
+        axis.set_yticks(range(len(down[1])), down[1])
+        axis.set(xlabel=across[0], ylabel=down[0], title=title)
+        for (i, j), cell in np.ndenumerate(cells):
+            dark = np.isfinite(cell) and image.norm(cell) > 0.5
+            axis.text(j, i, f"{cell:.3g}", ha="center", va="center", color="white" if dark else "black")
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+def _pyplot() -> Any:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot

@@ -1,4 +1,4 @@
-"""Figures of trials as text and pictures: CSV for a program, Markdown for a reader."""
+"""Figures of trials as text: CSV for a program, Markdown for a reader."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ import csv
 import dataclasses
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from share.io.charts import draw_bars
 from share.metrics.bootstrap import Interval
 from share.metrics.comparison import MEASURES, compare, no_worse, policies
 from share.metrics.figures import AgentFigures, Conditions, RunFigures
-from share.metrics.latency import NOTICED_MS
 from share.run.trial import Trial
 
 _AGENT = [field.name for field in dataclasses.fields(AgentFigures)]
@@ -43,6 +42,25 @@ def runs_csv(runs: Iterable[RunFigures]) -> str:
     )
 
 
+def sweep_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A line a point; rows: by `share.run.sweep.table`."""
+    head = [*rows[0]["settings"], "runs", *rows[0]["means"]]
+    return _csv(
+        head,
+        ([*row["settings"].values(), row["runs"], *(m.value for m in row["means"].values())] for row in rows),
+    )
+
+
+def sweep_markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The same for a reader, with intervals."""
+    head = [*rows[0]["settings"], "runs", *rows[0]["means"]]
+    body = [
+        [*row["settings"].values(), str(row["runs"]), *(_wide(m) for m in row["means"].values())]
+        for row in rows
+    ]
+    return _markdown([head, *body]) + "\n\nIn brackets: 95 % by drawing the runs again.\n"
+
+
 def markdown(runs: Sequence[RunFigures], trials: Sequence[Trial], base: str) -> str:
     """All policies against `base`."""
     names = policies(runs)
@@ -58,25 +76,6 @@ def markdown(runs: Sequence[RunFigures], trials: Sequence[Trial], base: str) -> 
         parts += [f"## Errors by `{names[0]}`", *(_wins(runs, names[0], other) for other in others)]
     parts += ["## Every agent", _every_agent(runs, names)]
     return "\n\n".join(parts) + "\n"
-
-
-def draw(folder: Path, runs: Sequence[RunFigures]) -> list[Path]:
-    """Latency and error of every agent on every session, by policy; the pictures' paths."""
-    names, sessions = policies(runs), list(dict.fromkeys(run.conditions.session for run in runs))
-    agents = list(dict.fromkeys(agent.agent for run in runs for agent in run.agents))
-    figures = {
-        "latency.png": ("latency_ms", "ms", NOTICED_MS),
-        "ate.png": ("ate_cm", "cm", None),
-    }
-    for file, (field, unit, line) in figures.items():
-        panels = {
-            agent: {
-                name: [_mean_of(runs, name, session, agent, field) for session in sessions] for name in names
-            }
-            for agent in agents
-        }
-        draw_bars(folder / file, panels, sessions, unit, line)
-    return [folder / file for file in figures]
 
 
 def _provenance(runs: Sequence[RunFigures], trials: Sequence[Trial]) -> str:
@@ -138,15 +137,15 @@ def _every_agent(runs: Sequence[RunFigures], names: Sequence[str]) -> str:
             a.agent for r in runs if r.conditions.session == session for a in r.agents
         ):
             cells = [
-                f"{_number(_mean_of(runs, name, session, agent, 'latency_ms'))}, "
-                f"{_number(_mean_of(runs, name, session, agent, 'ate_cm'))}"
+                f"{_number(mean_of(runs, name, session, agent, 'latency_ms'))}, "
+                f"{_number(mean_of(runs, name, session, agent, 'ate_cm'))}"
                 for name in names
             ]
             rows.append([session, agent, *cells])
     return _markdown(rows)
 
 
-def _mean_of(runs: Sequence[RunFigures], policy: str, session: str, agent: str, field: str) -> float:
+def mean_of(runs: Sequence[RunFigures], policy: str, session: str, agent: str, field: str) -> float:
     values = [
         getattr(one, field)
         for run in runs
@@ -184,6 +183,10 @@ def _markdown(rows: Sequence[Sequence[str]]) -> str:
 
 def _interval(of: Interval) -> str:
     return "–" if math.isnan(of.value) else f"{of.value:.2f} [{of.low:.2f}, {of.high:.2f}]"
+
+
+def _wide(of: Interval) -> str:
+    return "–" if math.isnan(of.value) else f"{of.value:.3g} [{of.low:.3g}, {of.high:.3g}]"
 
 
 def _number(value: float) -> str:

@@ -35,8 +35,11 @@ def test_a_run_is_scored_compared_and_never_overwritten(evaluate, plain_session,
     assert {"config.yaml", "run.json", "edge", "ar1", "robot"} <= {path.name for path in run.iterdir()}
     assert "| AR latency, ms |" in (out / "report.md").read_text()
     assert (out / "report.md").read_text().strip() in done.out
-    for picture in ("latency.png", "ate.png"):
-        assert (out / picture).read_bytes().startswith(b"\x89PNG")
+    pictures = {"latency.png", "ate.png", "over-time.png", "merges.png"}
+    assert {path.name for path in out.glob("*.png")} == pictures
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == len(pictures)
+    assert "<td>AR latency, ms</td>" in page.replace(' style="text-align: left;"', "")
 
     scored = evaluate("score", run, "--csv", tmp_path / "one.csv")
     assert scored.code == 0, scored.err
@@ -161,3 +164,43 @@ def test_virtual_runs_go_side_by_side(evaluate, plain_session, tmp_path):
     refused = evaluate("ablation", twin, "--workers", 2, "--out", out)
     assert refused.code == 2
     assert "goes with --virtual" in refused.err
+
+
+@pytest.mark.slow
+def test_settings_are_swept_and_what_is_there_is_not_played_again(evaluate, plain_session, tmp_path):
+    out = tmp_path / "out"
+    axes = ("--set", "control.kp=0.2,0.8", "--set", "control.rate_max_hz=2,5")
+    arguments = ("sweep", plain_session, "--virtual", *axes, "--out", out)
+    done = evaluate(*arguments)
+    assert done.code == 0, done.err
+    rows = rows_of(out / "sweep.csv")
+    assert [(row["control.kp"], row["control.rate_max_hz"]) for row in rows] == [
+        ("0.2", "2"),
+        ("0.2", "5"),
+        ("0.8", "2"),
+        ("0.8", "5"),
+    ]
+    assert all(float(row["AR latency"]) > 5 for row in rows)
+    assert (out / "sweep.md").read_text().strip() in done.out
+    assert (out / "heat.png").read_bytes().startswith(b"\x89PNG")
+    kept = {path: path.stat().st_mtime_ns for path in (out / "runs").glob("*/run.json")}
+    shutil.rmtree(next(iter(kept)).parent)
+    assert evaluate(*arguments).code == 0
+    again = {path: path.stat().st_mtime_ns for path in (out / "runs").glob("*/run.json")}
+    assert sum(again[path] == was for path, was in kept.items()) == 3
+
+    drawn = evaluate(
+        "sweep",
+        plain_session,
+        "--virtual",
+        "--set",
+        "control.kp=0.1:3",
+        "--random",
+        2,
+        "--out",
+        tmp_path / "r",
+    )
+    assert drawn.code == 0, drawn.err
+    assert len(rows_of(tmp_path / "r" / "sweep.csv")) == 2
+    assert evaluate("sweep", plain_session, "--set", "control.kpp=1", "--out", tmp_path / "x").code == 2
+    assert not (tmp_path / "x").exists()

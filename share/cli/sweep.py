@@ -1,0 +1,125 @@
+"""`share evaluate sweep`: which settings serve agents best."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from share.cli import options
+from share.cli.progress import LiveLine
+from share.cli.terms import on_terms, settings
+from share.config import POLICIES
+from share.errors import ShareError, UsageError
+
+if TYPE_CHECKING:
+    from share.metrics.figures import RunFigures
+    from share.run.play import Progress
+    from share.run.sweep import Axis, Point
+
+_HEAT = ("AR latency", "AR ATE in the map", "merges a metre", "AR QoE")
+
+
+@click.command(short_help="Settings tried one after the other, on sessions.")
+@click.argument("sessions", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--set",
+    "said",
+    multiple=True,
+    required=True,
+    metavar="NAME=VALUES",
+    help="SECTION.NAME=V,V… or, with --random, =LOW:HIGH; A.B+C.D=V,V… share a value. May be repeated.",
+)
+@click.option(
+    "--random", "count", type=click.IntRange(1), help="So many points, drawn, in place of the grid."
+)
+@click.option("--policy", type=click.Choice(POLICIES), default=POLICIES[0], show_default=True)
+@on_terms
+@click.option("--seeds", type=click.IntRange(1), default=1, show_default=True, help="How many: 0, 1, …")
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 64),
+    default=1,
+    show_default=True,
+    help="Sessions at a time (--virtual).",
+)
+@click.option("--scheduler", metavar="tcp://H:P", help="Of a dask cluster whose workers play (--virtual).")
+@options.config
+@click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path))
+def sweep(
+    sessions: tuple[Path, ...],
+    said: tuple[str, ...],
+    count: int | None,
+    policy: str,
+    seeds: int,
+    workers: int,
+    scheduler: str | None,
+    config_file: str | None,
+    out: Path,
+    **told: Any,
+) -> None:
+    """Play SESSIONS at each point of a grid of settings, or at points that are drawn.
+
+    In DIR: a folder a run, sweep.csv, sweep.md, and heat maps over the first two settings of a grid. Each
+    run is kept as it comes; broken off, the same command goes on where it stopped.
+
+    \b
+    Example:  share evaluate sweep room1 --virtual --set control.kp=0.2,0.8 --set control.ki=0,0.1 --out s
+    """
+    if (workers > 1 or scheduler) and not told["virtual"]:
+        which = "--scheduler" if scheduler else "--workers"
+        raise UsageError(f"{which}: runs in real time would slow each other down; it goes with --virtual")
+    from share.io.cluster import Cluster
+    from share.io.files import writable_dir
+    from share.io.session import read_session
+    from share.run.campaign import go_through, side_by_side
+    from share.run.figures import figures
+    from share.run.play import Terms
+    from share.run.sweep import Axis, drawn, grid, planned
+
+    axes = [Axis.parse(text) for text in said]
+    points = grid(axes) if count is None else drawn(axes, count, seed=0)
+    opened, live = [read_session(folder) for folder in sessions], LiveLine()
+    config = settings(config_file, told, opened)
+    runs = planned(opened, axes, points, range(seeds), Terms(policy, **told), out / "runs", config)
+    writable_dir(out)
+    at = {one.out: point for one, point in runs}
+
+    def show(number: int, now: Progress | None) -> None:
+        live.write(f"{number + 1} of {len(runs)}: {', '.join(at[runs[number][0].out])}  {now or ''}")
+
+    players = Cluster(scheduler) if scheduler else side_by_side(workers, len(opened))
+    found: dict[Path, RunFigures] = {}
+    failed = 0
+    for one, came in go_through([one for one, _ in runs], show, players):
+        if isinstance(came, ShareError):
+            failed += 1
+            live.end()
+            click.echo(f"share: {one.out.name}: {came}", err=True)
+        else:
+            found[one.out] = figures(came)
+    live.end()
+    if found:
+        _write(out, axes, [(point, found[one.out]) for one, point in runs if one.out in found])
+    if failed:
+        raise ShareError(f"{failed} of {len(runs)} runs failed; the same command plays them again")
+
+
+def _write(out: Path, axes: list[Axis], runs: list[tuple[Point, RunFigures]]) -> None:
+    from share.io.charts import draw_heat
+    from share.io.files import atomic_write
+    from share.run.report import sweep_csv, sweep_markdown
+    from share.run.sweep import heat, table
+
+    rows = table(axes, runs)
+    report = sweep_markdown(rows)
+    atomic_write(out / "sweep.csv", sweep_csv(rows))
+    atomic_write(out / "sweep.md", report)
+    click.echo(report)
+    told = f"report: {out / 'sweep.md'}   table: {out / 'sweep.csv'}"
+    if len(axes) > 1 and not any(axis.is_range for axis in axes):
+        maps = {measure: heat(axes, rows, measure) for measure in _HEAT}
+        draw_heat(out / "heat.png", maps, (axes[0].name, axes[0].values), (axes[1].name, axes[1].values))
+        told += f"   picture: {out / 'heat.png'}"
+    click.echo(told)

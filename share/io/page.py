@@ -1,0 +1,41 @@
+"""A report as one HTML page that opens offline: its text, in Markdown, and its pictures inside."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Mapping
+from pathlib import Path
+
+_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem;
+  color: #222; }
+h1, h2 { line-height: 1.2; } h2 { margin-top: 2.5rem; border-bottom: 1px solid #ccc; }
+table { border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums; display: block;
+  overflow-x: auto; }
+th, td { padding: 0.25rem 0.75rem; border-bottom: 1px solid #ddd; text-align: right; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; } th { background: #f3f3f3; }
+tbody tr:hover { background: #f8f8f0; }
+figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #555; font-size: 14px; }
+"""
+
+
+def page(title: str, text: str, pictures: Mapping[str, Path]) -> str:
+    """HTML. text: Markdown, whose own HTML is shown, not taken; pictures: PNG files by what is below each."""
+    from markdown import markdown
+
+    body = markdown(html.escape(text, quote=False), extensions=["tables"])
+    figures = "\n".join(_figure(caption, path) for caption, path in pictures.items())
+    return (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta name="viewport" content="width=device-width">\n<title>{html.escape(title)}</title>\n'
+        f"<style>{_STYLE}</style>\n</head>\n<body>\n{body}\n{figures}\n</body>\n</html>\n"
+    )
+
+
+def _figure(caption: str, path: Path) -> str:
+    data, said = base64.b64encode(path.read_bytes()).decode(), html.escape(caption)
+    return (
+        f'<figure>\n<img alt="{said}" src="data:image/png;base64,{data}">\n'
+        f"<figcaption>{said}</figcaption>\n</figure>"
+    )

@@ -1,0 +1,108 @@
+"""Runs that are planned together: those that are there are taken, the others are played."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import partial
+from itertools import groupby
+from pathlib import Path
+from typing import Protocol
+
+from share import process
+from share.config import Config
+from share.errors import DataError, ShareError, UsageError
+from share.io.pool import Pool
+from share.io.session import Session
+from share.run.play import Progress, Terms
+from share.run.trial import RUN, SETTINGS, Trial, read_trial, run_trial, settings_of
+
+Came = Trial | ShareError
+Show = Callable[[int, Progress | None], None]  # which of the runs, and how far it is
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """One run, by which settings, and in which folder it is or will be."""
+
+    session: Session
+    terms: Terms
+    out: Path
+    config: Config
+
+    @property
+    def is_done(self) -> bool:
+        return (self.out / RUN).is_file()
+
+
+Job = list[Planned]  # of one session: it is tracked once
+
+
+class Workers(Protocol):
+    """As `share.io.pool.Pool`."""
+
+    def run(
+        self, work: Callable[[Job], list[Came]], jobs: Iterable[Job]
+    ) -> Iterator[tuple[Job, list[Came]]]: ...
+
+
+def check_names(sessions: Sequence[Session]) -> None:
+    """Raises UsageError where two have one name, since their runs would."""
+    names = [session.folder.resolve().name for session in sessions]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise UsageError(f"two sessions are called {twice[0]}; rename a folder")
+
+
+def side_by_side(workers: int, sessions: int) -> AbstractContextManager[Workers] | None:
+    """So many processes on this machine, no more than there are sessions; None: one run after the other."""
+    return None if workers == 1 else Pool(min(workers, sessions), process.prepare, ())
+
+
+def go_through(
+    runs: Sequence[Planned], show: Show, workers: AbstractContextManager[Workers] | None = None
+) -> Iterator[tuple[Planned, Came]]:
+    """What is not done yet is played; each of `runs` with what came of it.
+
+    workers: play sessions side by side, which only virtual time stands. Raises UsageError where a run is
+    there that was on other terms.
+    """
+    ready = {planned.out: _as_planned(planned) for planned in runs if planned.is_done}
+    yield from ((planned, ready[planned.out]) for planned in runs if planned.out in ready)
+    left = [(number, planned) for number, planned in enumerate(runs) if planned.out not in ready]
+    if workers is None:
+        for number, planned in left:
+            show(number, None)
+            yield planned, _play(planned, partial(show, number))
+        return
+    by_session = sorted((planned for _, planned in left), key=lambda one: str(one.session.folder))
+    jobs = [list(group) for _, group in groupby(by_session, key=lambda one: one.session.folder)]
+    done = len(ready)
+    with workers as pool:
+        for job, came in pool.run(play_all, jobs):
+            done += len(job)
+            show(done - 1, None)
+            yield from zip(job, came, strict=True)
+
+
+def play_all(job: Job) -> list[Came]:
+    return [_play(planned, lambda now: None) for planned in job]
+
+
+def _play(planned: Planned, show: Callable[[Progress], None]) -> Came:
+    """A run that fails is no reason not to play the next."""
+    try:
+        return run_trial(planned.session, planned.terms, planned.config, planned.out, show)
+    except (UsageError, DataError):
+        raise
+    except ShareError as error:
+        return error
+
+
+def _as_planned(planned: Planned) -> Trial:
+    trial = read_trial(planned.out)
+    played = trial.session.folder.resolve(), trial.terms, (planned.out / SETTINGS).read_text()
+    wanted = planned.session.folder.resolve(), planned.terms, settings_of(planned.config, planned.terms.seed)
+    if played != wanted:
+        raise UsageError(f"{trial.folder}: was played on other terms or settings; give another --out")
+    return trial

@@ -1,0 +1,58 @@
+"""How a run went over time: QoE, rates and merges, from the files that its edge left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.io.json_file import read_json, read_json_lines
+from share.io.trajectory import read_tum
+from share.run.trial import Trial
+from share.types import F64
+
+_MERGES = ("loop accepted", "maps joined")
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """Of one agent, at its E evaluations: seconds (E,) since the edge began, qoe (E,), rate_hz (E,), NaN
+    where there was no limit."""
+
+    seconds: F64
+    qoe: F64
+    rate_hz: F64
+
+
+@dataclass(frozen=True, eq=False)
+class Merges:
+    """metres (M,): how far all agents together had gone by each of M merges."""
+
+    metres: F64
+
+
+def traces(trial: Trial) -> dict[str, Trace]:
+    """By agent. Raises DataError on damaged files."""
+    series = read_json(trial.folder / "edge" / "edge.json")["series"]
+    return {
+        name: Trace(*(_numbers(series.get(name, {}).get(key, [])) for key in ("t_s", "qoe", "rate_hz")))
+        for name in trial.session.agents
+    }
+
+
+def merges(trial: Trial) -> Merges:
+    """Raises DataError on damaged files."""
+    events = read_json_lines(trial.folder / "edge" / "events.jsonl")
+    began = next((e["t_s"] for e in events if e["event"] == "joined the edge"), 0.0)
+    done_s = np.array([e["t_s"] - began for e in events if e["event"] in _MERGES], float)
+    gone = np.zeros(len(done_s))
+    for name in trial.session.agents:
+        stamps_ns, T = read_tum(trial.session.folder / "truth" / f"{name}.tum")
+        steps = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+        way = np.concatenate([[0.0], np.cumsum(steps)])
+        gone += np.interp(done_s, (stamps_ns - stamps_ns[0]) * 1e-9, way)
+    return Merges(gone)
+
+
+def _numbers(values: list[float | None]) -> F64:
+    return np.array([np.nan if value is None else value for value in values], float)

@@ -1,0 +1,53 @@
+"""How a run went over time, from files whose content is known."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from share.io.trajectory import Trajectory, format_tum
+from share.run.traces import merges, traces
+
+S = 1_000_000_000
+
+
+@pytest.fixture
+def trial(tmp_path):
+    """Ann goes a metre a second for ten seconds, Bob half a metre."""
+    session = tmp_path / "session"
+    (session / "truth").mkdir(parents=True)
+    for name, speed in (("ann", 1.0), ("bob", 0.5)):
+        seconds = np.arange(11)
+        T = np.tile(np.eye(4), (11, 1, 1))
+        T[:, 0, 3] = speed * seconds
+        (session / "truth" / f"{name}.tum").write_text(format_tum(Trajectory(5 * S + seconds * S, T)))
+    edge = tmp_path / "run" / "edge"
+    edge.mkdir(parents=True)
+    series = {"ann": {"t_s": [1.0, 2.0], "qoe": [0.5, None], "rate_hz": [None, 2.5]}}
+    (edge / "edge.json").write_text(json.dumps({"series": series}))
+    events = [
+        {"t_s": 2.0, "event": "joined the edge"},
+        {"t_s": 2.5, "event": "joined the edge"},
+        {"t_s": 4.0, "event": "loop accepted"},
+        {"t_s": 5.0, "event": "loop refused"},
+        {"t_s": 6.0, "event": "maps joined"},
+        {"t_s": 99.0, "event": "loop accepted"},
+    ]
+    (edge / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
+    agents = {"ann": None, "bob": None}
+    return SimpleNamespace(folder=tmp_path / "run", session=SimpleNamespace(folder=session, agents=agents))
+
+
+def test_what_an_agent_was_told_over_time(trial):
+    found = traces(trial)
+    assert found["ann"].seconds.tolist() == [1.0, 2.0]
+    assert np.array_equal(found["ann"].qoe, [0.5, np.nan], equal_nan=True)
+    assert np.array_equal(found["ann"].rate_hz, [np.nan, 2.5], equal_nan=True)
+    assert len(found["bob"].seconds) == 0  # nobody evaluated Bob
+
+
+def test_merges_lie_where_all_had_gone_by_then(trial):
+    assert merges(trial).metres.tolist() == pytest.approx([2 * 1.5, 4 * 1.5, 15.0])
