@@ -3,7 +3,7 @@ PYTHON ?= $(shell python3.11 -c "" 2>/dev/null && echo python3.11 || echo python
 BIN := .venv/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
-.PHONY: install demo test lint type bench slow freeze vio-figures
+.PHONY: install demo test lint type bench slow train-test freeze vio-figures
 
 install: .venv/installed
 .venv/installed: setup.cfg pyproject.toml
@@ -18,6 +18,9 @@ test: install
 	$(BIN)/pytest
 slow: install
 	$(BIN)/pytest -m slow || test $$? -eq 5  # 5: none selected
+train-test: install  # brings torch
+	$(PIP) -e '.[train]'
+	$(BIN)/pytest tests/train -m "slow or not slow"
 lint: install
 	$(BIN)/ruff check && $(BIN)/ruff format --check && $(BIN)/lint-imports
 type: install

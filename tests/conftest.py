@@ -4,16 +4,33 @@ from share import process
 
 process.prepare()
 
+from collections.abc import Callable  # noqa: E402
 from pathlib import Path  # noqa: E402
 
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
+from shell import Done  # noqa: E402
+
+from share.cli.main import main  # noqa: E402
 
 
 @pytest.fixture
 def rng() -> np.random.Generator:
     """Seeded, the same in every run."""
     return np.random.default_rng(20261121)
+
+
+@pytest.fixture
+def share(capsys: pytest.CaptureFixture[str]) -> Callable[..., Done]:
+    """`share ARGUMENTS` within this process."""
+
+    def run(*arguments: object) -> Done:
+        with pytest.raises(SystemExit) as end:
+            main([str(argument) for argument in arguments])
+        assert isinstance(end.value.code, int)
+        return Done(end.value.code, *capsys.readouterr())
+
+    return run
 
 
 @pytest.fixture(scope="session")

@@ -15,11 +15,12 @@ from share.cli.progress import LiveLine
 from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
+    from share.config import Config
     from share.io.keys import AgentKeys
     from share.io.source import Source
     from share.io.transport import AgentLink
-    from share.metrics.local_error import LocalError
     from share.run.agent import AgentRun, Status
+    from share.run.errors import Errors
 
 
 @click.command()
@@ -87,15 +88,15 @@ def agent(
     check_keys(parse_address(address), with_keys)
     opened = open_source(source, calib, frames)
     options.say_notes(opened)
-    error = _by_truth(opened) if true_error else None
     run_id = secrets.randbits(63)
     hello = Hello(options.agent_name(name), AgentKind(kind), run_id, opened.rig, streamed)
     live = _LiveLine(opened.images_count, streamed)
+    errors = _errors(opened, settings, true_error, live.say)
     folder = None if out is None else Path(out)
     dial = partial(connect, address, run_id, with_keys)
     through = dial if shaped is None else lambda: shaped(dial())
     run = (StreamRun if streamed else AgentRun)(
-        opened, hello, settings, through, folder, live.say, live.show, verbose, error
+        opened, hello, settings, through, folder, live.say, live.show, verbose, errors
     )
     with on_stop(run.stop):
         run.go()
@@ -124,16 +125,29 @@ def _keys(folder: str | None, server_key: str | None) -> AgentKeys | None:
     return agent_keys(None if folder is None else Path(folder), server_key)
 
 
-def _by_truth(source: Source) -> LocalError:
+def _errors(source: Source, settings: Config, true_error: bool, say: Callable[[str], None]) -> Errors | None:
+    """Who tells how wrong the tracker is. Raises UsageError, DataError."""
+    if true_error:
+        return _by_truth(source)
+    if not settings.agent.error_model:
+        return None
+    from share.io.network import open_network
+    from share.run.errors import ByModel
+
+    return ByModel(open_network(Path(settings.agent.error_model)), say)
+
+
+def _by_truth(source: Source) -> Errors:
     """Raises UsageError where nobody knows it."""
     from share.metrics.local_error import LocalError
+    from share.run.errors import ByTruth
 
     truth = source.truth()
     if truth is None:
         raise UsageError(
             "--true-error: this source comes without a truth; SESSION/NAME has one in truth/NAME.tum"
         )
-    return LocalError(truth)
+    return ByTruth(LocalError(truth))
 
 
 def _shaped(name: str, seed: int) -> Callable[[AgentLink], AgentLink]:

@@ -9,9 +9,17 @@ import click
 
 from share.cli import options
 from share.cli.progress import LiveLine
+from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.train.label_file import Labels
+    from share.types import F32
+
+_BASE = click.option(
+    "--base",
+    metavar="FILE",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="A model whose backbone is taken.  [default: the one that comes with SHARE]",
+)
 
 
 @click.group()
@@ -56,21 +64,153 @@ def labels(
 
     jobs = plan([read_session(folder) for folder in sessions], runs, seed, out)
     writable_dir(out)
-    made = []
+    errors = []  # not what they are of: pictures of hundreds of runs would fill the memory
     for job, found in make(jobs, config, workers):
-        made.append(found)
-        live.write(f"{len(made)} of {len(jobs)} runs: {job.out.name}, {len(found)} keyframes")
+        errors.append(found.error_cm)
+        live.write(f"{len(errors)} of {len(jobs)} runs: {job.out.name}, {len(found)} keyframes")
     live.end()
-    click.echo(_summary(made))
+    click.echo(_summary(errors))
     click.echo(f"labels: {out}")
 
 
-def _summary(made: list[Labels]) -> str:
+@train.command(short_help="Teach a network on labels.")
+@click.argument("labels", metavar="LABELS", type=click.Path(path_type=Path))
+@click.option("--epochs", type=click.IntRange(1), default=200, show_default=True, help="At most.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the split, and of chance."
+)
+@_BASE
+@click.option(
+    "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Where it is kept."
+)
+def fit(labels: Path, epochs: int, seed: int, base: Path | None, out: Path) -> None:
+    """Teach the head of the error model on LABELS, a folder by `share train labels`: minutes on a CPU, the
+    GPU where there is one. Rooms are split: to learn from, to stop by, to calibrate intervals, to test.
+
+    Broken off, the same command goes on where it stopped. Needs `pip install share-slam[train]`.
+
+    \b
+    Example:  share train fit labels --out fit
+              share train export fit --labels labels --out error_model.onnx
+    """
+    _need_extra()
+    from share.io.files import writable_dir
+    from share.io.network import deep_of, open_network
+    from share.train.fit import FitOptions
+    from share.train.fitted import write_fitted
+    from share.train.graph import backbone_id
+    from share.train.table import collect
+    from share.train.teach import teach
+
+    collection, live, taken = collect(labels, seed), LiveLine(), _base(base)
+    writable_dir(out)
+    live.write(f"{len(collection.table.error_cm)} pictures go through the backbone")
+    deep = deep_of(open_network(taken), collection.table.picture)
+
+    def show(epoch: int, learnt: float, stopped: float) -> None:
+        live.write(f"epoch {epoch}: loss {learnt:.4f} where it learns, {stopped:.4f} where it stops")
+
+    wanted = FitOptions(epochs=epochs, seed=seed)
+    backbone = backbone_id(taken.read_bytes())
+    fitted = teach(collection, deep, backbone, wanted, out / "checkpoint.pt", show)
+    live.end()
+    write_fitted(out / "fit.npz", fitted)
+    counts = ", ".join(f"{count} to {part}" for part, count in fitted.about["keyframes"].items())
+    click.echo(f"keyframes: {counts}")
+    click.echo(f"fit: {out / 'fit.npz'}")
+
+
+@train.command(short_help="A model to ship, with its card.")
+@click.argument("fitted", metavar="FIT", type=click.Path(path_type=Path))
+@click.option(
+    "--labels", required=True, metavar="LABELS", type=click.Path(path_type=Path), help="It was taught on."
+)
+@_BASE
+@click.option("--out", required=True, metavar="FILE", type=click.Path(path_type=Path), help="An .onnx file.")
+def export(fitted: Path, labels: Path, base: Path | None, out: Path) -> None:
+    """Put the head in FIT, a folder by `share train fit`, onto the backbone, and write a model card beside it
+    with how it does on the rooms that were kept for the test.
+
+    \b
+    Example:  share train export fit --labels labels --out error_model.onnx
+    """
+    _need_extra()
+    from share.io.files import atomic_write, check_writable
+    from share.train.assembly import assemble
+    from share.train.card import card
+    from share.train.compare import of_network
+
+    check_writable(out)
+    made = assemble(fitted, labels, _base(base))
+    told = card(made.fitted.about, [of_network("this model", made.network, made.test)], len(made.model))
+    atomic_write(out, made.model)
+    atomic_write(out.with_suffix(".md"), told)
+    click.echo(told)
+    click.echo(f"model: {out}   card: {out.with_suffix('.md')}")
+
+
+@train.command(short_help="A model against four others, on rooms that none has learnt from.")
+@click.argument("labels", metavar="LABELS", type=click.Path(path_type=Path))
+@click.option(
+    "--fit",
+    "fitted",
+    required=True,
+    metavar="FIT",
+    type=click.Path(path_type=Path),
+    help="By train fit.",
+)
+@_BASE
+@options.as_json
+def compare(labels: Path, fitted: Path, base: Path | None, as_json: bool) -> None:
+    """Teach linear regression, a random forest, an MLP and a contrastive CNN on the rooms that the network in
+    FIT was taught on, and try all of them on those that were kept for the test.
+
+    \b
+    Example:  share train compare labels --fit fit
+    """
+    _need_extra()
+    import dataclasses
+    import json
+
+    from share.train.assembly import assemble
+    from share.train.card import table
+    from share.train.compare import of_network, of_rivals
+
+    live = LiveLine()
+    live.write("pictures go through the backbone")
+    made = assemble(fitted, labels, _base(base))
+    seed = made.fitted.about["options"]["seed"]
+    scores = of_rivals(made.collection, made.deep, seed, lambda name: live.write(f"teaching: {name}"))
+    scores.append(of_network("ours", made.network, made.test))
+    live.end()
+    if as_json:
+        click.echo(json.dumps([dataclasses.asdict(score) for score in scores]))
+    else:
+        click.echo(table(scores))
+
+
+def _base(given: Path | None) -> Path:
+    from share.io.network import SHIPPED
+
+    if given is None and not SHIPPED.is_file():
+        raise UsageError("--base: SHARE comes with no model yet; make a backbone with tools/make_backbone.py")
+    return given or SHIPPED
+
+
+def _need_extra() -> None:
+    import importlib.util
+
+    missing = [name for name in ("torch", "onnx", "sklearn") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise UsageError(f"{', '.join(missing)} is needed for this: pip install 'share-slam[train]'")
+
+
+def _summary(errors: list[F32]) -> str:
     import numpy as np
 
-    error_cm = np.concatenate([one.error_cm for one in made])
+    error_cm = np.concatenate(errors)
     known = error_cm[np.isfinite(error_cm)]
-    told = f"{len(made)} runs, {len(error_cm)} keyframes, {len(known)} with a known error"
+    told = f"{len(errors)} runs, {len(error_cm)} keyframes, {len(known)} with a known error"
     if not len(known):
         return told
     at = np.percentile(known, [5, 25, 50, 75, 95, 99])

@@ -25,12 +25,11 @@ from share.core import events as ev
 from share.core.agent import Agent
 from share.core.sequencer import SequencerCounters
 from share.errors import DataError
-from share.estimator.result import TrackResult
 from share.io.source import Source
 from share.io.transport import AgentLink
-from share.metrics.local_error import LocalError
 from share.metrics.runlog import RunLog
 from share.run.agent_files import AgentFiles
+from share.run.errors import Errors, Unknown
 from share.run.late import Late
 from share.run.pipeline import frames_of, tracker_for
 from share.strict import to_mapping
@@ -77,15 +76,15 @@ class AgentRun:
         say: Callable[[str], None],
         show: Callable[[Status], None] = lambda status: None,
         verbose: bool = False,
-        error: LocalError | None = None,
+        errors: Errors | None = None,
     ) -> None:
-        """error: tells how wrong the tracker is, by the truth."""
+        """errors: tells how wrong the tracker is."""
         self._source, self._settings = source, settings
         self._say, self._show, self._verbose = say, show, verbose
         self._machine = Agent(hello, settings)
         self._prepare()
         self._files, self._log = AgentFiles(out, say), RunLog()
-        self._error = error
+        self._errors = Unknown() if errors is None else errors
         self._late = Late(settings.agent.late_ms)
         self._counters = SequencerCounters()
         self._link = connect()  # last: whatever is wrong with the above has been said by now
@@ -119,6 +118,7 @@ class AgentRun:
             self._link.close()
             for thread in threads:
                 thread.join(timeout=2)
+            self._errors.close()
         if self._shared.error is not None:
             raise self._shared.error
 
@@ -197,19 +197,17 @@ class AgentRun:
             T_odom_body=result.T_odom_body,
             keyframe=result.keyframe,
             new_stretch=result.new_stretch,
-            error_cm=self._error_cm(frame.stamp_ns, result),
+            error_cm=self._errors.after(frame.stamp_ns, result),
         )
         self._post(tracked)  # the pose goes out before others are served
         self._log.add_result(result.new_stretch, result.sound, result.waits)
         self._waits = result.waits
         if result.keyframe:
-            self._post(ev.KeyframeMade(tracked, self._tracker.keyframe(frame)))
+            footing = self._tracker.footing()
+            candidate = self._tracker.keyframe(frame)
+            self._post(ev.KeyframeMade(tracked, candidate))
+            self._errors.keyframe(frame, footing, candidate)
         self._log.cpu_s += time.thread_time() - cpu
-
-    def _error_cm(self, stamp_ns: int, result: TrackResult) -> float | None:
-        if self._error is None:
-            return None
-        return self._error.after(stamp_ns, result.T_odom_body, result.new_stretch)
 
     def _post(self, event: ev.AgentEvent) -> None:
         self._shared.inbox.put(event)
@@ -277,6 +275,7 @@ class AgentRun:
             "bytes_down": protocol["bytes_down"],
             "damaged_images": self._damaged,
             "drop_late": self._late.dropped,
+            **self._errors.report(),
             "sequencer": dataclasses.asdict(self._counters),
             "protocol": protocol,
             "version": __version__,

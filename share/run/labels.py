@@ -6,7 +6,6 @@ import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from share.config import Config
 from share.core.sequencer import SequencerCounters
 from share.errors import UsageError
 from share.evaluator.doubt import Doubt
-from share.evaluator.features import features
+from share.evaluator.features import Features, features
 from share.io.pool import Pool
 from share.io.session import Session, read_session
 from share.io.source import Source, open_source
@@ -97,21 +96,23 @@ def _make(work: tuple[Job, Config]) -> None:
         "window_s": WINDOW_S,
         "version": __version__,
     }
-    write_labels(job.out, _labelled(source, spells, about, config))
+    write_labels(job.out, Labels.of(about, list(keyframes(source, config, spells, job.seed))))
 
 
-def _labelled(source: Source, spells: list[Spell], about: dict[str, Any], config: Config) -> Labels:
+def keyframes(
+    source: Source, config: Config, spells: Sequence[Spell] = (), seed: int = 0
+) -> Iterator[tuple[int, float, float, Features]]:
+    """Of each keyframe of our own tracker: its stamp, how wrong the tracker is by then (cm, NaN unknown), how
+    wrong it takes itself to be, and what the error model is told. Raises UsageError without a truth."""
     truth = source.truth()
-    assert truth is not None
+    if truth is None:
+        raise UsageError(f"{source.name}: comes without a truth, so nobody knows how wrong a tracker is")
     tracker, error, doubt = tracker_for(source, config), LocalError(truth), Doubt()
-    rows = []
-    frames = frames_of(source, config, SequencerCounters())
-    for frame in spoiled(frames, spells, about["seed"]):
+    for frame in spoiled(frames_of(source, config, SequencerCounters()), spells, seed):
         result = tracker.track(frame)
         error_cm = error.after(frame.stamp_ns, result.T_odom_body, result.new_stretch)
         if result.keyframe:
             footing = tracker.footing()
             sigma_cm = doubt.after(frame.stamp_ns, tracker.keyframe(frame))
-            told = np.nan if error_cm is None else error_cm
-            rows.append((frame.stamp_ns, told, sigma_cm, features(frame.image0, footing, sigma_cm)))
-    return Labels.of(about, rows)
+            told = float("nan") if error_cm is None else error_cm
+            yield frame.stamp_ns, told, sigma_cm, features(frame.image0, footing, sigma_cm)

@@ -23,6 +23,7 @@ from share.errors import UsageError
 from share.geometry.camera import Rig
 from share.io.files import atomic_write, writable_dir
 from share.io.line_file import LineFile
+from share.io.network import open_network
 from share.io.session import Session, read_session
 from share.io.source import Source, open_source
 from share.io.transport.links import Links
@@ -30,6 +31,7 @@ from share.metrics.local_error import LocalError
 from share.metrics.together import Together
 from share.run.agent_files import AgentFiles
 from share.run.costs import costs_of
+from share.run.errors import AtOnce, ByTruth, Errors, Unknown
 from share.run.pipeline import frames_of, tracker_for
 from share.run.play import Progress, Terms
 from share.strict import to_mapping
@@ -37,6 +39,7 @@ from share.wire.messages import Hello
 
 _AFTER_S = 2.0  # for what is under way when the last frame has come
 _SHOW_EVERY = 50  # frames of an agent
+_BY_TRUTH = "truth"
 
 
 def play_virtually(
@@ -50,14 +53,16 @@ def play_virtually(
     settings = dataclasses.replace(settings, edge=dataclasses.replace(settings.edge, policy=terms.policy))
     if terms.policy == config.STREAMED:
         raise UsageError("policy streamed is not played in virtual time: its agents do not track")
-    tracked = _tracked(session.folder.resolve(), settings.tracker, settings.inertial, settings.sequencer)
+    told_by = _BY_TRUTH if terms.true_error else settings.agent.error_model
+    parts = settings.tracker, settings.inertial, settings.sequencer
+    tracked = _tracked(session.folder.resolve(), *parts, told_by)
     links = Links.parse(terms.link)
     links.check(session.agents)
     began_ns = min(looks[0].at_ns for _, looks in tracked.values() if looks)
     members = [
         (
             Hello(name, agent.kind, number + 1, tracked[name][0]),
-            _coming(tracked[name][1], began_ns, terms),
+            _coming(tracked[name][1], began_ns),
             links.network(name),
         )
         for number, (name, agent) in enumerate(session.agents.items())
@@ -73,43 +78,52 @@ def play_virtually(
 
 @lru_cache(maxsize=1)  # policies follow each other on one session
 def _tracked(
-    folder: Path, tracker: TrackerConfig, inertial: InertialConfig, sequencer: SequencerConfig
+    folder: Path, tracker: TrackerConfig, inertial: InertialConfig, sequencer: SequencerConfig, told_by: str
 ) -> dict[str, tuple[Rig, list[Seen]]]:
-    """What each agent's frames came to, by name; they come in at the session's own times, ns."""
+    """What each agent's frames came to, by name; they come in at the session's own times, ns. told_by: who
+    says how wrong trackers are, the truth, a file with an error model, or nobody ("")."""
     settings = Config(tracker=tracker, inertial=inertial, sequencer=sequencer)
     session = read_session(folder)
     return {
-        name: _track(open_source(f"{folder}/{name}"), settings, agent.clock_offset_ns)
+        name: _track(open_source(f"{folder}/{name}"), settings, agent.clock_offset_ns, told_by)
         for name, agent in session.agents.items()
     }
 
 
-def _track(source: Source, settings: Config, clock_offset_ns: int) -> tuple[Rig, list[Seen]]:
-    tracker, truth = tracker_for(source, settings), source.truth()
-    error = None if truth is None else LocalError(truth)
+def _track(source: Source, settings: Config, clock_offset_ns: int, told_by: str) -> tuple[Rig, list[Seen]]:
+    tracker, errors = tracker_for(source, settings), _errors(source, told_by)
     seen = []
     for frame in frames_of(source, settings, SequencerCounters()):
         result = tracker.track(frame)
-        T, breaks = result.T_odom_body, result.new_stretch
+        error_cm, candidate = errors.after(frame.stamp_ns, result), None
+        if result.keyframe:
+            footing, candidate = tracker.footing(), tracker.keyframe(frame)
+            errors.keyframe(frame, footing, candidate)
         seen.append(
             Seen(
                 at_ns=frame.stamp_ns - clock_offset_ns,
-                T_odom_body=T,
-                error_cm=None if error is None else error.after(frame.stamp_ns, T, breaks),
-                candidate=tracker.keyframe(frame) if result.keyframe else None,
+                T_odom_body=result.T_odom_body,
+                error_cm=error_cm,
+                candidate=candidate,
                 stamp_ns=frame.stamp_ns,
                 state=result.state,
-                breaks=breaks,
+                breaks=result.new_stretch,
             )
         )
     return source.rig, seen
 
 
-def _coming(looks: list[Seen], began_ns: int, terms: Terms) -> Iterator[Seen]:
+def _errors(source: Source, told_by: str) -> Errors:
+    truth = source.truth()
+    if told_by == _BY_TRUTH:
+        return Unknown() if truth is None else ByTruth(LocalError(truth))
+    return AtOnce(open_network(Path(told_by))) if told_by else Unknown()
+
+
+def _coming(looks: list[Seen], began_ns: int) -> Iterator[Seen]:
     """Counted from the first frame of all."""
     for look in looks:
-        error_cm = look.error_cm if terms.true_error else None
-        yield dataclasses.replace(look, at_ns=look.at_ns - began_ns, error_cm=error_cm)
+        yield dataclasses.replace(look, at_ns=look.at_ns - began_ns)
 
 
 class _Observer:

@@ -1,0 +1,138 @@
+"""How wrong its tracker is, as an agent tells the edge: by the truth, by the error model, or not at all."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from share.estimator.result import TrackResult
+from share.evaluator.doubt import Doubt
+from share.evaluator.features import features
+from share.evaluator.model import Estimate, Network, estimate
+from share.metrics.latency import summary
+from share.metrics.local_error import LocalError
+from share.types import Candidate, Footing, Frame
+
+
+class Errors(Protocol):
+    """Of one agent."""
+
+    def after(self, stamp_ns: int, result: TrackResult) -> float | None:
+        """cm, after another frame; None where it is not known."""
+
+    def keyframe(self, frame: Frame, footing: Footing, candidate: Candidate) -> None:
+        """The frame is a keyframe. Returns at once."""
+
+    def close(self) -> None: ...
+
+    def report(self) -> dict[str, Any]:
+        """For report.json."""
+
+
+class Unknown:
+    """Nobody tells."""
+
+    def after(self, stamp_ns: int, result: TrackResult) -> float | None:
+        return None
+
+    def keyframe(self, frame: Frame, footing: Footing, candidate: Candidate) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def report(self) -> dict[str, Any]:
+        return {}
+
+
+class ByTruth(Unknown):
+    """An oracle, for experiments."""
+
+    def __init__(self, error: LocalError) -> None:
+        self._error = error
+
+    def after(self, stamp_ns: int, result: TrackResult) -> float | None:
+        return self._error.after(stamp_ns, result.T_odom_body, result.new_stretch)
+
+
+class AtOnce(Unknown):
+    """The error model, where time is drawn (`share.run.virtual`): it has answered when `keyframe` returns."""
+
+    def __init__(self, network: Network) -> None:
+        self._network, self._doubt = network, Doubt()
+        self._newest: Estimate | None = None
+
+    def after(self, stamp_ns: int, result: TrackResult) -> float | None:
+        return None if self._newest is None or result.T_odom_body is None else self._newest.error_cm
+
+    def keyframe(self, frame: Frame, footing: Footing, candidate: Candidate) -> None:
+        sigma_cm = self._doubt.after(frame.stamp_ns, candidate)
+        self._newest = estimate(self._network, features(frame.image0, footing, sigma_cm))
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    frame: Frame
+    footing: Footing
+    sigma_cm: float
+
+
+class ByModel:
+    """The error model, in a thread of its own. A keyframe that comes while it is busy waits; one more, and
+    the older is left out (policy drop_estimate). What it said last holds until it says something else."""
+
+    def __init__(self, network: Network, say: Callable[[str], None]) -> None:
+        self._network, self._say = network, say
+        self._doubt = Doubt()
+        self._newest: Estimate | None = None
+        self._waits: _Job | None = None
+        self._wake = threading.Condition()
+        self._ended = False
+        self._ms: list[float] = []
+        self._dropped = self._strange = 0
+        self._thread = threading.Thread(target=self._work, name="error model", daemon=True)
+        self._thread.start()
+
+    def after(self, stamp_ns: int, result: TrackResult) -> float | None:
+        newest = self._newest
+        return None if newest is None or result.T_odom_body is None else newest.error_cm
+
+    def keyframe(self, frame: Frame, footing: Footing, candidate: Candidate) -> None:
+        job = _Job(frame, footing, self._doubt.after(frame.stamp_ns, candidate))
+        with self._wake:
+            self._dropped += self._waits is not None
+            self._waits = job
+            self._wake.notify()
+
+    def close(self) -> None:
+        with self._wake:
+            self._ended = True
+            self._wake.notify()
+        self._thread.join(timeout=2)
+
+    def report(self) -> dict[str, Any]:
+        told = {"estimate_ms": summary(self._ms).report(), "drop_estimate": self._dropped}
+        return {"error_model": {**told, "strange": self._strange}}
+
+    def _work(self) -> None:
+        while (job := self._next()) is not None:
+            began = time.thread_time()
+            try:
+                told = features(job.frame.image0, job.footing, job.sigma_cm)
+                found = estimate(self._network, told)
+            except Exception as error:  # a network is a file from somewhere; odometry goes on without it
+                self._newest = None
+                self._say(f"the error model has failed and is left alone: {error}")
+                return
+            self._newest = found
+            self._strange += found.strange
+            self._ms.append(1e3 * (time.thread_time() - began))
+
+    def _next(self) -> _Job | None:
+        with self._wake:
+            self._wake.wait_for(lambda: self._ended or self._waits is not None)
+            job, self._waits = self._waits, None
+            return None if self._ended else job

@@ -1,0 +1,58 @@
+"""A head put onto the backbone that it was taught for, with the labels that it was taught on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from share.errors import UsageError
+from share.evaluator.model import Network
+from share.io.network import deep_of, open_network
+from share.train.fitted import Fitted, read_fitted
+from share.train.graph import backbone_id, with_head
+from share.train.rivals import Rows
+from share.train.table import Collection, collect
+from share.types import F32
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """model: the file; deep (N, 1280): of the collection's table."""
+
+    fitted: Fitted
+    collection: Collection
+    model: bytes
+    network: Network
+    deep: F32
+
+    @property
+    def test(self) -> Rows:
+        """Keyframes that nothing was learnt from."""
+        runs = self.collection.parts["test"]
+        return Rows(self.collection.table, self.deep).take(np.isin(self.collection.table.run, runs))
+
+
+def assemble(fit: Path, labels: Path, base: Path) -> Assembly:
+    """fit: a folder by `share train fit`. Raises UsageError where labels or base are not what it was taught
+    on, DataError."""
+    fitted = read_fitted(fit / "fit.npz")
+    collection = collect(labels, fitted.about["options"]["seed"])
+    _check_rooms(collection, fitted.about, labels)
+    given = base.read_bytes()
+    if backbone_id(given) != fitted.about["backbone"]:
+        raise UsageError(f"{base}: has another backbone than the one that {fit} was taught for")
+    model = with_head(given, fitted)
+    network = open_network(model)
+    return Assembly(fitted, collection, model, network, deep_of(network, collection.table.picture))
+
+
+def _check_rooms(collection: Collection, about: Mapping[str, Any], labels: Path) -> None:
+    """Else a test would be on what was learnt."""
+    for part, runs in collection.parts.items():
+        here = {str(collection.abouts[run]["session"]) for run in runs.tolist()}
+        if here != set(about["rooms"][part]):
+            raise UsageError(f"{labels}: is not what it was taught on; sessions of '{part}' differ")

@@ -1,0 +1,61 @@
+"""The model card: what an error model was taught on, how well it does, and what it is not for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from share.train.compare import Score
+
+_LIMITS = (
+    "It estimates the error of SHARE's own trackers over that window, not how far odometry has drifted.",
+    "It was taught on emulated rooms. `strange` says where a picture is unlike all of them.",
+    "What leaves no trace in a keyframe, as a wrong extrinsic, it cannot see.",
+)
+
+
+def card(about: Mapping[str, Any], scores: Sequence[Score], size: int) -> str:
+    """Markdown. about: of the model; scores: on rooms that it has not learnt from; size: bytes."""
+    rooms, counts = about["rooms"], about["keyframes"]
+    parts = [f"| {part} | {len(rooms[part])} | {counts[part]} | {', '.join(rooms[part])} |" for part in rooms]
+    return "\n".join(
+        [
+            "# Error model",
+            "",
+            f"By SHARE {about['version']}; errors over {about['window_s']:g} s; {size / 1e6:.1f} MB.",
+            "",
+            "| part | sessions | keyframes | |",
+            "|---|---|---|---|",
+            *parts,
+            "",
+            "On the rooms of *test*:",
+            "",
+            table(scores),
+            "",
+            *(f"* {limit}" for limit in _LIMITS),
+            "",
+        ]
+    )
+
+
+def table(scores: Sequence[Score]) -> str:
+    """Markdown, as the paper's: error, and time a keyframe."""
+    head = (
+        "| | RMSE cm | mean error cm | rank correlation | QoE off | in the interval | ms |",
+        "|---|" + 6 * "---|",
+    )
+    rows = [
+        f"| {s.name} | {s.rmse_cm:.3f} | {s.mae_cm:.3f} | {s.rank:.2f} | {s.qoe_off:.3f} "
+        f"| {_percent(s.covered)} | {_told(s.ms)} |"
+        for s in scores
+    ]
+    return "\n".join([*head, *rows])
+
+
+def _percent(value: float) -> str:
+    return "–" if math.isnan(value) else f"{100 * value:.0f} %"
+
+
+def _told(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.2f}"

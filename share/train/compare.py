@@ -1,0 +1,93 @@
+"""The error model and what else could be in its place, on rooms that none of them has learnt from."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.config import ControlConfig
+from share.control.qoe import DELAY_MS, Needs, qoe
+from share.evaluator.features import Features
+from share.evaluator.model import Network, estimate
+from share.train.rivals import RIVALS, Rows, Tell
+from share.train.table import Collection
+from share.types import F32, F64, AgentKind
+
+_TIMED = 200  # keyframes
+
+
+@dataclass(frozen=True)
+class Score:
+    """Of one model on N keyframes. rmse_cm, mae_cm; rank: correlation with the true error (Spearman);
+    qoe_off: by how much a headset's QoE is off, on average, where nothing is late; covered: how many errors
+    lie in their intervals, NaN without any; ms: of CPU a keyframe, the features not included, NaN where it
+    was not measured."""
+
+    name: str
+    rmse_cm: float
+    mae_cm: float
+    rank: float
+    qoe_off: float
+    covered: float = float("nan")
+    ms: float = float("nan")
+
+
+def of_network(name: str, network: Network, rows: Rows) -> Score:
+    """One by one, as on an agent."""
+    table, told, began = rows.table, [], time.thread_time()
+    for picture, psd, scalars in zip(table.picture, table.psd, table.scalars, strict=True):
+        told.append(estimate(network, Features(picture, psd, scalars)))
+    ms = 1e3 * (time.thread_time() - began) / max(len(told), 1)
+    low, high = (np.array([getattr(one, side) for one in told]) for side in ("low_cm", "high_cm"))
+    covered = float(((low <= table.error_cm) & (table.error_cm <= high)).mean())
+    return scored(name, np.array([one.error_cm for one in told]), table.error_cm, covered, ms)
+
+
+def of_rivals(
+    collection: Collection, deep: F32, seed: int, say: Callable[[str], None] = lambda name: None
+) -> list[Score]:
+    """Each taught on the rooms that ours is taught on, and tried where it is tried."""
+    rows = Rows(collection.table, deep)
+    parts = {part: rows.take(np.isin(collection.table.run, runs)) for part, runs in collection.parts.items()}
+    out = [_mean(parts["learn"], parts["test"])]
+    for name, rival in RIVALS.items():
+        say(name)
+        tell = rival(parts["learn"], parts["stop"], seed)
+        test = parts["test"]
+        out.append(scored(name, tell(test), test.table.error_cm, ms=_timed(tell, test)))
+    return out
+
+
+def scored(
+    name: str, told_cm: F64, error_cm: F32, covered: float = float("nan"), ms: float = float("nan")
+) -> Score:
+    from scipy.stats import spearmanr
+
+    off = told_cm - error_cm
+    rank = float(spearmanr(told_cm, error_cm).statistic) if np.ptp(told_cm) else 0.0
+    rmse, mae = float(np.sqrt((off**2).mean())), float(np.abs(off).mean())
+    return Score(name, rmse, mae, rank, float(np.abs(_qoe(told_cm) - _qoe(error_cm)).mean()), covered, ms)
+
+
+def _qoe(error_cm: F64 | F32) -> F64:
+    """Of a headset that waits for nothing: a delay would only make differences smaller."""
+    needs = Needs.of(ControlConfig(), AgentKind.AR)
+    return np.array([qoe(DELAY_MS, cm, needs) for cm in error_cm.tolist()])
+
+
+def _mean(learn: Rows, test: Rows) -> Score:
+    """Of who knows nothing of a keyframe."""
+    always = np.full(len(test.deep), float(learn.table.error_cm.mean()))
+    return scored("always the mean", always, test.table.error_cm)
+
+
+def _timed(tell: Tell, rows: Rows) -> float:
+    """ms of CPU, one keyframe at a time."""
+    some = [rows.take(np.array([k])) for k in range(min(_TIMED, len(rows.deep)))]
+    began = time.process_time()
+    for one in some:
+        tell(one)
+    return 1e3 * (time.process_time() - began) / max(len(some), 1)

@@ -1,0 +1,90 @@
+"""From labels to a head: inputs are standardised, the head is fitted and calibrated, and knows how far its
+knowledge goes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from share import __version__
+from share.metrics.local_error import WINDOW_S
+from share.train.fit import FitOptions, Inputs, Show, fit
+from share.train.fitted import Fitted, folded, known, margin
+from share.train.table import Collection
+from share.types import F32
+
+_LEAST = 1e-3  # deviation of an input that hardly changes
+
+
+def teach(
+    collection: Collection, deep: F32, backbone: str, options: FitOptions, checkpoint: Path | None, show: Show
+) -> Fitted:
+    """deep (N, 1280): of the table's pictures, by the backbone that the head will be put onto, which is
+    called `backbone` (`graph.backbone_id`)."""
+    scale = _Scale(deep, collection)
+    parts = {name: scale.inputs(name) for name in collection.parts}
+    head = fit(parts["learn"], parts["stop"], options, checkpoint, show)
+    with torch.no_grad():
+        joined = {name: head.join(*_tensors(parts[name])).numpy() for name in ("learn", "calibrate")}
+        told = head(*_tensors(parts["calibrate"])).numpy()
+    weights = {name: value.numpy() for name, value in head.state_dict().items()}
+    weights = folded(weights, "visual.0", *scale.deep)
+    weights = folded(weights, "numbers.0", *scale.scalars)
+    about = {
+        "version": __version__,
+        "window_s": WINDOW_S,
+        "backbone": backbone,
+        "options": asdict(options),
+        "rooms": {name: _rooms(collection, name) for name in collection.parts},
+        "keyframes": {name: len(part.log_error) for name, part in parts.items()},
+    }
+    return Fitted(
+        weights,
+        margin(told, parts["calibrate"].log_error),
+        *known(joined["learn"], joined["calibrate"]),
+        about,
+    )
+
+
+class _Scale:
+    """Inputs at a mean of 0 and a deviation of 1, by those that are learnt from."""
+
+    def __init__(self, deep: F32, collection: Collection) -> None:
+        self._deep, self._collection = deep, collection
+        learn = self._rows("learn")
+        self.deep = _moments(deep[learn])
+        self.scalars = _moments(collection.table.scalars[learn])
+
+    def inputs(self, part: str) -> Inputs:
+        rows, table = self._rows(part), self._collection.table
+        return Inputs(
+            _scaled(self._deep[rows], *self.deep),
+            table.psd[rows],
+            _scaled(table.scalars[rows], *self.scalars),
+            table.log_error[rows],
+        )
+
+    def _rows(self, part: str) -> Any:
+        return np.isin(self._collection.table.run, self._collection.parts[part])
+
+
+def _moments(x: F32) -> tuple[F32, F32]:
+    return x.mean(axis=0), np.maximum(x.std(axis=0), _LEAST)
+
+
+def _scaled(x: F32, mean: F32, deviation: F32) -> F32:
+    out: F32 = (x - mean) / deviation
+    return out
+
+
+def _tensors(inputs: Inputs) -> list[torch.Tensor]:
+    return inputs.tensors(torch.device("cpu"))[:3]
+
+
+def _rooms(collection: Collection, part: str) -> list[str]:
+    abouts = (collection.abouts[run] for run in collection.parts[part].tolist())
+    return sorted({str(about["session"]) for about in abouts})

@@ -1,0 +1,103 @@
+"""How an agent knows how wrong its tracker is: the error model beside it never holds it up, nor ends it."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from share.estimator.result import TrackResult
+from share.run.errors import AtOnce, ByModel
+from share.types import Candidate, Footing, Frame, TrackState, View
+
+NOTHING = View(np.zeros((0, 2), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 32), np.uint8))
+STANDS_ON = Footing(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0), 0, 0)
+CANDIDATE = Candidate(np.eye(4), np.eye(4), np.zeros((6, 6)), np.zeros(3), 0.0, NOTHING)
+TRACKED, LOST = TrackResult(TrackState.OK, np.eye(4)), TrackResult(TrackState.LOST, None)
+
+
+class Network:
+    """Says that the error is as many cm as the picture is bright; waits until it may."""
+
+    def __init__(self) -> None:
+        self.may = threading.Event()
+        self.seen: list[float] = []
+
+    def get_inputs(self):
+        return []
+
+    def run(self, names, inputs):
+        self.seen.append(float(inputs["picture"].mean()))
+        assert self.may.wait(5)
+        if self.seen[-1] > 200:
+            raise RuntimeError("too bright")
+        log = np.log(self.seen[-1])
+        return [np.array([[log, log - 1, log + 1]]), np.zeros((1, 64)), np.array([0.5])]
+
+
+def frame(brightness: int) -> Frame:
+    return Frame(brightness, brightness, np.full((48, 64), brightness, np.uint8))
+
+
+def until(reached, limit_s: float = 5.0) -> None:
+    end = time.monotonic() + limit_s
+    while not reached():
+        assert time.monotonic() < end
+        time.sleep(0.002)
+
+
+def test_what_was_said_last_holds():
+    network, said = Network(), []
+    network.may.set()
+    errors = ByModel(network, said.append)
+    assert errors.after(0, TRACKED) is None
+    errors.keyframe(frame(3), STANDS_ON, CANDIDATE)
+    until(lambda: errors.after(1, TRACKED) is not None)
+    assert errors.after(1, TRACKED) == pytest.approx(3)
+    assert errors.after(2, LOST) is None  # there is no pose that could be wrong
+    errors.close()
+    told = errors.report()["error_model"]
+    assert told["estimate_ms"]["n"] == 1
+    assert (told["drop_estimate"], told["strange"], said) == (0, 0, [])
+
+
+def test_who_is_busy_leaves_the_older_out():
+    network = Network()
+    errors = ByModel(network, lambda text: None)
+    began = time.monotonic()
+    errors.keyframe(frame(1), STANDS_ON, CANDIDATE)
+    until(lambda: network.seen == [1.0])  # it is at work, and waits
+    for brightness in (2, 3, 4):
+        errors.keyframe(frame(brightness), STANDS_ON, CANDIDATE)
+    assert time.monotonic() - began < 2
+    network.may.set()
+    until(lambda: errors.after(1, TRACKED) == pytest.approx(4))
+    errors.close()
+    assert network.seen == [1.0, 4.0]
+    assert errors.report()["error_model"]["drop_estimate"] == 2
+
+
+def test_a_network_that_fails_is_left_alone_and_said_so():
+    network, said = Network(), []
+    network.may.set()
+    errors = ByModel(network, said.append)
+    errors.keyframe(frame(5), STANDS_ON, CANDIDATE)
+    until(lambda: errors.after(1, TRACKED) is not None)
+    errors.keyframe(frame(250), STANDS_ON, CANDIDATE)
+    until(lambda: said)
+    assert said == ["the error model has failed and is left alone: too bright"]
+    errors.keyframe(frame(6), STANDS_ON, CANDIDATE)
+    assert errors.after(2, TRACKED) is None
+    errors.close()
+
+
+def test_in_virtual_time_it_has_answered_at_once():
+    network = Network()
+    network.may.set()
+    errors = AtOnce(network)
+    assert errors.after(0, TRACKED) is None
+    errors.keyframe(frame(7), STANDS_ON, CANDIDATE)
+    assert errors.after(1, TRACKED) == pytest.approx(7)
+    assert errors.after(1, LOST) is None

@@ -1,0 +1,86 @@
+"""What is said of a model that is held against the truth."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="make install-train brings it")
+pytest.importorskip("sklearn", reason="make install-train brings it")
+
+from share.train.card import table
+from share.train.compare import of_network, scored
+from share.train.rivals import Rows, _contrast, _numbers
+from share.train.table import Table
+
+ERROR_CM = np.array([0.1, 0.2, 0.4, 0.8], np.float32)
+
+
+def rows(error_cm=ERROR_CM) -> Rows:
+    n = len(error_cm)
+    table_of = Table(
+        np.zeros(n, np.int64),
+        error_cm,
+        np.zeros((n, 128, 128), np.uint8),
+        np.zeros((n, 3, 12, 16), np.float32),
+        np.zeros((n, 8), np.float32),
+    )
+    return Rows(table_of, np.zeros((n, 1280), np.float32))
+
+
+def test_who_is_right_has_no_error():
+    perfect = scored("x", ERROR_CM.astype(float), ERROR_CM)
+    assert (perfect.rmse_cm, perfect.mae_cm, perfect.qoe_off) == (0, 0, 0)
+    assert perfect.rank == pytest.approx(1)
+
+
+def test_errors_are_told_by_their_size_and_their_order():
+    off = scored("x", ERROR_CM[::-1].astype(float), ERROR_CM)
+    assert off.rank == pytest.approx(-1)
+    assert off.rmse_cm == pytest.approx(math.sqrt((0.7**2 + 0.2**2 + 0.2**2 + 0.7**2) / 4), rel=1e-6)
+    assert off.mae_cm == pytest.approx(0.45, rel=1e-6)
+    assert 0 < off.qoe_off < 1
+    assert scored("x", np.full(4, 0.3), ERROR_CM).rank == 0  # who says always the same knows no order
+
+
+def test_a_network_is_asked_keyframe_by_keyframe():
+    class Network:
+        asked = 0
+
+        def get_inputs(self):
+            return []
+
+        def run(self, names, inputs):
+            assert inputs["picture"].shape == (1, 128, 128)
+            self.asked += 1
+            log = math.log(0.2)
+            return [np.array([[log, log - 0.8, log + 0.8]]), np.zeros((1, 64)), np.array([0.5])]
+
+    network = Network()
+    told = of_network("ours", network, rows())
+    assert network.asked == 4
+    assert told.covered == 0.75  # 0.8 cm is more than 0.2 e^0.8
+    assert "| ours | " in table([told])
+    assert "75 %" in table([told])
+
+
+def test_the_forest_has_1312_numbers_each_in_its_place():
+    one = rows()
+    one.table.psd[0, 1, 7, 5] = 24.0  # in the lower half, the second of four across: of 24 cells
+    numbers = _numbers(one)
+    assert numbers.shape == (4, 1312)
+    assert numbers[0, 1280 + 8 + 4 + 1] == 1
+    assert numbers[0].sum() == 1
+
+
+def test_contrast_is_less_where_likes_are_together():
+    import torch
+
+    y = torch.tensor([0.0, 0.1, 5.0, 5.1])
+    together = torch.nn.functional.normalize(
+        torch.tensor([[1.0, 0.0], [1.0, 0.1], [-1.0, 0.0], [-1.0, 0.1]]), dim=1
+    )
+    apart = together[[0, 2, 1, 3]]
+    assert _contrast(together, y) < _contrast(apart, y)

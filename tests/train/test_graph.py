@@ -1,0 +1,100 @@
+"""The model as a file: node by node what the network in torch says."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="make install-train brings it")
+onnx = pytest.importorskip("onnx", reason="make install-train brings it")
+
+from tiny_backbone import tiny_backbone  # noqa: E402
+
+from share.evaluator.features import Features  # noqa: E402
+from share.evaluator.model import estimate  # noqa: E402
+from share.io.network import deep_of, open_network  # noqa: E402
+from share.train.fitted import Fitted  # noqa: E402
+from share.train.graph import backbone_id, with_head  # noqa: E402
+from share.train.network import Head, loss  # noqa: E402
+
+
+@pytest.fixture
+def head() -> Head:
+    torch.manual_seed(3)
+    return Head().eval()
+
+
+def fitted(head: Head, margin: float = 0.2, reach: float = 4.0) -> Fitted:
+    weights = {name: value.numpy() for name, value in head.state_dict().items()}
+    return Fitted(
+        weights, margin, np.zeros(96, np.float32), np.eye(96, dtype=np.float32) / reach, {"version": "x"}
+    )
+
+
+def keyframes(rng, n: int = 7) -> list[Features]:
+    return [
+        Features(
+            rng.integers(0, 256, (128, 128), np.uint8),
+            rng.random((3, 12, 16), np.float32),
+            rng.random(8, np.float32),
+        )
+        for _ in range(n)
+    ]
+
+
+def test_the_file_says_what_the_network_does(head, rng):
+    network = open_network(with_head(tiny_backbone(), fitted(head)))
+    for one in keyframes(rng):
+        deep = torch.from_numpy(deep_of(network, one.picture[None]))
+        with torch.no_grad():
+            inputs = deep, torch.from_numpy(one.psd[None].copy()), torch.from_numpy(one.scalars[None].copy())
+            expected, low, high = head(*inputs)[0].tolist()
+            joined = head.join(*inputs)[0].numpy()
+        told = estimate(network, one)
+        assert math.log(told.error_cm) == pytest.approx(expected, abs=1e-4)
+        assert told.embedding == pytest.approx(joined[:64], abs=1e-4)
+        strange = np.linalg.norm(joined) > 4
+        assert told.strange == strange
+        wider = 2 if strange else 1
+        assert math.log(told.low_cm) == pytest.approx(expected - wider * (expected - low + 0.2), abs=1e-4)
+        assert math.log(told.high_cm) == pytest.approx(expected + wider * (high - expected + 0.2), abs=1e-4)
+
+
+def test_another_head_takes_the_place_of_the_first(head, rng):
+    first = with_head(tiny_backbone(), fitted(head))
+    torch.manual_seed(4)
+    other = fitted(Head().eval())
+    again = with_head(first, other)
+    assert again == with_head(tiny_backbone(), other)
+    assert backbone_id(first) == backbone_id(again) == backbone_id(tiny_backbone())
+    (one,) = keyframes(rng, 1)
+    told = [estimate(open_network(model), one).error_cm for model in (first, again)]
+    assert told[0] != told[1]
+
+
+def test_an_interval_that_is_too_wide_shrinks_no_further_than_to_nothing(head, rng):
+    network = open_network(with_head(tiny_backbone(), fitted(head, margin=-50.0, reach=1e6)))
+    (one,) = keyframes(rng, 1)
+    told = estimate(network, one)
+    assert told.low_cm == pytest.approx(told.error_cm) == told.high_cm
+
+
+def test_the_loss_is_least_at_the_mean_and_the_quantiles(rng):
+    """Of errors whose distribution is known."""
+    y = torch.from_numpy(rng.lognormal(0.0, 0.8, 20_000))
+    told = torch.tensor([0.0, -0.5, 0.5], requires_grad=True)
+    optimiser = torch.optim.LBFGS([told], max_iter=200, line_search_fn="strong_wolfe")
+
+    def closure():
+        optimiser.zero_grad()
+        value = loss(told.expand(len(y), 3), torch.log(y))
+        value.backward()
+        return value
+
+    optimiser.step(closure)
+    expected, low, high = told.tolist()
+    assert math.exp(expected) == pytest.approx(float(y.mean()), rel=0.01)
+    assert math.exp(low) == pytest.approx(float(y.quantile(0.05)), rel=0.03)
+    assert math.exp(high) == pytest.approx(float(y.quantile(0.95)), rel=0.03)

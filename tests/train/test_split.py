@@ -1,0 +1,55 @@
+"""Rooms and motions stay together, and every part has some."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from share.train.split import PARTS, groups, split
+
+
+def about(scene="warehouse", seed=1, motions=("ar=walk:speed=0.6",), session="s"):
+    return {"session": session, "provenance": {"scene": scene, "seed": seed, "motions": list(motions)}}
+
+
+def test_runs_in_one_room_are_one_group():
+    found = groups([about(seed=1), about(seed=2), about(seed=1), about("firestation", 1)])
+    assert found[0] == found[2]
+    assert len(set(found.tolist())) == 3
+
+
+def test_a_recorded_motion_ties_rooms_together_and_a_planned_one_does_not():
+    found = groups([about(seed=1, motions=["paper:1"]), about(seed=2, motions=["paper:1"]), about(seed=3)])
+    assert found[0] == found[1] != found[2]
+    chained = groups(
+        [
+            about(seed=1, motions=["a=paper:1"]),
+            about(seed=2, motions=["b=tum:x.tum"]),
+            about(seed=3, motions=["a=paper:1", "b=tum:x.tum"]),
+        ]
+    )
+    assert chained[0] == chained[2] == chained[1]
+
+
+def test_recordings_of_real_rooms_are_groups_of_their_own():
+    real = {"session": "field", "provenance": {}}
+    found = groups([real, about(), {"session": "field", "provenance": {}}])
+    assert found[0] == found[2] != found[1]
+
+
+@pytest.mark.parametrize("rooms", [4, 5, 9, 40])
+def test_parts_are_whole_groups_and_none_is_empty(rooms):
+    group = np.repeat(np.arange(rooms), 3)
+    parts = split(group, seed=1)
+    assert list(parts) == list(PARTS)
+    assert sorted(np.concatenate(list(parts.values())).tolist()) == list(range(3 * rooms))
+    assert all(len(runs) for runs in parts.values())
+    owners = [set(group[runs].tolist()) for runs in parts.values()]
+    assert sum(map(len, owners)) == rooms
+    assert len(parts["learn"]) == max(map(len, parts.values()))
+
+
+def test_the_seed_decides():
+    group = np.arange(20)
+    one, same, other = (split(group, seed)["test"].tolist() for seed in (1, 1, 2))
+    assert one == same != other
