@@ -11,9 +11,10 @@ import numpy as np
 from hellos import hello_of
 
 from share.config import Config, EdgeConfig
-from share.core import edge as ed
+from share.core import edge_events as ed
 from share.core import events as ev
 from share.core.agent import Agent
+from share.core.edge import Edge
 from share.core.finding import Finding
 from share.core.mapper import Mapper
 from share.core.steps import Solve, Step
@@ -124,7 +125,7 @@ class ModelRun:
     """One life of the edge: both machines, as `share.run.edge` has them, without processes."""
 
     def __init__(self, config: Config, session: int) -> None:
-        self.machine = ed.Edge(config, session)
+        self.machine = Edge(config, session)
         self.mapper = Mapper(config)
         self.solver = Solver(config.graph)
 

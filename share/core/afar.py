@@ -6,64 +6,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from share.core.edge_events import BeginTracking, EndTracking, ToTracker, Track
 from share.core.window import Window
 from share.geometry.camera import Camera, Rig
 from share.types import Frame
 from share.wire.messages import Tracked
-
-# ---------------------------------------------------------------- to its tracker, and back
-
-
-@dataclass(frozen=True, eq=False)
-class BeginTracking:
-    """A tracker for this rig; it answers `Ready`. life: how many this agent has had before."""
-
-    key: str
-    life: int
-    rig: Rig
-
-
-@dataclass(frozen=True, eq=False)
-class Track:
-    """The next frame of this agent; it is answered by `Answered`."""
-
-    key: str
-    frame: Frame
-
-
-@dataclass(frozen=True)
-class EndTracking:
-    """Its tracker is not needed any more."""
-
-    key: str
-
-
-@dataclass(frozen=True)
-class Ready:
-    key: str
-    life: int
-
-
-@dataclass(frozen=True, eq=False)
-class Answered:
-    key: str
-    life: int
-    answer: Tracked
-
-
-@dataclass(frozen=True)
-class Lost:
-    """The tracker has died; how, for a person."""
-
-    key: str
-    life: int
-    how: str
-
-
-ToTracker = BeginTracking | Track | EndTracking
-FromTracker = Ready | Answered | Lost
-
-# ---------------------------------------------------------------- the agent
 
 
 @dataclass

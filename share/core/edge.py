@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, ClassVar
 
 from share import __version__
 from share.config import Config
-from share.core.afar import FromTracker, ToTracker
+from share.core.edge_events import Add, Effect, Event, Found, Join, Keep, Kept, Received, Record, Send, Tick
 from share.core.finding import Finding
 from share.core.inorder import InOrder
 from share.core.keeping import Change, KeepKeyframe, KeepRun
@@ -25,82 +25,7 @@ from share.errors import WireError
 from share.strict import to_mapping
 from share.types import Keyframe
 from share.wire import messages as wire
-from share.wire.codec import Bytes, decode, encode
-
-# ---------------------------------------------------------------- events
-
-
-@dataclass(frozen=True)
-class Received:
-    """A message, still bytes, from the peer that the transport knows by this id."""
-
-    peer: bytes
-    frames: Sequence[Bytes]
-
-
-@dataclass(frozen=True)
-class Found:
-    """What the mapper has decided, and what of it must survive a crash."""
-
-    findings: Sequence[Finding]
-    changes: Sequence[Change] = ()
-
-
-@dataclass(frozen=True)
-class Kept:
-    """Everything up to this ticket will be there after a crash."""
-
-    ticket: int
-
-
-@dataclass(frozen=True)
-class Tick:
-    """Time has passed."""
-
-
-Event = Received | Found | Kept | Tick | FromTracker
-
-# ---------------------------------------------------------------- effects
-
-
-@dataclass(frozen=True)
-class Send:
-    peer: bytes
-    frames: Sequence[Bytes]
-
-
-@dataclass(frozen=True)
-class Join:
-    """To the mapper: a run of an agent, before its first keyframe."""
-
-    key: str
-    hello: wire.Hello
-
-
-@dataclass(frozen=True)
-class Add:
-    """To the mapper: the next keyframe of a run, each once and in order."""
-
-    key: str
-    keyframe: Keyframe
-
-
-@dataclass(frozen=True)
-class Keep:
-    """Make this safe, and answer with `Kept`. Tickets rise."""
-
-    ticket: int
-    changes: tuple[Change, ...]
-
-
-@dataclass(frozen=True)
-class Record:
-    """A decision with its reason: one line of events.jsonl."""
-
-    fields: dict[str, Any]
-
-
-Effect = Send | Join | Add | Keep | Record | ToTracker
+from share.wire.codec import decode, encode
 
 
 class Edge:

@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from share.core.afar import Afar, Answered, Lost, Ready, ToTracker
-from share.core.edge import Edge, Event
+from share.core.afar import Afar
+from share.core.edge import Edge
+from share.core.edge_events import Answered, Event, Lost, Ready, ToTracker
 from share.core.peer import Peer
 from share.core.window import Window
 from share.types import Frame

@@ -18,10 +18,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from share.config import Config
-from share.core import edge as ed
+from share.core import edge_events as ed
 from share.core import events as ev
 from share.core.agent import Agent
 from share.core.channel import Channel, Network
+from share.core.edge import Edge
 from share.core.finding import Finding
 from share.core.keeping import Change
 from share.core.mapper import Mapper
@@ -125,7 +126,7 @@ class World:
             member = _Member(hello, Agent(hello, config), looks, network, rng.spawn(2))
             self._members[member.peer] = member
             self._next_look(member)
-        self.edge = ed.Edge(config, session=1)
+        self.edge = Edge(config, session=1)
         self.mapper: AnyMapper = Mapper(config) if mapper is None else mapper
         self._solver = Solver(config.graph)
         self._inbox: deque[tuple[Cost, Callable[[], list[Finding]]]] = deque()  # the mapper's

@@ -21,8 +21,26 @@ from typing import Any
 
 from share.config import Config
 from share.control.policies import POLICIES
-from share.core.afar import Answered, BeginTracking, EndTracking, Lost, Ready, Track
-from share.core.edge import Add, Edge, Effect, Event, Found, Join, Keep, Kept, Received, Record, Send, Tick
+from share.core.edge import Edge
+from share.core.edge_events import (
+    Add,
+    Answered,
+    BeginTracking,
+    Effect,
+    EndTracking,
+    Event,
+    Found,
+    Join,
+    Keep,
+    Kept,
+    Lost,
+    Ready,
+    Received,
+    Record,
+    Send,
+    Tick,
+    Track,
+)
 from share.core.peer import known_runs
 from share.core.tracking_edge import TrackingEdge
 from share.io.files import atomic_write, check_writable, claim

@@ -7,7 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
-from share.core.edge import Keep, Kept
+from share.core.edge_events import Keep, Kept
 from share.errors import StoreError
 from share.io.map_store import MapStore
 

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 from share.config import Config, GraphConfig
-from share.core.edge import Add, Found, Join
+from share.core.edge_events import Add, Found, Join
 from share.core.finding import Finding
 from share.core.keeping import Kept
 from share.core.mapper import Mapper

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 
 from share.config import Config
-from share.core.afar import Answered, BeginTracking, EndTracking, FromTracker, Lost, Ready, Track
+from share.core.edge_events import Answered, BeginTracking, EndTracking, FromTracker, Lost, Ready, Track
 from share.estimator.result import TrackResult
 from share.geometry.camera import Rig
 from share.run.companion import END, Companion, Inbox

@@ -12,8 +12,9 @@ from edge_sim import MS, ModelRun, Person, Town, walls
 from hellos import hello_of
 
 from share.config import AgentNeeds, Config, ControlConfig, EdgeConfig, GraphConfig
-from share.core import edge as ed
+from share.core import edge_events as ed
 from share.core import events as ev
+from share.core.edge import Edge
 from share.core.mapper import Mapper
 from share.core.steps import Query, Solve, Verify
 from share.geometry import se3
@@ -157,13 +158,13 @@ def hello(name: str = "ann", run_id: int = 1) -> m.Hello:
     return hello_of(name, run_id)
 
 
-def tell(edge: ed.Edge, run_id: int, message: m.Message, now_ms: float = 0) -> list[ed.Effect]:
+def tell(edge: Edge, run_id: int, message: m.Message, now_ms: float = 0) -> list[ed.Effect]:
     frames = [bytes(f) for f in encode(message)]
     return edge.handle(ed.Received(m.peer_id(run_id), frames), round(now_ms * MS))
 
 
 def test_a_name_in_use_is_refused_until_its_holder_is_silent():
-    edge = ed.Edge(Config(), 7)
+    edge = Edge(Config(), 7)
     assert sent(tell(edge, 1, hello()), m.Welcome) == [m.Welcome(7, 0)]
     refused = tell(edge, 2, hello(run_id=2), 100)
     assert "in use" in sent(refused, m.Refused)[0].reason
@@ -172,7 +173,7 @@ def test_a_name_in_use_is_refused_until_its_holder_is_silent():
 
 
 def test_a_name_is_free_at_once_after_goodbye():
-    edge = ed.Edge(Config(), 7)
+    edge = Edge(Config(), 7)
     tell(edge, 1, hello())
     tell(edge, 1, m.Bye(), 10)
     assert sent(tell(edge, 2, hello(run_id=2), 20), m.Welcome)
@@ -180,7 +181,7 @@ def test_a_name_is_free_at_once_after_goodbye():
 
 def test_no_more_agents_than_agreed():
     config = Config()
-    edge = ed.Edge(replace(config, edge=replace(config.edge, max_agents=2)), 7)
+    edge = Edge(replace(config, edge=replace(config.edge, max_agents=2)), 7)
     tell(edge, 1, hello("a", 1))
     tell(edge, 2, hello("b", 2))
     assert "2 agents" in sent(tell(edge, 3, hello("c", 3)), m.Refused)[0].reason
@@ -189,7 +190,7 @@ def test_no_more_agents_than_agreed():
 
 
 def test_strangers_get_a_pong_and_nothing_else():
-    edge = ed.Edge(Config(), 7)
+    edge = Edge(Config(), 7)
     pong = sent(tell(edge, 5, m.Ping(3, 42), 9), m.Pong)
     assert pong == [m.Pong(3, 42, 9 * MS, 9 * MS, 7)]
     assert not sent(tell(edge, 5, m.Evaluation(0, 1.0, None)), m.Message)
@@ -197,7 +198,7 @@ def test_strangers_get_a_pong_and_nothing_else():
 
 
 def test_malformed_messages_are_counted_and_said_once():
-    edge = ed.Edge(Config(), 7)
+    edge = Edge(Config(), 7)
     tell(edge, 1, hello())
     records = []
     for k in range(1000):
@@ -211,7 +212,7 @@ def test_malformed_messages_are_counted_and_said_once():
 def test_a_keyframe_is_applied_once_and_in_order():
     both = town()
     both.walk(6)
-    edge, entries = ed.Edge(Config(), 7), both.keyframes("ann")[:4]
+    edge, entries = Edge(Config(), 7), both.keyframes("ann")[:4]
     tell(edge, 11, hello(run_id=11))
     acks = [sent(tell(edge, 11, entries[k]), m.Ack)[0] for k in (1, 0, 1, 3, 2)]
     assert [ack.next_keyframe for ack in acks] == [0, 2, 2, 2, 4]

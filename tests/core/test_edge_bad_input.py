@@ -10,9 +10,10 @@ from edge_sim import Person, Town, walls
 from hellos import hello_of
 
 from share.config import Config, EdgeConfig
-from share.core import edge as ed
+from share.core import edge_events as ed
 from share.core import events as ev
 from share.core.agent import Agent
+from share.core.edge import Edge
 from share.core.mapper import Mapper
 from share.core.peer import Known
 from share.core.steps import Query
@@ -32,7 +33,7 @@ def keyframe(id: int, cov: np.ndarray | None = None, view: View = EMPTY) -> Keyf
     return Keyframe(id, id - 1, 10**8 * id, np.eye(4), cov, np.eye(4), np.zeros(3), 0.0, view, id - 1)
 
 
-def tell(edge: ed.Edge, message: m.Message, peer: int = HELLO.run_id) -> list[ed.Effect]:
+def tell(edge: Edge, message: m.Message, peer: int = HELLO.run_id) -> list[ed.Effect]:
     return edge.handle(ed.Received(m.peer_id(peer), [bytes(f) for f in encode(message)]), 0)
 
 
@@ -51,7 +52,7 @@ def sent(effects: list, kind: type) -> list:
     ids=["pose", "covariance not positive", "covariance not finite", "place", "up", "uv"],
 )
 def test_numbers_that_are_none_stop_at_the_door(frame, value):
-    edge = ed.Edge(Config(), 7)
+    edge = Edge(Config(), 7)
     tell(edge, HELLO)
     view = View(np.zeros((2, 2)), np.ones((2, 3)), np.zeros((2, 32), np.uint8))
     frames = [bytearray(f) for f in encode(keyframe(0, view=view))]
@@ -67,7 +68,7 @@ def test_numbers_that_are_none_stop_at_the_door(frame, value):
 
 
 def test_a_number_that_is_used_again_changes_nothing():
-    edge = ed.Edge(Config(), 7)
+    edge = Edge(Config(), 7)
     tell(edge, HELLO)
     assert of(tell(edge, keyframe(0)), ed.Add)
     effects = tell(edge, replace(keyframe(0), stamp_ns=5, up=np.ones(3)))
@@ -76,14 +77,14 @@ def test_a_number_that_is_used_again_changes_nothing():
 
 
 def test_two_runs_of_one_name_whose_numbers_end_alike():
-    edge = ed.Edge(Config(), 8, known=[Known("ann-000b", HELLO, None, 0)])
+    edge = Edge(Config(), 8, known=[Known("ann-000b", HELLO, None, 0)])
     (join,) = of(tell(edge, replace(HELLO, run_id=0xB000B), 0xB000B), ed.Join)
     assert join.key == "ann-b000b"
     assert of(tell(edge, keyframe(0), 0xB000B), ed.Add)[0].key == "ann-b000b"
 
 
 def test_a_covariance_beyond_measure_is_bounded_and_said():
-    edge = ed.Edge(Config(), 7)
+    edge = Edge(Config(), 7)
     tell(edge, HELLO)
     effects = tell(edge, keyframe(0, 1e11 * np.eye(6)))
     assert np.allclose(of(effects, ed.Add)[0].keyframe.cov, 100 * np.eye(6))
@@ -149,7 +150,7 @@ def test_ten_thousand_keyframes_at_once_stay_bounded():
 
 def test_hello_at_once_when_the_link_is_back():
     """A new life of the edge is known by its welcome, not only by the answer to the next ping."""
-    agent, edge = Agent(HELLO, Config()), ed.Edge(Config(), 7)
+    agent, edge = Agent(HELLO, Config()), Edge(Config(), 7)
     hello = agent.handle(ev.Connected(), 0)
     assert sent(hello, m.Hello)
     (welcome,) = sent(tell(edge, HELLO), m.Welcome)
@@ -163,7 +164,7 @@ def test_hello_at_once_when_the_link_is_back():
 def test_who_is_not_greeted_yet_is_told_the_newest_correction_with_the_welcome():
     """Until then it counts revisions of our predecessor, and would not take it."""
     known = Known("ann-000b", HELLO, None, 0)
-    edge, mapper = ed.Edge(Config(), 8, known=[known]), Mapper(Config())
+    edge, mapper = Edge(Config(), 8, known=[known]), Mapper(Config())
     mapper.join("ann-000b", HELLO)
     tell(edge, m.Ping(1, 0))
     effects = edge.handle(ed.Found(tuple(mapper.add("ann-000b", keyframe(0)))), 0)

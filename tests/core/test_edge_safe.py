@@ -6,7 +6,8 @@ import numpy as np
 from hellos import hello_of
 
 from share.config import Config
-from share.core import edge as ed
+from share.core import edge_events as ed
+from share.core.edge import Edge
 from share.core.keeping import KeepKeyframe, KeepRun
 from share.core.peer import Foot, Known
 from share.geometry import se3
@@ -26,7 +27,7 @@ def keyframe(id: int, reference: int, forward_m: float = 0.2, stamp_ms: int | No
     return Keyframe(id, reference, stamp_ns, T, 1e-6 * np.eye(6), T, np.zeros(3), 0.0, EMPTY, id - 1)
 
 
-def tell(edge: ed.Edge, message: m.Message) -> list[ed.Effect]:
+def tell(edge: Edge, message: m.Message) -> list[ed.Effect]:
     return edge.handle(ed.Received(m.peer_id(11), [bytes(f) for f in encode(message)]), 0)
 
 
@@ -40,7 +41,7 @@ def of(effects: list[ed.Effect], kind: type) -> list:
 
 
 def test_nothing_is_acknowledged_before_it_is_kept() -> None:
-    edge = ed.Edge(Config(), 7, keeps=True)
+    edge = Edge(Config(), 7, keeps=True)
     (joined,) = of(tell(edge, HELLO), ed.Keep)
     assert isinstance(joined.changes[0], KeepRun)
     effects = tell(edge, keyframe(0, -1))
@@ -55,7 +56,7 @@ def test_nothing_is_acknowledged_before_it_is_kept() -> None:
 
 
 def test_several_kept_at_once_are_acknowledged_once() -> None:
-    edge = ed.Edge(Config(), 7, keeps=True)
+    edge = Edge(Config(), 7, keeps=True)
     tell(edge, HELLO)
     keeps = [of(tell(edge, keyframe(k, k - 1)), ed.Keep)[0] for k in range(3)]
     assert acks(edge.handle(ed.Kept(keeps[1].ticket), 0)) == [m.Ack(2, (2,))]
@@ -64,7 +65,7 @@ def test_several_kept_at_once_are_acknowledged_once() -> None:
 
 def test_a_known_run_goes_on_where_it_was() -> None:
     foot = Foot(4, 800 * MS)
-    edge = ed.Edge(Config(), 8, keeps=True, known=[Known("ann-000b", HELLO, foot, 5)])
+    edge = Edge(Config(), 8, keeps=True, known=[Known("ann-000b", HELLO, foot, 5)])
     effects = tell(edge, HELLO)
     (welcome,) = [decode([bytes(f) for f in e.frames]) for e in of(effects, ed.Send)]
     assert welcome == m.Welcome(8, 5)
@@ -76,7 +77,7 @@ def test_a_known_run_goes_on_where_it_was() -> None:
 
 
 def test_a_leap_begins_a_stretch_in_the_same_odom() -> None:
-    edge = ed.Edge(Config(), 7)
+    edge = Edge(Config(), 7)
     tell(edge, HELLO)
     tell(edge, keyframe(0, -1))
     effects = tell(edge, keyframe(1, 0, forward_m=100.0))
@@ -91,7 +92,7 @@ def test_a_leap_begins_a_stretch_in_the_same_odom() -> None:
 
 
 def test_far_is_no_leap_if_time_enough_has_passed() -> None:
-    edge = ed.Edge(Config(), 7)
+    edge = Edge(Config(), 7)
     tell(edge, HELLO)
     tell(edge, keyframe(0, -1))
     (add,) = of(tell(edge, keyframe(1, 0, forward_m=20.0, stamp_ms=10_000)), ed.Add)
@@ -99,7 +100,7 @@ def test_far_is_no_leap_if_time_enough_has_passed() -> None:
 
 
 def test_a_reference_that_is_not_the_last_is_said_and_left_out() -> None:
-    edge = ed.Edge(Config(), 7)
+    edge = Edge(Config(), 7)
     tell(edge, HELLO)
     tell(edge, keyframe(0, -1))
     tell(edge, keyframe(1, 0))
@@ -112,7 +113,7 @@ def test_a_reference_that_is_not_the_last_is_said_and_left_out() -> None:
 
 
 def test_a_runs_number_is_not_shared_by_two_names() -> None:
-    edge = ed.Edge(Config(), 7)
+    edge = Edge(Config(), 7)
     tell(edge, HELLO)
     effects = tell(edge, hello_of("eve", 11))
     (refused,) = [decode([bytes(f) for f in e.frames]) for e in of(effects, ed.Send)]

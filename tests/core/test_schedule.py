@@ -9,7 +9,8 @@ from hellos import hello_of, rig_of
 from share.config import Config, ControlConfig, EdgeConfig
 from share.control.policies import POLICIES
 from share.control.qoe import Needs, qoe
-from share.core import edge as ed
+from share.core import edge_events as ed
+from share.core.edge import Edge
 from share.core.gating import Gating
 from share.geometry import se3
 from share.types import AgentKind
@@ -20,13 +21,13 @@ MS = 1_000_000
 CONTROL = ControlConfig(ar_target=0.8)
 
 
-def welcomed(policy: str, kind: AgentKind = AgentKind.AR) -> ed.Edge:
-    edge = ed.Edge(Config(edge=EdgeConfig(policy=policy), control=CONTROL), session=7)
+def welcomed(policy: str, kind: AgentKind = AgentKind.AR) -> Edge:
+    edge = Edge(Config(edge=EdgeConfig(policy=policy), control=CONTROL), session=7)
     edge.handle(ed.Received(b"a", encode(hello_of("ann", 5, kind))), 0)
     return edge
 
 
-def rates(edge: ed.Edge, delay_ms: float, error_cm: float | None, now_ms: int) -> list[float]:
+def rates(edge: Edge, delay_ms: float, error_cm: float | None, now_ms: int) -> list[float]:
     told = encode(m.Evaluation(0, delay_ms, error_cm))
     effects = edge.handle(ed.Received(b"a", told), now_ms * MS)
     said = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.Send)]

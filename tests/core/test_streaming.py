@@ -10,10 +10,10 @@ import pytest
 from hellos import hello_of
 
 from share.config import Config, EdgeConfig, StreamConfig
-from share.core import afar
-from share.core import edge as ed
+from share.core import edge_events as ed
 from share.core import events as ev
 from share.core.agent import Agent
+from share.core.edge import Edge
 from share.core.tracking_edge import TrackingEdge
 from share.errors import UsageError
 from share.geometry import se3
@@ -46,10 +46,10 @@ class Wire:
     takes: bool = True  # the link
     cut: bool = False
     agent: Agent = field(default_factory=lambda: Agent(HELLO, CONFIG))
-    edge: ed.Edge = field(default_factory=lambda: TrackingEdge(CONFIG, 1))
+    edge: Edge = field(default_factory=lambda: TrackingEdge(CONFIG, 1))
     effects: list[ev.AgentEffect] = field(default_factory=list)
     told: list[dict] = field(default_factory=list)
-    trackers: list[afar.BeginTracking | afar.EndTracking] = field(default_factory=list)
+    trackers: list[ed.BeginTracking | ed.EndTracking] = field(default_factory=list)
     tracked: list[Frame] = field(default_factory=list)
     _due: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
     _busy_ms: float = 0.0
@@ -83,21 +83,21 @@ class Wire:
                     self.later(1, lambda copy=copy: self.to_agent(ev.Received(copy)))
                 case ed.Record():
                     self.told.append(effect.fields)
-                case afar.BeginTracking():
+                case ed.BeginTracking():
                     self.trackers.append(effect)
                     self._life = effect.life
-                    ready = afar.Ready(effect.key, effect.life)
+                    ready = ed.Ready(effect.key, effect.life)
                     self.later(self.start_ms, lambda ready=ready: self.to_edge(ready))
-                case afar.EndTracking():
+                case ed.EndTracking():
                     self.trackers.append(effect)
-                case afar.Track():
+                case ed.Track():
                     self._track(effect)
 
-    def _track(self, what: afar.Track) -> None:
+    def _track(self, what: ed.Track) -> None:
         self.tracked.append(what.frame)
         self._busy_ms = max(self._busy_ms, self.now_ms) + self.track_ms
         answer = m.Tracked(what.frame.index, what.frame.stamp_ns, TrackState.OK, pose(what.frame.index))
-        done = afar.Answered(what.key, self._life, answer)
+        done = ed.Answered(what.key, self._life, answer)
         self.later(self._busy_ms - self.now_ms, lambda: self.to_edge(done))
 
     def later(self, ms: float, what: Callable[[], None]) -> None:
@@ -214,7 +214,7 @@ def test_a_tracker_that_dies_costs_what_it_had_and_another_begins() -> None:
     wire.play(3, every_ms=10)
     wire.run(900)
     assert len(wire.of(ev.FrameDone)) == 1
-    wire.to_edge(afar.Lost(wire.trackers[0].key, 0, "was ended by SIGKILL"))
+    wire.to_edge(ed.Lost(wire.trackers[0].key, 0, "was ended by SIGKILL"))
     assert wire.trackers[-1].life == 1
     assert [t["reason"] for t in wire.told if t["event"] == "tracking lost"] == [
         "its process was ended by SIGKILL; odometry begins anew"
@@ -231,7 +231,7 @@ def test_a_tracker_that_dies_costs_what_it_had_and_another_begins() -> None:
 def test_a_tracker_that_cannot_begin_is_said_to_its_agent() -> None:
     wire = Wire(start_ms=1e6)
     wire.run(100)
-    wire.to_edge(afar.Lost(wire.trackers[0].key, 0, "ended with exit code 1"))
+    wire.to_edge(ed.Lost(wire.trackers[0].key, 0, "ended with exit code 1"))
     wire.run(200)
     (fail,) = wire.of(ev.Fail)
     assert isinstance(fail.error, UsageError)
@@ -246,14 +246,14 @@ def test_a_goodbye_waits_for_the_last_pose_and_ends_the_tracker() -> None:
     wire.run(1500)
     assert len(wire.of(ev.FrameDone)) == 4
     assert wire.of(ev.Stop)
-    assert isinstance(wire.trackers[-1], afar.EndTracking)
+    assert isinstance(wire.trackers[-1], ed.EndTracking)
     assert wire.told[-1]["event"] == "left"
 
 
 @pytest.mark.parametrize(
     ("edge", "streams", "said"),
     [
-        (ed.Edge(Config(), 1), True, "this edge tracks nobody: start it with --policy streamed"),
+        (Edge(Config(), 1), True, "this edge tracks nobody: start it with --policy streamed"),
         (
             TrackingEdge(CONFIG, 1),
             False,
@@ -261,7 +261,7 @@ def test_a_goodbye_waits_for_the_last_pose_and_ends_the_tracker() -> None:
         ),
     ],
 )
-def test_who_does_not_fit_is_refused(edge: ed.Edge, streams: bool, said: str) -> None:
+def test_who_does_not_fit_is_refused(edge: Edge, streams: bool, said: str) -> None:
     wire = Wire(edge=edge, agent=Agent(replace(HELLO, streams=streams), CONFIG))
     wire.run(200)
     (fail,) = wire.of(ev.Fail)

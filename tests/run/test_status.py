@@ -16,7 +16,8 @@ from hellos import hello_of
 from prometheus_client.parser import text_string_to_metric_families
 
 from share.config import Config
-from share.core.edge import Edge, Join, Received
+from share.core.edge import Edge
+from share.core.edge_events import Join, Received
 from share.core.mapper import Mapper
 from share.errors import TransportError, UsageError
 from share.run import status_metrics, web
