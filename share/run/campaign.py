@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Protocol
 
 from share import process
-from share.config import Config
+from share.config import Config, load
 from share.errors import DataError, ShareError, UsageError
 from share.io.pool import Pool
 from share.io.session import Session
@@ -100,9 +100,12 @@ def _play(planned: Planned, show: Callable[[Progress], None]) -> Came:
 
 
 def _as_planned(planned: Planned) -> Trial:
+    """A setting that the run did not know yet counts as it is shipped."""
     trial = read_trial(planned.out)
-    played = trial.session.folder.resolve(), trial.terms, (planned.out / SETTINGS).read_text()
-    wanted = planned.session.folder.resolve(), planned.terms, settings_of(planned.config, planned.terms.seed)
+    text = settings_of(planned.config, planned.terms.seed)
+    settings = load((planned.out / SETTINGS).read_text(), str(planned.out / SETTINGS))
+    played = trial.session.folder.resolve(), trial.terms, settings
+    wanted = planned.session.folder.resolve(), planned.terms, load(text)
     if played != wanted:
         raise UsageError(f"{trial.folder}: was played on other terms or settings; give another --out")
     return trial

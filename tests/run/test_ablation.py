@@ -10,6 +10,7 @@ from share.config import Config, from_mapping
 from share.errors import UsageError
 from share.io.session import Session
 from share.run.ablation import plan
+from share.run.campaign import go_through
 from share.run.play import Terms
 from share.run.trial import read_trial, settings_of
 
@@ -44,6 +45,29 @@ def test_each_seed_draws_anew_and_settings_come_back_as_they_were():
     assert first == Config()
     assert third.control.gate_seed == first.control.gate_seed + 3
     assert third.control.random_seed == first.control.random_seed + 3
+
+
+def test_a_run_of_before_a_setting_was_there_is_taken(tmp_path):
+    made = session(str(tmp_path / "room"))
+    made.folder.mkdir()
+    (made.folder / "session.yaml").write_text(
+        "schema: 1\nagents: {ann: {kind: ar, sensors: stereo, rate_hz: 15}}"
+    )
+    (one,) = plan([made], ("share",), [0], TERMS, tmp_path / "runs")
+    one.out.mkdir(parents=True)
+    record = {"session": str(made.folder), "policy": "share", "link": "wifi5", "seed": 0}
+    (one.out / "run.json").write_text(json.dumps(record))
+    settings = yaml.safe_load(settings_of(Config(), 0))
+    del settings["agent"]["error_model"]
+    (one.out / "config.yaml").write_text(yaml.safe_dump(settings))
+    ((planned, came),) = go_through([one], lambda number, now: None)
+    assert planned is one
+    assert came.folder == one.out
+
+    settings["control"]["kp"] = 7.0
+    (one.out / "config.yaml").write_text(yaml.safe_dump(settings))
+    with pytest.raises(UsageError, match="was played on other terms or settings"):
+        list(go_through([one], lambda number, now: None))
 
 
 @pytest.mark.parametrize("text", ["{}", "[]", "{", json.dumps({"policy": "share"})])
