@@ -23,8 +23,9 @@ figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #555; 
 def page(title: str, text: str, pictures: Mapping[str, Path]) -> str:
     """HTML. text: Markdown, whose own HTML is shown, not taken; pictures: PNG files by what is below each."""
     from markdown import markdown
+    from markdown.extensions.tables import TableExtension  # by its class, so that a freezer sees it
 
-    body = markdown(html.escape(text, quote=False), extensions=["tables"])
+    body = markdown(html.escape(text, quote=False), extensions=[TableExtension()])
     figures = "\n".join(_figure(caption, path) for caption, path in pictures.items())
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
