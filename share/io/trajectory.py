@@ -24,9 +24,15 @@ class Trajectory(NamedTuple):
     T: F64
 
     @property
+    def way(self) -> F64:
+        """m (N,), how far it has gone by each pose; [0] without any."""
+        steps = np.linalg.norm(np.diff(self.T[:, :3, 3], axis=0), axis=1)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    @property
     def metres(self) -> float:
         """The length of its way."""
-        return float(np.linalg.norm(np.diff(self.T[:, :3, 3], axis=0), axis=1).sum())
+        return float(self.way[-1])
 
 
 def format_pose(stamp_ns: int, T: F64) -> str:

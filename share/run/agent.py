@@ -203,10 +203,7 @@ class AgentRun:
         self._log.add_result(result.new_stretch, result.sound, result.waits)
         self._waits = result.waits
         if result.keyframe:
-            footing = self._tracker.footing()
-            candidate = self._tracker.keyframe(frame)
-            self._post(ev.KeyframeMade(tracked, candidate))
-            self._errors.keyframe(frame, footing, candidate)
+            self._post(ev.KeyframeMade(tracked, self._errors.keyframe(frame, self._tracker)))
         self._log.cpu_s += time.thread_time() - cpu
 
     def _post(self, event: ev.AgentEvent) -> None:

@@ -14,7 +14,14 @@ from share.evaluator.features import features
 from share.evaluator.model import Estimate, Network, estimate
 from share.metrics.latency import summary
 from share.metrics.local_error import LocalError
-from share.types import Candidate, Footing, Frame
+from share.types import U8, Candidate, Footing, Frame
+
+
+class Tracker(Protocol):
+    """What of either tracker is asked here."""
+
+    def footing(self) -> Footing: ...
+    def keyframe(self, frame: Frame) -> Candidate: ...
 
 
 class Errors(Protocol):
@@ -23,8 +30,8 @@ class Errors(Protocol):
     def after(self, stamp_ns: int, result: TrackResult) -> float | None:
         """cm, after another frame; None where it is not known."""
 
-    def keyframe(self, frame: Frame, footing: Footing, candidate: Candidate) -> None:
-        """The frame is a keyframe. Returns at once."""
+    def keyframe(self, frame: Frame, tracker: Tracker) -> Candidate:
+        """Has `tracker` make the frame just tracked a keyframe, and looks at what it has to know of it."""
 
     def close(self) -> None: ...
 
@@ -38,8 +45,8 @@ class Unknown:
     def after(self, stamp_ns: int, result: TrackResult) -> float | None:
         return None
 
-    def keyframe(self, frame: Frame, footing: Footing, candidate: Candidate) -> None:
-        pass
+    def keyframe(self, frame: Frame, tracker: Tracker) -> Candidate:
+        return tracker.keyframe(frame)
 
     def close(self) -> None:
         pass
@@ -58,36 +65,44 @@ class ByTruth(Unknown):
         return self._error.after(stamp_ns, result.T_odom_body, result.new_stretch)
 
 
+@dataclass(frozen=True, eq=False)
+class _Job:
+    image: U8
+    footing: Footing
+    sigma_cm: float
+
+
 class AtOnce(Unknown):
-    """The error model, where time is drawn (`share.run.virtual`): it has answered when `keyframe` returns."""
+    """The error model, where time is drawn (`share.run.virtual`): it has answered when `keyframe` returns.
+    What it said last holds until it says something else."""
 
     def __init__(self, network: Network) -> None:
         self._network, self._doubt = network, Doubt()
         self._newest: Estimate | None = None
 
     def after(self, stamp_ns: int, result: TrackResult) -> float | None:
-        return None if self._newest is None or result.T_odom_body is None else self._newest.error_cm
+        newest = self._newest
+        return None if newest is None or result.T_odom_body is None else newest.error_cm
 
-    def keyframe(self, frame: Frame, footing: Footing, candidate: Candidate) -> None:
-        sigma_cm = self._doubt.after(frame.stamp_ns, candidate)
-        self._newest = estimate(self._network, features(frame.image0, footing, sigma_cm))
+    def keyframe(self, frame: Frame, tracker: Tracker) -> Candidate:
+        footing, candidate = tracker.footing(), tracker.keyframe(frame)
+        self._take(_Job(frame.image0, footing, self._doubt.after(frame.stamp_ns, candidate)))
+        return candidate
+
+    def _take(self, job: _Job) -> None:
+        self._newest = self._estimate(job)
+
+    def _estimate(self, job: _Job) -> Estimate:
+        return estimate(self._network, features(job.image, job.footing, job.sigma_cm))
 
 
-@dataclass(frozen=True, eq=False)
-class _Job:
-    frame: Frame
-    footing: Footing
-    sigma_cm: float
-
-
-class ByModel:
+class ByModel(AtOnce):
     """The error model, in a thread of its own. A keyframe that comes while it is busy waits; one more, and
-    the older is left out (policy drop_estimate). What it said last holds until it says something else."""
+    the older is left out (policy drop_estimate)."""
 
     def __init__(self, network: Network, say: Callable[[str], None]) -> None:
-        self._network, self._say = network, say
-        self._doubt = Doubt()
-        self._newest: Estimate | None = None
+        super().__init__(network)
+        self._say = say
         self._waits: _Job | None = None
         self._wake = threading.Condition()
         self._ended = False
@@ -96,12 +111,7 @@ class ByModel:
         self._thread = threading.Thread(target=self._work, name="error model", daemon=True)
         self._thread.start()
 
-    def after(self, stamp_ns: int, result: TrackResult) -> float | None:
-        newest = self._newest
-        return None if newest is None or result.T_odom_body is None else newest.error_cm
-
-    def keyframe(self, frame: Frame, footing: Footing, candidate: Candidate) -> None:
-        job = _Job(frame, footing, self._doubt.after(frame.stamp_ns, candidate))
+    def _take(self, job: _Job) -> None:
         with self._wake:
             self._dropped += self._waits is not None
             self._waits = job
@@ -121,8 +131,7 @@ class ByModel:
         while (job := self._next()) is not None:
             began = time.thread_time()
             try:
-                told = features(job.frame.image0, job.footing, job.sigma_cm)
-                found = estimate(self._network, told)
+                found = self._estimate(job)
             except Exception as error:  # a network is a file from somewhere; odometry goes on without it
                 self._newest = None
                 self._say(f"the error model has failed and is left alone: {error}")

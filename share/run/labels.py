@@ -20,6 +20,7 @@ from share.io.session import Session, read_session
 from share.io.source import Source, open_source
 from share.metrics.local_error import WINDOW_S, LocalError
 from share.process import prepare
+from share.run.campaign import check_names
 from share.run.pipeline import frames_of, tracker_for
 from share.train.label_file import Labels, read_labels, write_labels
 from share.train.spoil import KINDS, Spell, draw, spoiled
@@ -40,11 +41,10 @@ class Job:
 
 def plan(sessions: Sequence[Session], runs: int, seed: int, out: Path) -> list[Job]:
     """Everything, done or not. Raises UsageError where there is no truth, or two sessions have one name."""
-    names = [session.folder.resolve().name for session in sessions]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise UsageError(f"two sessions are called {twice[0]}; rename a folder")
+    check_names(sessions)
     jobs = []
-    for session, name in zip(sessions, names, strict=True):
+    for session in sessions:
+        name = session.folder.resolve().name
         for agent in session.agents:
             if not (session.folder / "truth" / f"{agent}.tum").is_file():
                 raise UsageError(f"{session.folder}: has no truth/{agent}.tum to tell how wrong it is")

@@ -81,7 +81,7 @@ def _over_time(folder: Path, trials: Sequence[Trial]) -> dict[str, Path]:
     }
     units = ["" if title.startswith("QoE") else "Hz" for title in panels]
     draw_lines(folder / "over-time.png", panels, "s", units)
-    done = {trial.terms.policy: merges(trial).metres for trial in same}
+    done = {trial.terms.policy: merges(trial) for trial in same}
     counted = {name: (metres, np.arange(1.0, len(metres) + 1)) for name, metres in done.items()}
     draw_lines(folder / "merges.png", {f"merges on {where}": counted}, "m that all agents have gone", [""])
     return {

@@ -24,13 +24,6 @@ class Trace:
     rate_hz: F64
 
 
-@dataclass(frozen=True, eq=False)
-class Merges:
-    """metres (M,): how far all agents together had gone by each of M merges."""
-
-    metres: F64
-
-
 def traces(trial: Trial) -> dict[str, Trace]:
     """By agent. Raises DataError on damaged files."""
     series = read_json(trial.folder / "edge" / "edge.json")["series"]
@@ -40,18 +33,16 @@ def traces(trial: Trial) -> dict[str, Trace]:
     }
 
 
-def merges(trial: Trial) -> Merges:
-    """Raises DataError on damaged files."""
+def merges(trial: Trial) -> F64:
+    """How far all agents together had gone by each merge, m (M,). Raises DataError on damaged files."""
     events = read_json_lines(trial.folder / "edge" / "events.jsonl")
     began = next((e["t_s"] for e in events if e["event"] == "joined the edge"), 0.0)
     done_s = np.array([e["t_s"] - began for e in events if e["event"] in _MERGES], float)
     gone = np.zeros(len(done_s))
     for name in trial.session.agents:
-        stamps_ns, T = read_tum(trial.session.folder / "truth" / f"{name}.tum")
-        steps = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
-        way = np.concatenate([[0.0], np.cumsum(steps)])
-        gone += np.interp(done_s, (stamps_ns - stamps_ns[0]) * 1e-9, way)
-    return Merges(gone)
+        truth = read_tum(trial.session.folder / "truth" / f"{name}.tum")
+        gone += np.interp(done_s, (truth.stamps_ns - truth.stamps_ns[0]) * 1e-9, truth.way)
+    return gone
 
 
 def _numbers(values: list[float | None]) -> F64:

@@ -95,16 +95,13 @@ def _track(source: Source, settings: Config, clock_offset_ns: int, told_by: str)
     seen = []
     for frame in frames_of(source, settings, SequencerCounters()):
         result = tracker.track(frame)
-        error_cm, candidate = errors.after(frame.stamp_ns, result), None
-        if result.keyframe:
-            footing, candidate = tracker.footing(), tracker.keyframe(frame)
-            errors.keyframe(frame, footing, candidate)
+        error_cm = errors.after(frame.stamp_ns, result)
         seen.append(
             Seen(
                 at_ns=frame.stamp_ns - clock_offset_ns,
                 T_odom_body=result.T_odom_body,
                 error_cm=error_cm,
-                candidate=candidate,
+                candidate=errors.keyframe(frame, tracker) if result.keyframe else None,
                 stamp_ns=frame.stamp_ns,
                 state=result.state,
                 breaks=result.new_stretch,

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from share.errors import UsageError
 from share.evaluator.model import Network
 from share.io.network import deep_of, open_network
@@ -32,8 +30,7 @@ class Assembly:
     @property
     def test(self) -> Rows:
         """Keyframes that nothing was learnt from."""
-        runs = self.collection.parts["test"]
-        return Rows(self.collection.table, self.deep).take(np.isin(self.collection.table.run, runs))
+        return Rows(self.collection.table, self.deep).take(self.collection.of("test"))
 
 
 def assemble(fit: Path, labels: Path, base: Path) -> Assembly:

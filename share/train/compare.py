@@ -51,7 +51,7 @@ def of_rivals(
 ) -> list[Score]:
     """Each taught on the rooms that ours is taught on, and tried where it is tried."""
     rows = Rows(collection.table, deep)
-    parts = {part: rows.take(np.isin(collection.table.run, runs)) for part, runs in collection.parts.items()}
+    parts = {part: rows.take(collection.of(part)) for part in collection.parts}
     out = [_mean(parts["learn"], parts["test"])]
     for name, rival in RIVALS.items():
         say(name)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from share.columns import Columns
 from share.errors import UsageError
@@ -43,12 +44,10 @@ class Collection:
     table: Table
     parts: dict[str, I64]
 
-    def part(self, name: str) -> Table:
-        return self.table.take(np.isin(self.table.run, self.parts[name]))
-
-    @property
-    def group(self) -> I64:
-        return groups(self.abouts)
+    def of(self, part: str) -> NDArray[np.bool_]:
+        """Which keyframes (N,) of the table are."""
+        out: NDArray[np.bool_] = np.isin(self.table.run, self.parts[part])
+        return out
 
 
 def collect(folder: Path, seed: int) -> Collection:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -55,21 +54,18 @@ class _Scale:
 
     def __init__(self, deep: F32, collection: Collection) -> None:
         self._deep, self._collection = deep, collection
-        learn = self._rows("learn")
+        learn = collection.of("learn")
         self.deep = _moments(deep[learn])
         self.scalars = _moments(collection.table.scalars[learn])
 
     def inputs(self, part: str) -> Inputs:
-        rows, table = self._rows(part), self._collection.table
+        rows, table = self._collection.of(part), self._collection.table
         return Inputs(
             _scaled(self._deep[rows], *self.deep),
             table.psd[rows],
             _scaled(table.scalars[rows], *self.scalars),
             table.log_error[rows],
         )
-
-    def _rows(self, part: str) -> Any:
-        return np.isin(self._collection.table.run, self._collection.parts[part])
 
 
 def _moments(x: F32) -> tuple[F32, F32]:

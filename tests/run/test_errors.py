@@ -18,6 +18,14 @@ CANDIDATE = Candidate(np.eye(4), np.eye(4), np.zeros((6, 6)), np.zeros(3), 0.0, 
 TRACKED, LOST = TrackResult(TrackState.OK, np.eye(4)), TrackResult(TrackState.LOST, None)
 
 
+class Tracker:
+    def footing(self):
+        return STANDS_ON
+
+    def keyframe(self, frame):
+        return CANDIDATE
+
+
 class Network:
     """Says that the error is as many cm as the picture is bright; waits until it may."""
 
@@ -53,7 +61,7 @@ def test_what_was_said_last_holds():
     network.may.set()
     errors = ByModel(network, said.append)
     assert errors.after(0, TRACKED) is None
-    errors.keyframe(frame(3), STANDS_ON, CANDIDATE)
+    errors.keyframe(frame(3), Tracker())
     until(lambda: errors.after(1, TRACKED) is not None)
     assert errors.after(1, TRACKED) == pytest.approx(3)
     assert errors.after(2, LOST) is None  # there is no pose that could be wrong
@@ -67,10 +75,10 @@ def test_who_is_busy_leaves_the_older_out():
     network = Network()
     errors = ByModel(network, lambda text: None)
     began = time.monotonic()
-    errors.keyframe(frame(1), STANDS_ON, CANDIDATE)
+    errors.keyframe(frame(1), Tracker())
     until(lambda: network.seen == [1.0])  # it is at work, and waits
     for brightness in (2, 3, 4):
-        errors.keyframe(frame(brightness), STANDS_ON, CANDIDATE)
+        errors.keyframe(frame(brightness), Tracker())
     assert time.monotonic() - began < 2
     network.may.set()
     until(lambda: errors.after(1, TRACKED) == pytest.approx(4))
@@ -83,12 +91,12 @@ def test_a_network_that_fails_is_left_alone_and_said_so():
     network, said = Network(), []
     network.may.set()
     errors = ByModel(network, said.append)
-    errors.keyframe(frame(5), STANDS_ON, CANDIDATE)
+    errors.keyframe(frame(5), Tracker())
     until(lambda: errors.after(1, TRACKED) is not None)
-    errors.keyframe(frame(250), STANDS_ON, CANDIDATE)
+    errors.keyframe(frame(250), Tracker())
     until(lambda: said)
     assert said == ["the error model has failed and is left alone: too bright"]
-    errors.keyframe(frame(6), STANDS_ON, CANDIDATE)
+    errors.keyframe(frame(6), Tracker())
     assert errors.after(2, TRACKED) is None
     errors.close()
 
@@ -98,6 +106,6 @@ def test_in_virtual_time_it_has_answered_at_once():
     network.may.set()
     errors = AtOnce(network)
     assert errors.after(0, TRACKED) is None
-    errors.keyframe(frame(7), STANDS_ON, CANDIDATE)
+    errors.keyframe(frame(7), Tracker())
     assert errors.after(1, TRACKED) == pytest.approx(7)
     assert errors.after(1, LOST) is None

@@ -50,4 +50,4 @@ def test_what_an_agent_was_told_over_time(trial):
 
 
 def test_merges_lie_where_all_had_gone_by_then(trial):
-    assert merges(trial).metres.tolist() == pytest.approx([2 * 1.5, 4 * 1.5, 15.0])
+    assert merges(trial).tolist() == pytest.approx([2 * 1.5, 4 * 1.5, 15.0])
