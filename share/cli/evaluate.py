@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
+from share.cli.playing import check_all, of_many, played
 from share.cli.progress import LiveLine
 from share.cli.run_table import table
 from share.cli.sweep import sweep
 from share.cli.terms import on_terms, settings
 from share.config import POLICIES
-from share.errors import ShareError, UsageError
+from share.errors import UsageError
 
 if TYPE_CHECKING:
     from share.metrics.figures import RunFigures
-    from share.run.play import Progress
     from share.run.trial import Trial
 
 BASE = "covins-g"  # what the others are told as a part of
@@ -122,14 +122,7 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, as_json: bool) -> None:
     help="May be repeated.  [default: all that share a map]",
 )
 @on_terms
-@click.option("--seeds", type=click.IntRange(1), default=1, show_default=True, help="How many: 0, 1, …")
-@click.option(
-    "--workers",
-    type=click.IntRange(1, 64),
-    default=1,
-    show_default=True,
-    help="Sessions at a time (--virtual).",
-)
+@of_many
 @options.config
 @click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path))
 def ablation(
@@ -155,35 +148,19 @@ def ablation(
     from share.io.files import writable_dir
     from share.io.session import read_session
     from share.run.ablation import plan
-    from share.run.campaign import go_through, side_by_side
+    from share.run.campaign import side_by_side
     from share.run.figures import figures
     from share.run.play import Terms
 
     policies = chosen or tuple(policy for policy in POLICIES if policy != "streamed")
-    opened, live = [read_session(folder) for folder in sessions], LiveLine()
+    opened = [read_session(folder) for folder in sessions]
     config = settings(config_file, told, opened)
     planned = plan(opened, policies, range(seeds), Terms("", **told), out / "runs", config)
     writable_dir(out)
-    played: dict[Path, Trial] = {}
-    failed: list[str] = []
-
-    def show(number: int, now: Progress | None) -> None:
-        name = planned[number].out.name
-        live.write(f"{number + 1} of {len(planned)}: {name}  {now or ''}")
-
-    for one, came in go_through(planned, show, side_by_side(workers, len(opened))):
-        if isinstance(came, ShareError):
-            failed.append(one.out.name)
-            live.end()
-            click.echo(f"share: {one.out.name}: {came}", err=True)
-        else:
-            played[one.out] = came
-    live.end()
-    trials = [played[one.out] for one in planned if one.out in played]
+    trials = list(played(planned, side_by_side(workers, len(opened)), lambda one: one.out.name).values())
     if trials:
         _write(out, [figures(trial) for trial in trials], trials)
-    if failed:
-        raise ShareError(f"{len(failed)} of {len(planned)} runs failed; the same command plays them again")
+    check_all(len(trials), len(planned))
 
 
 def _write(out: Path, found: list[RunFigures], trials: list[Trial]) -> None:

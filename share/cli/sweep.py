@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
-from share.cli.progress import LiveLine
+from share.cli.playing import check_all, of_many, played
 from share.cli.terms import on_terms, settings
 from share.config import POLICIES
-from share.errors import ShareError, UsageError
+from share.errors import UsageError
 
 if TYPE_CHECKING:
     from share.metrics.figures import RunFigures
-    from share.run.play import Progress
     from share.run.sweep import Axis, Point
 
 _HEAT = ("AR latency", "AR ATE in the map", "merges a metre", "AR QoE")
@@ -36,14 +35,7 @@ _HEAT = ("AR latency", "AR ATE in the map", "merges a metre", "AR QoE")
 )
 @click.option("--policy", type=click.Choice(POLICIES), default=POLICIES[0], show_default=True)
 @on_terms
-@click.option("--seeds", type=click.IntRange(1), default=1, show_default=True, help="How many: 0, 1, …")
-@click.option(
-    "--workers",
-    type=click.IntRange(1, 64),
-    default=1,
-    show_default=True,
-    help="Sessions at a time (--virtual).",
-)
+@of_many
 @click.option("--scheduler", metavar="tcp://H:P", help="Of a dask cluster whose workers play (--virtual).")
 @options.config
 @click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path))
@@ -73,37 +65,23 @@ def sweep(
     from share.io.cluster import Cluster
     from share.io.files import writable_dir
     from share.io.session import read_session
-    from share.run.campaign import go_through, side_by_side
+    from share.run.campaign import side_by_side
     from share.run.figures import figures
     from share.run.play import Terms
     from share.run.sweep import Axis, drawn, grid, planned
 
     axes = [Axis.parse(text) for text in said]
     points = grid(axes) if count is None else drawn(axes, count, seed=0)
-    opened, live = [read_session(folder) for folder in sessions], LiveLine()
+    opened = [read_session(folder) for folder in sessions]
     config = settings(config_file, told, opened)
     runs = planned(opened, axes, points, range(seeds), Terms(policy, **told), out / "runs", config)
     writable_dir(out)
     at = {one.out: point for one, point in runs}
-
-    def show(number: int, now: Progress | None) -> None:
-        live.write(f"{number + 1} of {len(runs)}: {', '.join(at[runs[number][0].out])}  {now or ''}")
-
     players = Cluster(scheduler) if scheduler else side_by_side(workers, len(opened))
-    found: dict[Path, RunFigures] = {}
-    failed = 0
-    for one, came in go_through([one for one, _ in runs], show, players):
-        if isinstance(came, ShareError):
-            failed += 1
-            live.end()
-            click.echo(f"share: {one.out.name}: {came}", err=True)
-        else:
-            found[one.out] = figures(came)
-    live.end()
-    if found:
-        _write(out, axes, [(point, found[one.out]) for one, point in runs if one.out in found])
-    if failed:
-        raise ShareError(f"{failed} of {len(runs)} runs failed; the same command plays them again")
+    trials = played([one for one, _ in runs], players, lambda one: ", ".join(at[one.out]))
+    if trials:
+        _write(out, axes, [(at[folder], figures(trial)) for folder, trial in trials.items()])
+    check_all(len(trials), len(runs))
 
 
 def _write(out: Path, axes: list[Axis], runs: list[tuple[Point, RunFigures]]) -> None:
