@@ -74,7 +74,7 @@ def check(options: argparse.Namespace) -> None:
 
 def checked(name: str, network: Network) -> Checked:
     rows = []
-    for stamp_ns, error_cm, _, features in keyframes(open_source(name), Config()):
+    for stamp_ns, error_cm, features in keyframes(open_source(name), Config()):
         if not np.isnan(error_cm):
             told = estimate(network, features)
             interval = told.error_cm, told.low_cm, told.high_cm

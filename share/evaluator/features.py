@@ -2,43 +2,67 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from share.evaluator.odometer import Lately
 from share.evaluator.psd import CELL_PX, CHANNELS, GRID, psd
+from share.evaluator.recent import RECENT, Recent
 from share.evaluator.scalars import NAMES, scalars
 from share.types import F32, U8, Footing, checked
 
 PICTURE_PX = 128  # across and down: the whole image, whatever its shape
+SHAPES = {
+    "picture": (PICTURE_PX, PICTURE_PX),
+    "psd": (CHANNELS, GRID[1], GRID[0]),
+    "scalars": (len(NAMES),),
+    "recent": (len(RECENT),),
+}
 _SMALL = (GRID[0] * CELL_PX, GRID[1] * CELL_PX)  # 320 x 240
+
+
+def kind_of(name: str) -> type[np.generic]:
+    """Of the numbers in this one of `SHAPES`."""
+    return np.uint8 if name == "picture" else np.float32
 
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """picture (128, 128) uint8, psd (3, 12, 16) and scalars (8,) float32."""
+    """picture (128, 128) uint8, psd (3, 12, 16), scalars (8,) and recent (26,) float32."""
 
     picture: U8
     psd: F32
     scalars: F32
+    recent: F32
 
     def __post_init__(self) -> None:
-        for name, shape, kind in (
-            ("picture", (PICTURE_PX, PICTURE_PX), np.uint8),
-            ("psd", (CHANNELS, GRID[1], GRID[0]), np.float32),
-            ("scalars", (len(NAMES),), np.float32),
-        ):
-            object.__setattr__(self, name, checked(name, getattr(self, name), shape, kind))
+        for name, shape in SHAPES.items():
+            object.__setattr__(self, name, checked(name, getattr(self, name), shape, kind_of(name)))
+
+    def named(self) -> dict[str, NDArray[Any]]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
-def features(image: U8, footing: Footing, sigma_cm: float) -> Features:
-    """Of a keyframe: its image of cam0 (H, W), what its pose stands on, and what `Doubt` says of it."""
-    small = _scaled(image, _SMALL)
-    spread = psd(small, footing, (image.shape[1], image.shape[0]))
-    return Features(_scaled(small, (PICTURE_PX, PICTURE_PX)), spread, scalars(small, footing, sigma_cm))
+class Observer:
+    """Of one agent, keyframe by keyframe."""
+
+    def __init__(self) -> None:
+        self._recent = Recent()
+
+    def features(self, stamp_ns: int, image: U8, footing: Footing, lately: Lately) -> Features:
+        """Of a keyframe: its image of cam0 (H, W), what its pose stands on, and what its tracker says itself
+        (`Odometer`)."""
+        small = _scaled(image, _SMALL)
+        spread = psd(small, footing, (image.shape[1], image.shape[0]))
+        now = scalars(small, footing, lately.sigma_cm)
+        picture = _scaled(small, SHAPES["picture"])
+        return Features(picture, spread, now, self._recent.after(stamp_ns, now, lately))
 
 
-def _scaled(image: U8, size: tuple[int, int]) -> U8:
+def _scaled(image: U8, size: tuple[int, ...]) -> U8:
     """Each pixel the mean of what it covers."""
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -19,8 +19,8 @@ _WIDER = 2.0  # times as wide, by logarithms, where the network has seen nothing
 
 class Network(Protocol):
     """As an onnxruntime.InferenceSession: inputs picture (N, 128, 128) uint8, psd (N, 3, 12, 16), scalars
-    (N, 8); outputs log_error (N, 3), of cm: expected, low, high; embedding (N, 64); distance (N,), from what
-    it has learnt on, 1 where it ends."""
+    (N, 8), recent (N, 26); outputs log_error (N, 3), of cm: expected, low, high; embedding (N, 64); distance
+    (N,), from what it has learnt on, 1 where it ends."""
 
     def get_inputs(self) -> Sequence[Any]: ...
     def run(self, names: Sequence[str], inputs: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]: ...
@@ -41,7 +41,7 @@ class Estimate:
 
 def estimate(network: Network, features: Features) -> Estimate:
     """Of one keyframe."""
-    inputs = {name: getattr(features, name)[None] for name in ("picture", "psd", "scalars")}
+    inputs = {name: value[None] for name, value in features.named().items()}
     log_error, embedding, distance = network.run(OUTPUTS, inputs)
     expected, low, high = log_error[0].tolist()
     strange = bool(distance[0] > 1)

@@ -29,7 +29,7 @@ _SURE_CM, _DECADES = 0.01, 4.0  # the tracker's own sigma: 0, and what makes 1
 
 def scalars(small: U8, footing: Footing, sigma_cm: float) -> F32:
     """(8,) as `NAMES`, each about 0 to 1. small (240, 320): the image, scaled. sigma_cm: what the tracker
-    says itself of its error (`Doubt`)."""
+    says itself of its error (`Odometer`)."""
     believed = int(footing.believed.sum())
     mean, deviation = _moments(small)
     _, laplacian = _moments(cv2.Laplacian(small, cv2.CV_16S))

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.errors import DataError
-from share.evaluator.psd import CHANNELS, GRID
-from share.evaluator.scalars import NAMES
+from share.evaluator.features import SHAPES
 from share.types import F32, U8
 
 if TYPE_CHECKING:
@@ -41,12 +40,8 @@ def deep_of(network: Network, pictures: U8) -> F32:
     out = []
     for begin in range(0, len(pictures), _BATCH):
         some = pictures[begin : begin + _BATCH]
-        nothing = {
-            "psd": np.zeros((len(some), CHANNELS, GRID[1], GRID[0]), np.float32),
-            "scalars": np.zeros((len(some), len(NAMES)), np.float32),
-        }
-        taken = {spec.name for spec in network.get_inputs()}
+        taken = {spec.name for spec in network.get_inputs()} - {"picture"}
         inputs: dict[str, NDArray[Any]] = {"picture": some}
-        inputs |= {name: value for name, value in nothing.items() if name in taken}
+        inputs |= {name: np.zeros((len(some), *SHAPES[name]), np.float32) for name in taken}
         out.append(np.asarray(network.run(["deep"], inputs)[0], np.float32))
     return np.concatenate(out) if out else np.zeros((0, 1280), np.float32)

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from share.estimator.result import TrackResult
-from share.evaluator.doubt import Doubt
-from share.evaluator.features import features
+from share.evaluator.features import Observer
 from share.evaluator.model import Estimate, Network, estimate
+from share.evaluator.odometer import Lately, Odometer
 from share.metrics.latency import summary
 from share.metrics.local_error import LocalError
 from share.types import U8, Candidate, Footing, Frame
@@ -67,9 +67,10 @@ class ByTruth(Unknown):
 
 @dataclass(frozen=True, eq=False)
 class _Job:
+    stamp_ns: int
     image: U8
     footing: Footing
-    sigma_cm: float
+    lately: Lately
 
 
 class AtOnce(Unknown):
@@ -77,7 +78,7 @@ class AtOnce(Unknown):
     What it said last holds until it says something else."""
 
     def __init__(self, network: Network) -> None:
-        self._network, self._doubt = network, Doubt()
+        self._network, self._odometer, self._observer = network, Odometer(), Observer()
         self._newest: Estimate | None = None
 
     def after(self, stamp_ns: int, result: TrackResult) -> float | None:
@@ -86,14 +87,16 @@ class AtOnce(Unknown):
 
     def keyframe(self, frame: Frame, tracker: Tracker) -> Candidate:
         footing, candidate = tracker.footing(), tracker.keyframe(frame)
-        self._take(_Job(frame.image0, footing, self._doubt.after(frame.stamp_ns, candidate)))
+        lately = self._odometer.after(frame.stamp_ns, candidate)
+        self._take(_Job(frame.stamp_ns, frame.image0, footing, lately))
         return candidate
 
     def _take(self, job: _Job) -> None:
         self._newest = self._estimate(job)
 
     def _estimate(self, job: _Job) -> Estimate:
-        return estimate(self._network, features(job.image, job.footing, job.sigma_cm))
+        seen = self._observer.features(job.stamp_ns, job.image, job.footing, job.lately)
+        return estimate(self._network, seen)
 
 
 class ByModel(AtOnce):

@@ -13,8 +13,8 @@ from share import __version__
 from share.config import Config
 from share.core.sequencer import SequencerCounters
 from share.errors import UsageError
-from share.evaluator.doubt import Doubt
-from share.evaluator.features import Features, features
+from share.evaluator.features import Features, Observer
+from share.evaluator.odometer import Odometer
 from share.io.pool import Pool
 from share.io.session import Session, read_session
 from share.io.source import Source, open_source
@@ -101,18 +101,19 @@ def _make(work: tuple[Job, Config]) -> None:
 
 def keyframes(
     source: Source, config: Config, spells: Sequence[Spell] = (), seed: int = 0
-) -> Iterator[tuple[int, float, float, Features]]:
-    """Of each keyframe of our own tracker: its stamp, how wrong the tracker is by then (cm, NaN unknown), how
-    wrong it takes itself to be, and what the error model is told. Raises UsageError without a truth."""
+) -> Iterator[tuple[int, float, Features]]:
+    """Of each keyframe of our own tracker: its stamp, how wrong the tracker is by then (cm, NaN unknown),
+    and what the error model is told. Raises UsageError without a truth."""
     truth = source.truth()
     if truth is None:
         raise UsageError(f"{source.name}: comes without a truth, so nobody knows how wrong a tracker is")
-    tracker, error, doubt = tracker_for(source, config), LocalError(truth), Doubt()
+    tracker, error = tracker_for(source, config), LocalError(truth)
+    odometer, observer = Odometer(), Observer()
     for frame in spoiled(frames_of(source, config, SequencerCounters()), spells, seed):
         result = tracker.track(frame)
         error_cm = error.after(frame.stamp_ns, result.T_odom_body, result.new_stretch)
         if result.keyframe:
             footing = tracker.footing()
-            sigma_cm = doubt.after(frame.stamp_ns, tracker.keyframe(frame))
+            lately = odometer.after(frame.stamp_ns, tracker.keyframe(frame))
             told = float("nan") if error_cm is None else error_cm
-            yield frame.stamp_ns, told, sigma_cm, features(frame.image0, footing, sigma_cm)
+            yield frame.stamp_ns, told, observer.features(frame.stamp_ns, frame.image0, footing, lately)

@@ -10,7 +10,6 @@ import numpy as np
 
 from share.config import ControlConfig
 from share.control.qoe import DELAY_MS, Needs, qoe
-from share.evaluator.features import Features
 from share.evaluator.model import Network, estimate
 from share.train.rivals import RIVALS, Rows, Tell
 from share.train.table import Collection
@@ -38,8 +37,8 @@ class Score:
 def of_network(name: str, network: Network, rows: Rows) -> Score:
     """One by one, as on an agent."""
     table, told, began = rows.table, [], time.thread_time()
-    for picture, psd, scalars in zip(table.picture, table.psd, table.scalars, strict=True):
-        told.append(estimate(network, Features(picture, psd, scalars)))
+    for features in table.features():
+        told.append(estimate(network, features))
     ms = 1e3 * (time.thread_time() - began) / max(len(told), 1)
     low, high = (np.array([getattr(one, side) for one in told]) for side in ("low_cm", "high_cm"))
     covered = float(((low <= table.error_cm) & (table.error_cm <= high)).mean())

@@ -35,11 +35,12 @@ class FitOptions:
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Of N keyframes: deep (N, 1280), by the backbone; psd, scalars as in `Features`; log_error (N,)."""
+    """Of N keyframes: deep (N, 1280), by the backbone; psd as in `Features`; numbers (N, 34), its scalars
+    and recent; log_error (N,)."""
 
     deep: F32
     psd: F32
-    scalars: F32
+    numbers: F32
     log_error: F32
 
     def tensors(self, device: torch.device) -> list[torch.Tensor]:
@@ -101,9 +102,9 @@ def _epoch(
     torch.manual_seed(options.seed * 100_003 + epoch)
     order, total = torch.randperm(len(rows[0])), 0.0
     for which in order.split(options.batch):
-        deep, psd, scalars, log_error = (column[which.to(column.device)] for column in rows)
+        *inputs, log_error = (column[which.to(column.device)] for column in rows)
         optimiser.zero_grad()
-        value = loss(head(deep, psd, scalars), log_error)
+        value = loss(head(*inputs), log_error)
         value.backward()
         torch.nn.utils.clip_grad_norm_(head.parameters(), 1.0)
         optimiser.step()
@@ -114,7 +115,7 @@ def _epoch(
 def _evaluated(head: Head, rows: list[torch.Tensor]) -> float:
     head.eval()
     with torch.no_grad():
-        return float(loss(head(*rows[:3]), rows[3]))
+        return float(loss(head(*rows[:-1]), rows[-1]))
 
 
 def _copy(head: Head) -> dict[str, torch.Tensor]:

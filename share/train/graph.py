@@ -12,12 +12,13 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from share.evaluator.features import SHAPES
 from share.evaluator.model import OUTPUTS
 from share.train.fitted import Fitted
 
 DEEP = "deep"  # the backbone's last tensor (N, 1280)
 _HEAD = "head/"  # names of all that a head brings begin with it
-_INPUTS = {"psd": ("N", 3, 12, 16), "scalars": ("N", 8)}
+_INPUTS = {name: ("N", *shape) for name, shape in SHAPES.items() if name != "picture"}
 _SHAPES = {"log_error": ("N", 3), "embedding": ("N", 64), "distance": ("N",)}
 
 
@@ -71,7 +72,8 @@ class _Head:
         self._node("LayerNormalization", [seen, *self._layer("visual.2")], "embedding", axis=-1, epsilon=1e-5)
         spread = self._conv(self._conv("psd", "spread.0"), "spread.2")
         spread = self._node("Flatten", [self._node("GlobalAveragePool", [spread])])
-        numbers = self._linear("scalars", "numbers.0", relu=True)
+        numbers = self._node("Concat", ["scalars", "recent"], axis=1)
+        numbers = self._linear(numbers, "numbers.0", relu=True)
         joined = self._node("Concat", ["embedding", spread, numbers], axis=1)
         self._interval(self._linear(self._linear(joined, "joined.0", relu=True), "joined.2"), fitted.margin)
         away = self._node("Sub", [joined, self._constant("mean", fitted.mean)])

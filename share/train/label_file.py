@@ -16,48 +16,44 @@ from typing import Any
 import numpy as np
 
 from share.errors import DataError
-from share.evaluator.features import PICTURE_PX, Features
-from share.evaluator.psd import CHANNELS, GRID
-from share.evaluator.scalars import NAMES
+from share.evaluator.features import SHAPES, Features, kind_of
 from share.io.files import atomic_write
 from share.types import F32, I64, U8
 
-SCHEMA = 1
+SCHEMA = 2
 
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Keyframes of one run, in order: stamps_ns (N,); error_cm (N,), NaN unknown; sigma_cm (N,), what the
-    tracker says itself; picture (N, 128, 128), psd (N, 3, 12, 16), scalars (N, 8) as in `Features`. about:
-    plain data."""
+    """Keyframes of one run, in order: stamps_ns (N,); error_cm (N,), NaN unknown; picture (N, 128, 128), psd
+    (N, 3, 12, 16), scalars (N, 8), recent (N, 26) as in `Features`. about: plain data."""
 
     about: dict[str, Any]
     stamps_ns: I64
     error_cm: F32
-    sigma_cm: F32
     picture: U8
     psd: F32
     scalars: F32
+    recent: F32
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
     @classmethod
-    def of(cls, about: dict[str, Any], rows: Sequence[tuple[int, float, float, Features]]) -> Labels:
-        """rows: stamp_ns, error_cm, sigma_cm and features of each keyframe."""
-        told = [features for *_, features in rows]
+    def of(cls, about: dict[str, Any], rows: Sequence[tuple[int, float, Features]]) -> Labels:
+        """rows: stamp_ns, error_cm and features of each keyframe."""
         return cls(
             about,
             np.array([row[0] for row in rows], np.int64),
             np.array([row[1] for row in rows], np.float32),
-            np.array([row[2] for row in rows], np.float32),
-            np.array([f.picture for f in told], np.uint8).reshape(-1, PICTURE_PX, PICTURE_PX),
-            np.array([f.psd for f in told], np.float32).reshape(-1, CHANNELS, GRID[1], GRID[0]),
-            np.array([f.scalars for f in told], np.float32).reshape(-1, len(NAMES)),
+            *(
+                np.array([getattr(row[2], name) for row in rows], kind_of(name)).reshape(-1, *shape)
+                for name, shape in SHAPES.items()
+            ),
         )
 
 
-_COLUMNS = ("stamps_ns", "error_cm", "sigma_cm", "picture", "psd", "scalars")
+_COLUMNS = ("stamps_ns", "error_cm", *SHAPES)
 
 
 def write_labels(path: Path, labels: Labels) -> None:

@@ -1,7 +1,8 @@
 """The network of the error model but for its backbone, in torch; and what it is taught by.
 
 Three branches are joined: what the picture looks like (by a backbone that stays as it is), where there are
-points, and eight numbers. Source: SHARE, IMWUT 10(3) 97, 2026 (docs/error-model.md).
+points, and numbers. Source: SHARE, IMWUT 10(3) 97, 2026; that these are also of the last seconds is ours
+(docs/error-model.md).
 """
 
 from __future__ import annotations
@@ -10,12 +11,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from share.evaluator.recent import RECENT
+from share.evaluator.scalars import NAMES
+
 DEEP, EMBEDDING, JOINED = 1280, 64, 96
+NUMBERS = len(NAMES) + len(RECENT)
 LOW, HIGH = 0.05, 0.95  # quantiles
 
 
 class Head(nn.Module):  # type: ignore[misc]
-    """deep (N, 1280), psd (N, 3, 12, 16), scalars (N, 8) to log of cm (N, 3): expected, low, high."""
+    """deep (N, 1280), psd (N, 3, 12, 16), numbers (N, 34: scalars, recent) to log of cm (N, 3):
+    expected, low, high."""
 
     def __init__(self, dropout: float = 0.0) -> None:
         super().__init__()
@@ -29,16 +35,16 @@ class Head(nn.Module):  # type: ignore[misc]
             nn.AdaptiveAvgPool2d(1),
             nn.Flatten(),
         )
-        self.numbers = nn.Sequential(nn.Linear(8, 16), nn.ReLU())
+        self.numbers = nn.Sequential(nn.Linear(NUMBERS, 16), nn.ReLU())
         self.joined = nn.Sequential(nn.Linear(JOINED, 48), nn.ReLU(), nn.Linear(48, 3))
 
-    def join(self, deep: Tensor, psd: Tensor, scalars: Tensor) -> Tensor:
+    def join(self, deep: Tensor, psd: Tensor, numbers: Tensor) -> Tensor:
         """(N, 96)."""
-        branches = (self.visual(self.forgets(deep)), self.spread(psd), self.numbers(scalars))
+        branches = (self.visual(self.forgets(deep)), self.spread(psd), self.numbers(numbers))
         return torch.cat(branches, dim=1)
 
-    def forward(self, deep: Tensor, psd: Tensor, scalars: Tensor) -> Tensor:
-        expected, below, above = self.joined(self.join(deep, psd, scalars)).unbind(dim=1)
+    def forward(self, deep: Tensor, psd: Tensor, numbers: Tensor) -> Tensor:
+        expected, below, above = self.joined(self.join(deep, psd, numbers)).unbind(dim=1)
         low, high = expected - functional.softplus(below), expected + functional.softplus(above)
         return torch.stack([expected, low, high], dim=1)
 

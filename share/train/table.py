@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from share.columns import Columns
 from share.errors import UsageError
+from share.evaluator.features import SHAPES, Features
 from share.train.label_file import Labels, read_labels
 from share.train.split import groups, split
 from share.types import F32, I64, U8
@@ -22,18 +23,29 @@ _LEAST_CM, _MOST_CM = 0.01, 100.0  # beyond, a label is a tracker that was lost 
 @dataclass(frozen=True, eq=False)
 class Table(Columns):
     """N keyframes whose error is known: run (N,), of which each is; error_cm (N,); picture (N, 128, 128),
-    psd (N, 3, 12, 16), scalars (N, 8) as in `Features`."""
+    psd (N, 3, 12, 16), scalars (N, 8), recent (N, 26) as in `Features`."""
 
     run: I64
     error_cm: F32
     picture: U8
     psd: F32
     scalars: F32
+    recent: F32
 
     @property
     def log_error(self) -> F32:
         out: F32 = np.log(self.error_cm)
         return out
+
+    @property
+    def numbers(self) -> F32:
+        """(N, 34): scalars and recent."""
+        return np.concatenate([self.scalars, self.recent], axis=1)
+
+    def features(self) -> Iterator[Features]:
+        """Keyframe by keyframe."""
+        columns = [getattr(self, name) for name in SHAPES]
+        return (Features(*one) for one in zip(*columns, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +84,6 @@ def tabulate(found: Sequence[Labels]) -> Table:
     run = [np.full(int(k.sum()), number) for number, k in enumerate(known)]
     columns = [
         np.concatenate([getattr(labels, name)[k] for labels, k in zip(found, known, strict=True)])
-        for name in ("error_cm", "picture", "psd", "scalars")
+        for name in ("error_cm", *SHAPES)
     ]
     return Table(np.concatenate(run), columns[0].clip(_LEAST_CM, _MOST_CM), *columns[1:])

@@ -32,7 +32,7 @@ def teach(
         told = head(*_tensors(parts["calibrate"])).numpy()
     weights = {name: value.numpy() for name, value in head.state_dict().items()}
     weights = folded(weights, "visual.0", *scale.deep)
-    weights = folded(weights, "numbers.0", *scale.scalars)
+    weights = folded(weights, "numbers.0", *scale.numbers)
     about = {
         "version": __version__,
         "window_s": WINDOW_S,
@@ -56,14 +56,14 @@ class _Scale:
         self._deep, self._collection = deep, collection
         learn = collection.of("learn")
         self.deep = _moments(deep[learn])
-        self.scalars = _moments(collection.table.scalars[learn])
+        self.numbers = _moments(collection.table.numbers[learn])
 
     def inputs(self, part: str) -> Inputs:
         rows, table = self._collection.of(part), self._collection.table
         return Inputs(
             _scaled(self._deep[rows], *self.deep),
             table.psd[rows],
-            _scaled(table.scalars[rows], *self.scalars),
+            _scaled(table.numbers[rows], *self.numbers),
             table.log_error[rows],
         )
 
@@ -78,7 +78,7 @@ def _scaled(x: F32, mean: F32, deviation: F32) -> F32:
 
 
 def _tensors(inputs: Inputs) -> list[torch.Tensor]:
-    return inputs.tensors(torch.device("cpu"))[:3]
+    return inputs.tensors(torch.device("cpu"))[:-1]
 
 
 def _rooms(collection: Collection, part: str) -> list[str]:

@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("torch", reason="make install-train brings it")
 pytest.importorskip("sklearn", reason="make install-train brings it")
 
+from share.evaluator.features import SHAPES, kind_of
 from share.train.card import table
 from share.train.compare import of_network, scored
 from share.train.rivals import Rows, _contrast, _numbers
@@ -23,9 +24,7 @@ def rows(error_cm=ERROR_CM) -> Rows:
     table_of = Table(
         np.zeros(n, np.int64),
         error_cm,
-        np.zeros((n, 128, 128), np.uint8),
-        np.zeros((n, 3, 12, 16), np.float32),
-        np.zeros((n, 8), np.float32),
+        *(np.zeros((n, *shape), kind_of(name)) for name, shape in SHAPES.items()),
     )
     return Rows(table_of, np.zeros((n, 1280), np.float32))
 

@@ -12,9 +12,9 @@ torch = pytest.importorskip("torch", reason="make install-train brings it")
 pytest.importorskip("onnx", reason="make install-train brings it")
 pytest.importorskip("sklearn", reason="make install-train brings it")
 
+from made_features import made_features  # noqa: E402
 from tiny_backbone import tiny_backbone  # noqa: E402
 
-from share.evaluator.features import Features  # noqa: E402
 from share.io.network import deep_of, open_network  # noqa: E402
 from share.train.fit import FitOptions, fit  # noqa: E402
 from share.train.label_file import Labels, write_labels  # noqa: E402
@@ -36,8 +36,8 @@ def labels(tmp_path_factory) -> Path:
             scalars[5] = 1 - few
             picture = np.full((128, 128), 255 * (1 - dark), np.uint8)
             error_cm = 0.2 * np.exp(2 * dark + 1.5 * few + 0.2 * rng.standard_normal())
-            psd = rng.random((3, 12, 16), np.float32)
-            rows.append((k, float(error_cm) if k else float("nan"), 0.5, Features(picture, psd, scalars)))
+            seen = made_features(rng, picture=picture, scalars=scalars)
+            rows.append((k, float(error_cm) if k else float("nan"), seen))
         made = {"scene": "warehouse", "seed": room, "size": None, "motions": ["ar=walk:"]}
         write_labels(
             folder / f"w{room}-ar-0.npz", Labels.of({"session": f"w{room}", "provenance": made}, rows)

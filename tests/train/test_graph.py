@@ -10,6 +10,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="make install-train brings it")
 onnx = pytest.importorskip("onnx", reason="make install-train brings it")
 
+from made_features import made_features  # noqa: E402
 from tiny_backbone import tiny_backbone  # noqa: E402
 
 from share.evaluator.features import Features  # noqa: E402
@@ -34,22 +35,16 @@ def fitted(head: Head, margin: float = 0.2, reach: float = 4.0) -> Fitted:
 
 
 def keyframes(rng, n: int = 7) -> list[Features]:
-    return [
-        Features(
-            rng.integers(0, 256, (128, 128), np.uint8),
-            rng.random((3, 12, 16), np.float32),
-            rng.random(8, np.float32),
-        )
-        for _ in range(n)
-    ]
+    return [made_features(rng) for _ in range(n)]
 
 
 def test_the_file_says_what_the_network_does(head, rng):
     network = open_network(with_head(tiny_backbone(), fitted(head)))
     for one in keyframes(rng):
         deep = torch.from_numpy(deep_of(network, one.picture[None]))
+        numbers = np.concatenate([one.scalars, one.recent])
         with torch.no_grad():
-            inputs = deep, torch.from_numpy(one.psd[None].copy()), torch.from_numpy(one.scalars[None].copy())
+            inputs = deep, torch.from_numpy(one.psd[None].copy()), torch.from_numpy(numbers[None])
             expected, low, high = head(*inputs)[0].tolist()
             joined = head.join(*inputs)[0].numpy()
         told = estimate(network, one)

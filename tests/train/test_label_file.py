@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from made_features import made_features
 
 from share.errors import DataError
-from share.evaluator.features import Features
+from share.evaluator.features import SHAPES
 from share.train.label_file import Labels, read_labels, write_labels
 
 
@@ -16,12 +17,7 @@ def labels(rng) -> Labels:
         (
             10**18 + k,
             float("nan") if k == 0 else 0.1 * k,
-            0.2 * k,
-            Features(
-                rng.integers(0, 256, (128, 128), np.uint8),
-                rng.random((3, 12, 16), np.float32),
-                rng.random(8, np.float32),
-            ),
+            made_features(rng),
         )
         for k in range(4)
     ]
@@ -33,7 +29,7 @@ def test_what_is_written_is_read(labels, tmp_path):
     found = read_labels(tmp_path / "one.npz")
     assert found.about == labels.about
     assert len(found) == 4
-    for name in ("stamps_ns", "error_cm", "sigma_cm", "picture", "psd", "scalars"):
+    for name in ("stamps_ns", "error_cm", *SHAPES):
         one, two = getattr(labels, name), getattr(found, name)
         assert one.dtype == two.dtype
         assert np.array_equal(one, two, equal_nan=name == "error_cm")

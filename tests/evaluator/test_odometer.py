@@ -1,0 +1,63 @@
+"""How far an agent went in a window, and what its tracker's own covariances say of the error."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from share.evaluator.odometer import Lately, Odometer
+from share.geometry import se3
+from share.types import Candidate, View
+
+S = 1_000_000_000
+NOTHING = View(np.zeros((0, 2), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 32), np.uint8))
+AHEAD = se3.from_quat(np.array([[2.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))[0]
+
+
+def candidate(T: np.ndarray, sigma_rad: float, sigma_m: float, new: bool = False) -> Candidate:
+    cov = np.diag([sigma_rad**2] * 3 + [sigma_m**2] * 3)
+    return Candidate(np.eye(4), T, cov, np.zeros(3), 0.0, NOTHING, new)
+
+
+def test_independent_motions_add_up_as_their_variances_do():
+    odometer = Odometer(5.0)
+    for k in range(4):
+        sigma_cm = odometer.after(k * S, candidate(np.eye(4), 0.0, 0.001)).sigma_cm
+        assert sigma_cm == pytest.approx(0.1 * np.sqrt(3 * k))
+
+
+def test_what_is_older_than_the_window_is_forgotten():
+    odometer = Odometer(5.0)
+    odometer.after(-S, candidate(np.eye(4), 0.0, 0.0, new=True))
+    odometer.after(0, candidate(AHEAD, 0.0, 1.0))
+    odometer.after(3 * S, candidate(AHEAD, 0.0, 0.002))
+    lately = odometer.after(5 * S, candidate(AHEAD, 0.0, 0.001))
+    assert lately.sigma_cm == pytest.approx(0.1 * np.sqrt(3 * 5))
+    assert lately.way_m == pytest.approx(4)
+    assert lately.since_ns == 0
+
+
+def test_ways_and_turns_add_up():
+    odometer = Odometer(5.0)
+    left = se3.exp(np.array([0.0, 0.0, np.pi / 2, 0.0, 0.0, 0.0]))
+    assert odometer.after(S, candidate(left, 0.0, 0.0, new=True)) == Lately(S, 0.0, 0.0, 0.0)
+    for _ in range(2):
+        lately = odometer.after(2 * S, candidate(left @ AHEAD, 0.0, 0.0))
+    assert lately.way_m == pytest.approx(4)
+    assert lately.turn_rad == pytest.approx(np.pi)
+    assert lately.since_ns == S  # not longer than the stretch
+
+
+def test_a_turn_that_is_doubted_moves_what_comes_after():
+    """By its lever: 0.01 rad about either axis across 2 m ahead is 2 cm."""
+    odometer = Odometer(5.0)
+    odometer.after(-S, candidate(np.eye(4), 0.0, 0.0, new=True))
+    odometer.after(0, candidate(np.eye(4), 0.01, 0.0))
+    assert odometer.after(S, candidate(AHEAD, 0.0, 0.0)).sigma_cm == pytest.approx(2 * np.sqrt(2))
+
+
+def test_a_stretch_that_begins_is_sure_of_itself():
+    odometer = Odometer(5.0)
+    odometer.after(0, candidate(AHEAD, 0.0, 1.0, new=True))
+    odometer.after(S, candidate(AHEAD, 0.0, 1.0))
+    assert odometer.after(2 * S, candidate(AHEAD, 0.0, 1.0, new=True)) == Lately(2 * S, 0.0, 0.0, 0.0)
