@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli import options
+from share.cli.compare import compare
 from share.cli.playing import check_all, of_many, played
 from share.cli.progress import LiveLine
 from share.cli.run_table import table
@@ -39,6 +40,7 @@ def evaluate() -> None:
 
 
 evaluate.add_command(sweep)
+evaluate.add_command(compare)
 
 
 @evaluate.command(short_help="Play a session, and keep everything.")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import Any
 from share.metrics.bootstrap import Interval
 from share.metrics.comparison import MEASURES, compare, no_worse, policies
 from share.metrics.figures import AgentFigures, Conditions, RunFigures
+from share.run.as_text import csv_text, markdown_table, number
 from share.run.trial import Trial
 
 _AGENT = [field.name for field in dataclasses.fields(AgentFigures)]
@@ -28,7 +27,7 @@ PROTOCOL = (
 
 def agents_csv(runs: Iterable[RunFigures]) -> str:
     """A line an agent and run."""
-    return _csv(
+    return csv_text(
         [*_CONDITIONS, *_AGENT],
         ([*_conditions(run), *(getattr(agent, f) for f in _AGENT)] for run in runs for agent in run.agents),
     )
@@ -36,7 +35,7 @@ def agents_csv(runs: Iterable[RunFigures]) -> str:
 
 def runs_csv(runs: Iterable[RunFigures]) -> str:
     """A line a run."""
-    return _csv(
+    return csv_text(
         [*_CONDITIONS, *_RUN, "metres"],
         ([*_conditions(run), *(getattr(run, f) for f in _RUN), run.metres] for run in runs),
     )
@@ -45,7 +44,7 @@ def runs_csv(runs: Iterable[RunFigures]) -> str:
 def sweep_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     """A line a point; rows: by `share.run.sweep.table`."""
     head = [*rows[0]["settings"], "runs", *rows[0]["means"]]
-    return _csv(
+    return csv_text(
         head,
         ([*row["settings"].values(), row["runs"], *(m.value for m in row["means"].values())] for row in rows),
     )
@@ -58,7 +57,7 @@ def sweep_markdown(rows: Sequence[Mapping[str, Any]]) -> str:
         [*row["settings"].values(), str(row["runs"]), *(_wide(m) for m in row["means"].values())]
         for row in rows
     ]
-    return _markdown([head, *body]) + "\n\nIn brackets: 95 % by drawing the runs again.\n"
+    return markdown_table([head, *body]) + "\n\nIn brackets: 95 % by drawing the runs again.\n"
 
 
 def markdown(runs: Sequence[RunFigures], trials: Sequence[Trial], base: str) -> str:
@@ -119,9 +118,9 @@ def _comparison(runs: Sequence[RunFigures], names: Sequence[str], base: str) -> 
         for name in names:
             one = found[name][k]
             ratio = "" if name == base else f"; {_interval(one.ratio)}"
-            cells.append(_number(one.value.value) + ratio)
+            cells.append(number(one.value.value) + ratio)
         rows.append([f"{measure.name}{', ' + measure.unit if measure.unit else ''}", *cells])
-    return _markdown(rows)
+    return markdown_table(rows)
 
 
 def _wins(runs: Sequence[RunFigures], name: str, other: str) -> str:
@@ -137,12 +136,12 @@ def _every_agent(runs: Sequence[RunFigures], names: Sequence[str]) -> str:
             a.agent for r in runs if r.conditions.session == session for a in r.agents
         ):
             cells = [
-                f"{_number(mean_of(runs, name, session, agent, 'latency_ms'))}, "
-                f"{_number(mean_of(runs, name, session, agent, 'ate_cm'))}"
+                f"{number(mean_of(runs, name, session, agent, 'latency_ms'))}, "
+                f"{number(mean_of(runs, name, session, agent, 'ate_cm'))}"
                 for name in names
             ]
             rows.append([session, agent, *cells])
-    return _markdown(rows)
+    return markdown_table(rows)
 
 
 def mean_of(runs: Sequence[RunFigures], policy: str, session: str, agent: str, field: str) -> float:
@@ -161,33 +160,9 @@ def _conditions(run: RunFigures) -> list[object]:
     return [getattr(run.conditions, name) for name in _CONDITIONS]
 
 
-def _csv(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(head)
-    for row in rows:
-        writer.writerow([_cell(value) for value in row])
-    return text.getvalue()
-
-
-def _cell(value: object) -> object:
-    if isinstance(value, float):
-        return "" if math.isnan(value) else f"{value:.6g}"
-    return value
-
-
-def _markdown(rows: Sequence[Sequence[str]]) -> str:
-    head, *body = rows
-    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *body))
-
-
 def _interval(of: Interval) -> str:
     return "–" if math.isnan(of.value) else f"{of.value:.2f} [{of.low:.2f}, {of.high:.2f}]"
 
 
 def _wide(of: Interval) -> str:
     return "–" if math.isnan(of.value) else f"{of.value:.3g} [{of.low:.3g}, {of.high:.3g}]"
-
-
-def _number(value: float) -> str:
-    return "–" if math.isnan(value) else f"{value:.3g}"

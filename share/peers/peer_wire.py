@@ -1,7 +1,9 @@
-"""The pipe between measure_peers and a peer in another interpreter. Needs numpy alone: both ends use it.
+"""The pipe between SHARE and a peer in another interpreter. Needs numpy alone: both ends use it.
 
 To the peer: a line of JSON, its calibration; then of every moment a line of JSON and the bytes of both
-images. Back: a line of JSON for each moment. Numbers go as text that reads back to the same number.
+images. Back: a line of JSON for each moment: T_world_body, null where it has no pose, and cpu_s. After the
+last one, a peer that mends its past may send one more line: stamps_ns and T_world_body of the trajectory as
+it takes it to be in the end. Numbers go as text that reads back to the same number.
 """
 
 from __future__ import annotations

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import sys
-from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from recordings import make_euroc
 
+from share import peers
 from share.config import Config
 from share.core.sequencer import SequencerCounters
 from share.errors import DataError, UsageError
 from share.io.source import open_source
+from share.io.trajectory import Trajectory
+from share.run.peers import PEERS, calibration, moments, ours, theirs, version_of
 from share.run.pipeline import frames_of
+from share.run.versus import figures
 
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
 PEER = f"""
 import sys
-sys.path.insert(0, {str(TOOLS)!r})
+sys.path.insert(0, {str(Path(peers.__file__).parent)!r})
 import numpy as np
 from peer_wire import claim_stdout, read_line, read_moment, write_line
 
@@ -39,12 +41,6 @@ np.save(sys.argv[1], seen, allow_pickle=True)
 
 
 @pytest.fixture
-def tool(monkeypatch):
-    monkeypatch.syspath_prepend(TOOLS)
-    return importlib.import_module("measure_peers")
-
-
-@pytest.fixture
 def source(tmp_path):
     return open_source(str(make_euroc(tmp_path / "recording", frames=25)))
 
@@ -55,8 +51,8 @@ def command(tmp_path, most=1000):
     return [sys.executable, str(script), str(tmp_path / "seen.npy"), str(most)]
 
 
-def test_peer_sees_what_was_recorded(tool, source, tmp_path):
-    tool.peer_run(source, command(tmp_path))
+def test_peer_sees_what_was_recorded(source, tmp_path):
+    theirs(source, command(tmp_path))
     seen = np.load(tmp_path / "seen.npy", allow_pickle=True).item()
     frames = list(frames_of(source, Config(), SequencerCounters()))
     assert [m["stamp_ns"] for m in seen["moments"]] == [frame.stamp_ns for frame in frames]
@@ -68,20 +64,20 @@ def test_peer_sees_what_was_recorded(tool, source, tmp_path):
     assert imu.tolist() == [list(m.payload) for m in recorded]
 
 
-def test_samples_go_just_past_their_frame(tool, source):
-    for moment in tool.moments(source):
+def test_samples_go_just_past_their_frame(source):
+    for moment in moments(source):
         assert moment.imu_ns[-2] <= moment.stamp_ns < moment.imu_ns[-1]
 
 
-def test_frames_that_no_sample_comes_after_are_not_shown(tool, source):
+def test_frames_that_no_sample_comes_after_are_not_shown(source):
     stamps, values = source.imu
     last = source.stamps()["cam0"][-1]
     object.__setattr__(source, "imu", (stamps[stamps <= last], values[stamps <= last]))
-    assert [m.stamp_ns for m in tool.moments(source)] == source.stamps()["cam0"][:-1].tolist()
+    assert [m.stamp_ns for m in moments(source)] == source.stamps()["cam0"][:-1].tolist()
 
 
-def test_peer_is_told_the_calibration(tool, source, tmp_path):
-    tool.peer_run(source, command(tmp_path))
+def test_peer_is_told_the_calibration(source, tmp_path):
+    theirs(source, command(tmp_path))
     told = np.load(tmp_path / "seen.npy", allow_pickle=True).item()["calibration"]
     left, right = told["cameras"]
     assert left["K"] == [[50.0, 0.0, 31.5], [0.0, 51.0, 23.5], [0.0, 0.0, 1.0]]
@@ -93,42 +89,74 @@ def test_peer_is_told_the_calibration(tool, source, tmp_path):
     assert told["imu"]["gyro_density"] == 1.7e-4 and told["imu"]["rate_hz"] == 200
 
 
-def test_answers_come_back(tool, source, tmp_path):
-    run = tool.peer_run(source, command(tmp_path))
-    first = next(tool.moments(source))
+def test_answers_come_back(source, tmp_path):
+    run = theirs(source, command(tmp_path))
+    first = next(moments(source))
     assert run.stamps == source.stamps()["cam0"].tolist()
     assert run.poses[0][:3, 3].tolist() == [0.1, float(first.left[0, 0]), 1 / 3]
     assert run.cpu_ms == pytest.approx(range(2, 26))  # the first frame sets up
 
 
-def test_peer_that_stops_is_an_error(tool, source, tmp_path):
+def test_peer_that_stops_is_an_error(source, tmp_path):
     with pytest.raises(DataError, match="frame 3"):
-        tool.peer_run(source, command(tmp_path, most=3))
+        theirs(source, command(tmp_path, most=3))
 
 
-def test_score_is_of_all_frames_under_one_alignment(tool, source):
+def test_peer_that_loses_itself_has_no_pose_then_and_may_mend_its_past(source, tmp_path):
+    lost = PEER.replace(
+        "T_world_body=T.tolist()", "T_world_body=None if len(seen['moments']) < 5 else T.tolist()"
+    )
+    end = "write_line(answers, dict(stamps_ns=[10, 20], T_world_body=[np.eye(4).tolist()] * 2))"
+    script = tmp_path / "peer.py"
+    script.write_text(lost + end)
+    run = theirs(source, [sys.executable, str(script), str(tmp_path / "seen.npy"), "1000"])
+    assert run.stamps == source.stamps()["cam0"][4:].tolist()
+    assert len(run.cpu_ms) == 24
+    assert run.final.stamps_ns.tolist() == [10, 20]
+    assert run.final.T.shape == (2, 4, 4)
+
+
+def test_what_else_a_peer_says_is_kept(source, tmp_path):
+    with pytest.raises(DataError, match=r"frame 3; see .*peer\.log"):
+        theirs(source, command(tmp_path, most=3), tmp_path / "peer.log")
+    assert "chatter that is no answer" in (tmp_path / "peer.log").read_text()
+
+
+def test_ours_is_what_track_tells(source):
+    from share.run.track import track
+
+    run, told = ours(source, Config()), track(source, Config(), lambda done: None)
+    assert run.trajectory.stamps_ns.tolist() == told.trajectory.stamps_ns.tolist()
+    assert np.array_equal(run.trajectory.T, told.trajectory.T)
+    assert len(run.cpu_ms) == 24
+
+
+def test_cameras_that_look_alike_need_not_be_turned(source):
+    assert np.allclose(calibration(source)["R_rectified_cam0"], np.eye(3), atol=1e-6)
+
+
+def test_score_is_of_all_frames_under_one_alignment(source):
     truth = source.truth()
     T = np.array([[0, -1, 0, 4], [1, 0, 0, 5], [0, 0, 1, 6], [0, 0, 0, 1.0]])
-    run = tool.Run(truth.stamps_ns.tolist(), list(T @ truth.T), [1.0, 2.0, 6.0])
-    good = tool.figures(source, run)
-    assert good["ate_cm"] == pytest.approx(0, abs=1e-9) and good["told"] == 1
-    assert (good["cpu_ms"], good["cpu_mean_ms"]) == (2, 3)
-    run.poses[7] = run.poses[7] + np.array([[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0.05], [0, 0, 0, 0]])
-    assert tool.figures(source, run)["worst_cm"] == pytest.approx(5, rel=0.2)
+    poses = T @ truth.T
+    good = figures("x", "y", source, Trajectory(truth.stamps_ns, poses), [1.0, 2.0, 6.0])
+    assert good.ate_cm == pytest.approx(0, abs=1e-9)
+    assert good.told == 1
+    assert (good.cpu_ms, good.cpu_mean_ms) == (2, 3)
+    poses[7, 2, 3] += 0.05
+    off = figures("x", "y", source, Trajectory(truth.stamps_ns, poses), [])
+    assert off.most_cm == pytest.approx(5, rel=0.2)
+    assert np.isnan(off.cpu_ms)
 
 
-@pytest.mark.parametrize("python", [None, Path(sys.executable), Path("/nowhere/python")])
-def test_peer_that_is_not_there_is_named(tool, python, capsys):
+@pytest.mark.parametrize("python", [Path(sys.executable), Path("/nowhere/python")])
+def test_peer_that_is_not_there_has_no_version(python):
     if python == Path(sys.executable) and importlib.util.find_spec("depthai"):
         pytest.skip("depthai is installed here")
-    names = [name for name, _ in tool.trackers_of(Namespace(python=python))]
-    assert len(names) == 1 and names[0].startswith("SHARE ")
-    told = capsys.readouterr().err
-    assert told.startswith("left out: Basalt") and told.count("\n") == 1
-    assert "pip install depthai==" in told and "--python" in told
+    assert version_of(PEERS["basalt"], python) is None
 
 
-def test_mono_is_refused(tool, tmp_path):
+def test_mono_is_refused(tmp_path):
     folder = make_euroc(tmp_path / "mono", imu=False)
     with pytest.raises(UsageError, match="stereo"):
-        tool.calibration(open_source(str(folder)))
+        calibration(open_source(str(folder)))

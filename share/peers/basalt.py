@@ -1,10 +1,11 @@
 """Basalt, as the wheel `depthai` has it (node BasaltVIO, on the host, no camera), at the end of a pipe.
 
-    PYTHON tools/peer_basalt.py [--version]
+    PYTHON share/peers/basalt.py [--version]
 
-measure_peers runs it, in the interpreter of an environment with `depthai`; see peer_wire. One moment at a
-time: the next comes when the pose of this one has gone out, so nothing is dropped, and a pose is of the
-moment asked for (the node does not stamp it). Settings: as shipped. Calibration, IMU noise: the recording's.
+`share evaluate compare` runs it, in the interpreter of an environment with `depthai`; see peer_wire. One
+moment at a time: the next comes when the pose of this one has gone out, so nothing is dropped, and a pose is
+of the moment asked for (the node does not stamp it). Settings: as shipped. Calibration, IMU noise: the
+recording's.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ SETTLE_S, PATIENCE = 1.0, timedelta(seconds=60)
 
 
 class Basalt:
-    """calibration: see `measure_peers.calibration`."""
+    """calibration: see `share.run.peers.calibration`."""
 
     def __init__(self, calibration: dict[str, Any]) -> None:
         cameras = calibration["cameras"]
@@ -169,14 +170,14 @@ def lend(handler: Any) -> tuple[threading.Event, Any]:
     eeprom = handler.getEepromData()
     inside = ctypes.c_void_p.from_address(id(eeprom) + object.__basicsize__).value  # behind Python's header
 
-    @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
     def answer(result: int, _camera: int) -> int:
         construct(result, inside, 0)
         asked.set()
         return result
 
-    replace(library._ZN3dai10DeviceBase14getCalibrationEv, answer)
-    return asked, (eeprom, answer)
+    function = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)(answer)
+    replace(library._ZN3dai10DeviceBase14getCalibrationEv, function)
+    return asked, (eeprom, function)
 
 
 def replace(function: Any, by: Any) -> None:

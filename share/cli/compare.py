@@ -1,0 +1,120 @@
+"""`share evaluate compare`: our tracker and those of others on the same recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import click
+
+from share.cli import options
+from share.cli.progress import LiveLine
+from share.errors import DataError, ShareError, UsageError
+
+_NAMES = ("basalt", "orbslam3")
+
+
+@click.command(short_help="Our tracker and those of others, on the same recordings.")
+@click.argument("sources", nargs=-1, required=True)
+@click.option(
+    "--peer",
+    "peers",
+    multiple=True,
+    metavar="NAME=PYTHON",
+    help=f"Interpreter that has {' or '.join(_NAMES)}; may be repeated.  [default: the one that runs SHARE]",
+)
+@click.option(
+    "--vocabulary",
+    metavar="FILE",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="ORBvoc.txt, which ORB-SLAM3 needs and its package has not.",
+)
+@options.config
+@click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path))
+def compare(
+    sources: tuple[str, ...],
+    peers: tuple[str, ...],
+    vocabulary: Path | None,
+    config_file: str | None,
+    out: Path,
+) -> None:
+    """Run SHARE's own tracker and those of others over the same recordings, score all by the truth, and
+    measure what they take of a processor. Each agent alone, no edge.
+
+    SOURCES are sessions, all of whose agents are run, or what `share track` takes, with a truth, stereo and
+    an IMU. Peers come from package registries, each in an environment of its own; one that is not there is
+    named and left out. In DIR: a row and a trajectory (TUM) a run, table.md, table.csv, report.html and
+    pictures. Broken off, the same command goes on where it stopped.
+
+    \b
+    Example:  python -m venv peers && peers/bin/pip install depthai==3.12.0
+              share evaluate compare room1 --peer basalt=peers/bin/python --out compared
+    """
+    settings = options.load_config(config_file)
+    from share.io.files import atomic_write, writable_dir
+    from share.io.page import page
+    from share.io.source import open_source
+    from share.run.versus import Row, contenders, csv_of, draw, markdown, rows
+
+    recordings = dict(_recordings(sources))
+    all_of, lacking = contenders(settings, pythons(peers), vocabulary)
+    for text in lacking:
+        click.echo(f"left out: {text}", err=True)
+    writable_dir(out)
+    live, found, failed = LiveLine(), list[Row](), 0
+    for number, (name, path) in enumerate(recordings.items()):
+        source = open_source(path)
+        for contender in all_of:
+            what = f"{number + 1} of {len(recordings)}: {name}: {contender.title}"
+            show = partial(_show, live, what, source.images_count)
+            try:
+                found += rows(name, source, contender, out, show)
+            except DataError as error:
+                live.end()
+                click.echo(f"share: {name}: {contender.title}: {error}", err=True)
+                failed += 1
+    live.end()
+    if found:
+        text = markdown(found, lacking)
+        atomic_write(out / "table.md", text)
+        atomic_write(out / "table.csv", csv_of(found))
+        atomic_write(out / "report.html", page("Trackers side by side", text, draw(out, found)))
+        click.echo(text)
+        click.echo(f"report: {out / 'report.html'}   tables: {out / 'table.md'}, {out / 'table.csv'}")
+    if failed:
+        raise ShareError(f"{failed} runs failed; the same command runs them again")
+
+
+def _show(live: LiveLine, what: str, of: int, done: int) -> None:
+    live.write(f"{what}  {done} of {of} frames")
+
+
+def _recordings(sources: tuple[str, ...]) -> Iterator[tuple[str, str]]:
+    """Name and what to open. Raises UsageError where two have one name."""
+    from share.io.session import is_session, read_session
+
+    found = []
+    for text in sources:
+        folder = Path(text)
+        if is_session(folder):
+            found += [
+                (f"{folder.resolve().name}/{name}", f"{text}/{name}") for name in read_session(folder).agents
+            ]
+        else:
+            found.append(("/".join(folder.resolve().parts[-2:]) if "/" in text else text, text))
+    names = [name for name, _ in found]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise UsageError(f"two recordings are called {twice[0]}; rename a folder")
+    yield from found
+
+
+def pythons(peers: Sequence[str]) -> dict[str, Path]:
+    """By name of the peer, of texts NAME=PYTHON. Raises UsageError."""
+    found = {}
+    for text in peers:
+        name, _, python = text.partition("=")
+        if name not in _NAMES or not python:
+            raise UsageError(f"--peer {text}: give NAME=PYTHON, with a name of {', '.join(_NAMES)}")
+        found[name] = Path(python)
+    return found

@@ -1,0 +1,226 @@
+"""Our tracker and those of others on the same recordings: rows are kept as they come; tables and pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from share import __version__
+from share.config import Config
+from share.errors import DataError, UsageError
+from share.io.charts import draw_bars
+from share.io.files import atomic_write
+from share.io.json_file import read_json
+from share.io.machine import describe_machine
+from share.io.source import Source
+from share.io.trajectory import Trajectory, format_tum
+from share.metrics.ate import ate
+from share.metrics.rpe import rpe_time
+from share.run.as_text import csv_text, markdown_table, number
+from share.run.peers import PEERS, TrackerRun, ours, theirs, version_of
+from share.strict import to_mapping
+
+PROTOCOL = (
+    "causal poses of all frames, as each tracker told them at the time; truth interpolated at their stamps",
+    "ATE: rms under one SE3 alignment; RPE: rms over 1 s, without one; docs/evaluation.md",
+    "CPU: process time of all threads, decoding apart; ours with its keyframes",
+    "'in the end': not causal, the trajectory by the map that a tracker has when all is over",
+)
+_END = ", in the end"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One tracker on one recording. told: share of the frames that have a pose. NaN: not known."""
+
+    recording: str
+    tracker: str
+    frames: int
+    told: float
+    ate_cm: float
+    most_cm: float
+    rpe_1s_cm: float
+    rpe_1s_deg: float
+    cpu_ms: float = math.nan
+    cpu_mean_ms: float = math.nan
+    cpu_p99_ms: float = math.nan
+
+
+@dataclass(frozen=True)
+class Contender:
+    """key: in names of files. title: for a reader. about: plain data that says which one it is. run: given a
+    recording, a file for what else it says, and whom to tell how many frames are done."""
+
+    key: str
+    title: str
+    about: Mapping[str, Any]
+    run: Callable[[Source, Path, Callable[[int], None]], TrackerRun]
+
+
+def contenders(
+    settings: Config, pythons: Mapping[str, Path], vocabulary: Path | None
+) -> tuple[list[Contender], list[str]]:
+    """Ours first; and why a peer is left out, with what to do. pythons: interpreters, by name of `PEERS`; by
+    default, the one that runs this."""
+    found = [
+        Contender(
+            "share",
+            f"SHARE {__version__}",
+            {"settings": to_mapping(settings)},
+            lambda source, log, show: ours(source, settings, show),
+        )
+    ]
+    lacking = []
+    for key, peer in PEERS.items():
+        python = pythons.get(key, Path(sys.executable))
+        version = version_of(peer, python)
+        if version is None:
+            lacking.append(
+                f"{peer.title}: {python} does not have it; {peer.install}, then --peer {key}=DIR/bin/python"
+            )
+        elif peer.vocabulary and vocabulary is None:
+            lacking.append(f"{peer.title}: needs the vocabulary of its authors: --vocabulary ORBvoc.txt")
+        else:
+            extra = ["--vocabulary", str(vocabulary)] if peer.vocabulary else []
+            found.append(Contender(key, version, {}, partial(_theirs, [str(python), str(peer.path), *extra])))
+    return found, lacking
+
+
+def _theirs(command: list[str], source: Source, log: Path, show: Callable[[int], None]) -> TrackerRun:
+    return theirs(source, command, log, show)
+
+
+def rows(
+    name: str, source: Source, contender: Contender, out: Path, show: Callable[[int], None]
+) -> Iterator[Row]:
+    """Of one contender on the recording that is called `name`; from `out`, if they are there. Raises
+    UsageError where they are there and of something else, DataError where it fails."""
+    stem = out / f"{name.replace('/', '-')}-{contender.key}"
+    file, made_by = stem.with_suffix(".json"), _made_by(source, contender)
+    if not file.exists():
+        run = contender.run(source, stem.with_suffix(".log"), show)
+        found = [figures(name, contender.title, source, run.trajectory, run.cpu_ms)]
+        atomic_write(stem.with_suffix(".tum"), format_tum(run.trajectory))
+        if run.final is not None:
+            found.append(figures(name, contender.title + _END, source, run.final, []))
+            atomic_write(stem.with_name(f"{stem.name}-end.tum"), format_tum(run.final))
+        told = {
+            "made_by": made_by,
+            "machine": describe_machine(),
+            "rows": list(map(dataclasses.asdict, found)),
+        }
+        atomic_write(file, json.dumps(told, indent=2) + "\n")
+    kept: dict[str, Any] = read_json(file)
+    if kept.get("made_by") != made_by:
+        raise UsageError(f"{file}: is of another recording, version or setting; give another --out")
+    try:
+        yield from (Row(**row) for row in kept["rows"])
+    except (KeyError, TypeError) as error:
+        raise DataError(f"{file}: is damaged: {error!r}; remove it") from None
+
+
+def _made_by(source: Source, contender: Contender) -> dict[str, Any]:
+    """As it comes back from JSON."""
+    told = {"recording": source.name, "tracker": contender.title, **contender.about}
+    back: dict[str, Any] = json.loads(json.dumps(told, default=str))
+    return back
+
+
+def figures(name: str, tracker: str, source: Source, estimate: Trajectory, cpu_ms: Sequence[float]) -> Row:
+    """NaN where there are too few poses with a truth to speak of any."""
+    truth = source.truth()
+    if truth is None:
+        raise UsageError(f"{name}: comes without a truth, so nobody can be told from another")
+    errors = (math.nan,) * 4
+    try:
+        absolute, relative = ate(estimate, truth), rpe_time(estimate, truth)
+        turned = math.degrees(relative.rotation.rmse)
+        errors = (100 * absolute.rmse, 100 * absolute.max, 100 * relative.translation.rmse, turned)
+    except DataError:
+        pass
+    cpu = (
+        [float(np.median(cpu_ms)), float(np.mean(cpu_ms)), float(np.percentile(cpu_ms, 99))] if cpu_ms else []
+    )
+    count = source.images_count
+    return Row(name, tracker, count, len(estimate.stamps_ns) / max(count, 1), *errors, *cpu)
+
+
+def csv_of(found: Sequence[Row]) -> str:
+    """A line a row."""
+    return csv_text([f.name for f in dataclasses.fields(Row)], map(dataclasses.astuple, found))
+
+
+def markdown(found: Sequence[Row], lacking: Sequence[str]) -> str:
+    """The table, medians where there are several recordings, and the protocol."""
+    head = ("recording", "tracker", "ATE cm", "most cm", "RPE 1 s cm", "°", "with a pose %")
+    cpu = ("CPU ms a frame", "mean", "p99")
+    body = [_cells(row) for row in found]
+    if len({row.recording for row in found}) > 1:
+        body += [_cells(row) for row in _medians(found)]
+    machine = describe_machine()
+    lines = [
+        "# Trackers side by side",
+        markdown_table([[*head, *cpu], *body]),
+        "\n".join(
+            f"* {text[0].upper()}{text[1:]}."
+            for text in (
+                *PROTOCOL,
+                f"machine: {machine['cpu']}, {machine['cores']} cores; SHARE {__version__}",
+                *(f"left out: {text}" for text in lacking),
+            )
+        ),
+    ]
+    return "\n\n".join(lines) + "\n"
+
+
+def _medians(found: Sequence[Row]) -> Iterator[Row]:
+    """Of each tracker, over the recordings where it has figures."""
+    for tracker in dict.fromkeys(row.tracker for row in found):
+        mine = [row for row in found if row.tracker == tracker]
+        values = [
+            median(known)
+            if (known := [v for row in mine if not math.isnan(v := getattr(row, f.name))])
+            else math.nan
+            for f in dataclasses.fields(Row)[3:]
+        ]
+        yield Row(f"median of {len(mine)}", tracker, sum(row.frames for row in mine), *values)
+
+
+def _cells(row: Row) -> list[str]:
+    cm = [number(value, ".2f") for value in (row.ate_cm, row.most_cm, row.rpe_1s_cm, row.rpe_1s_deg)]
+    cpu = [number(value, ".1f") for value in (row.cpu_ms, row.cpu_mean_ms, row.cpu_p99_ms)]
+    return [row.recording, row.tracker, *cm, f"{100 * row.told:.1f}", *cpu]
+
+
+def draw(folder: Path, found: Sequence[Row]) -> dict[str, Path]:
+    """PNG files in `folder`, by what is to be said of each."""
+    recordings, trackers = (
+        list(dict.fromkeys(getattr(r, f) for r in found)) for f in ("recording", "tracker")
+    )
+    by = {(row.recording, row.tracker): row for row in found}
+
+    def values(field: str) -> dict[str, list[float]]:
+        return {
+            tracker: [getattr(by.get((one, tracker)), field, math.nan) for one in recordings]
+            for tracker in trackers
+        }
+
+    draw_bars(
+        folder / "errors.png",
+        {"ATE": values("ate_cm"), "RPE over 1 s": values("rpe_1s_cm")},
+        recordings,
+        "cm",
+    )
+    causal = {tracker: told for tracker, told in values("cpu_mean_ms").items() if not np.isnan(told).all()}
+    draw_bars(folder / "cpu.png", {"CPU a frame, mean": causal}, recordings, "ms")
+    return {"Errors of each tracker": folder / "errors.png", "What they take": folder / "cpu.png"}
