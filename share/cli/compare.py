@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from share.cli import options
 from share.cli.progress import LiveLine
 from share.errors import DataError, ShareError, UsageError
+
+if TYPE_CHECKING:
+    from share.io.source import Source
+    from share.run.versus import Contender, Row
 
 _NAMES = ("basalt", "orbslam3")
 
@@ -52,38 +57,70 @@ def compare(
               share evaluate compare room1 --peer basalt=peers/bin/python --out compared
     """
     settings = options.load_config(config_file)
-    from share.io.files import atomic_write, writable_dir
-    from share.io.page import page
-    from share.io.source import open_source
-    from share.run.versus import Row, contenders, csv_of, draw, markdown, rows
+    from share.io.files import writable_dir
+    from share.run.versus import contenders
 
-    recordings = dict(_recordings(sources))
+    recordings = _opened(sources)
     all_of, lacking = contenders(settings, pythons(peers), vocabulary)
+    jobs = [(name, contender) for name in recordings for contender in all_of]
+    unfit = [(name, one) for name, one in jobs if not one.fits(recordings[name])]
+    lacking += [
+        f"{one.title} on {name}, which is {recordings[name].rig.kind}: others are run with stereo+imu"
+        for name, one in unfit
+    ]
     for text in lacking:
         click.echo(f"left out: {text}", err=True)
     writable_dir(out)
-    live, found, failed = LiveLine(), list[Row](), 0
-    for number, (name, path) in enumerate(recordings.items()):
-        source = open_source(path)
-        for contender in all_of:
-            what = f"{number + 1} of {len(recordings)}: {name}: {contender.title}"
-            show = partial(_show, live, what, source.images_count)
-            try:
-                found += rows(name, source, contender, out, show)
-            except DataError as error:
-                live.end()
-                click.echo(f"share: {name}: {contender.title}: {error}", err=True)
-                failed += 1
-    live.end()
+    jobs = [job for job in jobs if job not in unfit]
+    found, failed = _run(jobs, recordings, out)
     if found:
-        text = markdown(found, lacking)
-        atomic_write(out / "table.md", text)
-        atomic_write(out / "table.csv", csv_of(found))
-        atomic_write(out / "report.html", page("Trackers side by side", text, draw(out, found)))
-        click.echo(text)
-        click.echo(f"report: {out / 'report.html'}   tables: {out / 'table.md'}, {out / 'table.csv'}")
+        _write(out, found, lacking)
     if failed:
-        raise ShareError(f"{failed} runs failed; the same command runs them again")
+        raise ShareError(f"{failed} of {len(jobs)} runs failed; the same command runs them again")
+
+
+def _opened(sources: tuple[str, ...]) -> dict[str, Source]:
+    """By name. Raises UsageError where there is no truth."""
+    from share.io.source import open_source
+    from share.run.versus import check
+
+    found = {name: open_source(path) for name, path in _recordings(sources)}
+    for name, source in found.items():
+        check(name, source)
+    return found
+
+
+def _run(
+    jobs: Sequence[tuple[str, Contender]], recordings: Mapping[str, Source], out: Path
+) -> tuple[list[Row], int]:
+    """What is known, and how many failed, which is said."""
+    from share.run.versus import rows
+
+    live, found, failed = LiveLine(), list["Row"](), 0
+    for number, (name, contender) in enumerate(jobs):
+        what = f"{number + 1} of {len(jobs)}: {name}: {contender.title}"
+        show = partial(_show, live, what, recordings[name].images_count)
+        try:
+            found += rows(name, recordings[name], contender, out, show)
+        except DataError as error:
+            live.end()
+            click.echo(f"share: {name}: {contender.title}: {error}", err=True)
+            failed += 1
+    live.end()
+    return found, failed
+
+
+def _write(out: Path, found: Sequence[Row], lacking: Sequence[str]) -> None:
+    from share.io.files import atomic_write
+    from share.io.page import page
+    from share.run.versus import csv_of, draw, markdown
+
+    text = markdown(found, lacking)
+    atomic_write(out / "table.md", text)
+    atomic_write(out / "table.csv", csv_of(found))
+    atomic_write(out / "report.html", page("Trackers side by side", text, draw(out, found)))
+    click.echo(text)
+    click.echo(f"report: {out / 'report.html'}   tables: {out / 'table.md'}, {out / 'table.csv'}")
 
 
 def _show(live: LiveLine, what: str, of: int, done: int) -> None:

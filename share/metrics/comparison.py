@@ -102,6 +102,19 @@ def no_worse(runs: Sequence[RunFigures], policy: str, other: str) -> tuple[int, 
     return sum(round(a, _DIGITS) <= round(b, _DIGITS) for a, b in known), len(known)
 
 
+def no_worse_on_average(runs: Sequence[RunFigures], policy: str, other: str) -> tuple[int, int]:
+    """The same of means over the runs of an agent on a session that both have."""
+    mine, theirs = _by_place(runs, policy), _by_place(runs, other)
+    sums: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
+    for place in (place for place in mine if place in theirs):
+        session, link, _ = place
+        for a, b in zip(mine[place].agents, theirs[place].agents, strict=True):
+            if not (math.isnan(a.ate_cm) or math.isnan(b.ate_cm)):
+                sums.setdefault((session, link, a.agent), []).append((a.ate_cm, b.ate_cm))
+    means = [np.round(np.mean(pairs, axis=0), _DIGITS) for pairs in sums.values()]
+    return sum(bool(a <= b) for a, b in means), len(means)
+
+
 def _by_place(runs: Sequence[RunFigures], policy: str) -> dict[tuple[str, str, int], RunFigures]:
     """By what they share with runs of other policies."""
     return {

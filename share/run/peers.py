@@ -129,6 +129,11 @@ def theirs(
     return run
 
 
+def fits(source: Source) -> bool:
+    """Whether peers can be run on it: it is stereo with an IMU, whatever else it has."""
+    return source.rig.cam1 is not None and source.rig.imu is not None
+
+
 def calibration(source: Source) -> dict[str, Any]:
     """The rig in plain numbers. R_rectified_cam0: from cam0 to where it looks once both images are rectified.
     Raises UsageError where it is not stereo with an IMU."""

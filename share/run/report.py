@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from share.metrics.bootstrap import Interval
-from share.metrics.comparison import MEASURES, compare, no_worse, policies
+from share.metrics.comparison import MEASURES, compare, no_worse, no_worse_on_average, policies
 from share.metrics.figures import AgentFigures, Conditions, RunFigures
 from share.run.as_text import csv_text, markdown_table, number
 from share.run.trial import Trial
@@ -125,8 +125,9 @@ def _comparison(runs: Sequence[RunFigures], names: Sequence[str], base: str) -> 
 
 def _wins(runs: Sequence[RunFigures], name: str, other: str) -> str:
     better, of = no_worse(runs, name, other)
+    means, of_means = no_worse_on_average(runs, name, other)
     told = f"in {better} of {of} runs of an agent (those in which it is in the map by both)"
-    return f"* no more than by `{other}` {told}"
+    return f"* no more than by `{other}` {told}, in {means} of {of_means} means of an agent on a session"
 
 
 def _every_agent(runs: Sequence[RunFigures], names: Sequence[str]) -> str:

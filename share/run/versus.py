@@ -27,7 +27,7 @@ from share.io.trajectory import Trajectory, format_tum
 from share.metrics.ate import ate
 from share.metrics.rpe import rpe_time
 from share.run.as_text import csv_text, markdown_table, number
-from share.run.peers import PEERS, TrackerRun, ours, theirs, version_of
+from share.run.peers import PEERS, TrackerRun, fits, ours, theirs, version_of
 from share.strict import to_mapping
 
 PROTOCOL = (
@@ -58,12 +58,14 @@ class Row:
 
 @dataclass(frozen=True)
 class Contender:
-    """key: in names of files. title: for a reader. about: plain data that says which one it is. run: given a
-    recording, a file for what else it says, and whom to tell how many frames are done."""
+    """key: in names of files. title: for a reader. about: plain data that says which one it is. fits: whether
+    it can be run on a recording. run: given one, a file for what else it says, and whom to tell how many
+    frames are done."""
 
     key: str
     title: str
     about: Mapping[str, Any]
+    fits: Callable[[Source], bool]
     run: Callable[[Source, Path, Callable[[int], None]], TrackerRun]
 
 
@@ -77,6 +79,7 @@ def contenders(
             "share",
             f"SHARE {__version__}",
             {"settings": to_mapping(settings)},
+            lambda source: True,
             lambda source, log, show: ours(source, settings, show),
         )
     ]
@@ -92,7 +95,8 @@ def contenders(
             lacking.append(f"{peer.title}: needs the vocabulary of its authors: --vocabulary ORBvoc.txt")
         else:
             extra = ["--vocabulary", str(vocabulary)] if peer.vocabulary else []
-            found.append(Contender(key, version, {}, partial(_theirs, [str(python), str(peer.path), *extra])))
+            command = [str(python), str(peer.path), *extra]
+            found.append(Contender(key, version, {}, fits, partial(_theirs, command)))
     return found, lacking
 
 
@@ -136,11 +140,16 @@ def _made_by(source: Source, contender: Contender) -> dict[str, Any]:
     return back
 
 
+def check(name: str, source: Source) -> None:
+    """Raises UsageError without a truth."""
+    if source.truth() is None:
+        raise UsageError(f"{name}: comes without a truth, so nobody can be told from another")
+
+
 def figures(name: str, tracker: str, source: Source, estimate: Trajectory, cpu_ms: Sequence[float]) -> Row:
     """NaN where there are too few poses with a truth to speak of any."""
     truth = source.truth()
-    if truth is None:
-        raise UsageError(f"{name}: comes without a truth, so nobody can be told from another")
+    assert truth is not None  # see `check`
     errors = (math.nan,) * 4
     try:
         absolute, relative = ate(estimate, truth), rpe_time(estimate, truth)

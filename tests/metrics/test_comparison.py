@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from share.metrics.comparison import MEASURES, compare, no_worse, policies
+from share.metrics.comparison import MEASURES, compare, no_worse, no_worse_on_average, policies
 from share.metrics.figures import AgentFigures, Conditions, RunFigures
 
 NAN = math.nan
@@ -18,13 +18,18 @@ def agent(name: str, kind: str, **known: float) -> AgentFigures:
 
 
 def run(
-    policy: str, session: str, latency: tuple[float, float], ate: tuple[float, float], done: int
+    policy: str,
+    session: str,
+    latency: tuple[float, float],
+    ate: tuple[float, float],
+    done: int,
+    seed: int = 0,
 ) -> RunFigures:
     agents = tuple(
         agent(name, kind, latency_ms=ms, ate_cm=cm, metres=10.0)
         for name, kind, ms, cm in zip(("ann", "bot"), ("ar", "robot"), latency, ate, strict=True)
     )
-    return RunFigures(Conditions(session, policy, "wifi5", 0), agents, 2, 1.0, 2 * done, 0, done)
+    return RunFigures(Conditions(session, policy, "wifi5", seed), agents, 2, 1.0, 2 * done, 0, done)
 
 
 RUNS = [
@@ -56,6 +61,16 @@ def test_the_base_is_all_of_itself():
 def test_whose_error_is_no_more():
     assert no_worse(RUNS, "share", "covins-g") == (2, 3)
     assert no_worse(RUNS, "covins-g", "share") == (2, 3)
+
+
+def test_whose_error_is_no_more_on_average():
+    again = [
+        run("share", "one", (10.0, 40.0), (1.0, 3.0), 20, seed=1),
+        run("covins-g", "one", (10.0, 40.0), (0.4, 3.5), 20, seed=1),  # means: 0.7 for 1.0, 2.75 for 3.0
+    ]
+    assert no_worse_on_average(RUNS, "share", "covins-g") == (2, 3)
+    assert no_worse_on_average(RUNS + again, "share", "covins-g") == (1, 3)
+    assert no_worse_on_average(RUNS + again, "covins-g", "share") == (2, 3)
 
 
 def test_policies_keep_their_order_and_every_measure_has_a_name():
