@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ from share.config import POLICIES
 from share.errors import UsageError
 
 if TYPE_CHECKING:
+    from share.run.annex import Annex
     from share.metrics.figures import RunFigures
     from share.run.trial import Trial
 
@@ -90,6 +90,7 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, as_json: bool) -> None:
     Example:  share evaluate score runs/*
     """
     from share.io.files import atomic_write, check_writable
+    from share.io.json_file import known
     from share.run.figures import figures
     from share.run.report import PROTOCOL, agents_csv
     from share.run.trial import read_trial
@@ -101,7 +102,10 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, as_json: bool) -> None:
     if csv_file is not None:
         atomic_write(csv_file, agents_csv(found))
     if as_json:
-        told = [_plain(one) | {"record": trial.record} for one, trial in zip(found, trials, strict=True)]
+        told = [
+            known(dataclasses.asdict(one) | {"metres": one.metres}) | {"record": trial.record}
+            for one, trial in zip(found, trials, strict=True)
+        ]
         click.echo(json.dumps({"protocol": PROTOCOL, "runs": told}, default=str))
         return
     for one, trial in zip(found, trials, strict=True):
@@ -125,11 +129,20 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, as_json: bool) -> None:
 )
 @on_terms
 @of_many
+@click.option(
+    "--with",
+    "annexes",
+    multiple=True,
+    metavar="PATH",
+    type=click.Path(path_type=Path, exists=True),
+    help="What else the report is to show: a folder by `evaluate sweep`, a file by `train compare --json`.",
+)
 @options.config
 @click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path))
 def ablation(
     sessions: tuple[Path, ...],
     chosen: tuple[str, ...],
+    annexes: tuple[Path, ...],
     seeds: int,
     workers: int,
     config_file: str | None,
@@ -150,22 +163,24 @@ def ablation(
     from share.io.files import writable_dir
     from share.io.session import read_session
     from share.run.ablation import plan
+    from share.run.annex import annex
     from share.run.campaign import side_by_side
     from share.run.figures import figures
     from share.run.play import Terms
 
     policies = chosen or tuple(policy for policy in POLICIES if policy != "streamed")
+    also = [annex(path) for path in annexes]
     opened = [read_session(folder) for folder in sessions]
     config = settings(config_file, told, opened)
     planned = plan(opened, policies, range(seeds), Terms("", **told), out / "runs", config)
     writable_dir(out)
     trials = list(played(planned, side_by_side(workers, len(opened)), lambda one: one.out.name).values())
     if trials:
-        _write(out, [figures(trial) for trial in trials], trials)
+        _write(out, [figures(trial) for trial in trials], trials, also)
     check_all(len(trials), len(planned))
 
 
-def _write(out: Path, found: list[RunFigures], trials: list[Trial]) -> None:
+def _write(out: Path, found: list[RunFigures], trials: list[Trial], also: list[Annex]) -> None:
     from share.io.files import atomic_write
     from share.io.page import page
     from share.metrics.comparison import policies
@@ -174,28 +189,13 @@ def _write(out: Path, found: list[RunFigures], trials: list[Trial]) -> None:
 
     names = policies(found)
     base = BASE if BASE in names else names[0]
-    report = markdown(found, trials, base)
+    report = "\n".join([markdown(found, trials, base), *(one.text for one in also)])
     atomic_write(out / "agents.csv", agents_csv(found))
     atomic_write(out / "runs.csv", runs_csv(found))
     atomic_write(out / "report.md", report)
     pictures = draw(out, found, trials, base)
+    for one in also:
+        pictures |= one.pictures
     atomic_write(out / "report.html", page("Policies compared", report, pictures))
     click.echo(report)
     click.echo(f"report: {out / 'report.html'}, {out / 'report.md'}   tables: {out}/*.csv")
-
-
-def _plain(run: RunFigures) -> dict[str, Any]:
-    """For JSON, which knows no NaN."""
-    return {name: _known(value) for name, value in (dataclasses.asdict(run) | {"metres": run.metres}).items()}
-
-
-def _known(value: Any) -> Any:
-    match value:
-        case float() if math.isnan(value):
-            return None
-        case dict():
-            return {name: _known(one) for name, one in value.items()}
-        case list() | tuple():
-            return [_known(one) for one in value]
-        case _:
-            return value

@@ -169,12 +169,9 @@ def compare(labels: Path, fitted: Path, base: Path | None, as_json: bool) -> Non
     Example:  share train compare labels --fit fit
     """
     _need_extra()
-    import dataclasses
-    import json
-
     from share.train.assembly import assemble
-    from share.train.card import table
     from share.train.compare import of_network, of_rivals
+    from share.train.score import table, to_json
 
     live = LiveLine()
     live.write("pictures go through the backbone")
@@ -184,7 +181,7 @@ def compare(labels: Path, fitted: Path, base: Path | None, as_json: bool) -> Non
     scores.append(of_network("ours", made.network, made.test))
     live.end()
     if as_json:
-        click.echo(json.dumps([dataclasses.asdict(score) for score in scores]))
+        click.echo(to_json(scores))
     else:
         click.echo(table(scores))
 

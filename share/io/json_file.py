@@ -1,8 +1,9 @@
-"""JSON that our own commands wrote, read again."""
+"""JSON that our own commands write, and read again."""
 
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,19 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
     text = _text(path)
     whole = text[: text.rfind("\n") + 1].splitlines()
     return [_object(line, f"{path}, line {number}") for number, line in enumerate(whole, 1)]
+
+
+def known(value: Any) -> Any:
+    """Plain data for JSON, which knows no NaN: None in its place."""
+    match value:
+        case float() if math.isnan(value):
+            return None
+        case dict():
+            return {name: known(one) for name, one in value.items()}
+        case list() | tuple():
+            return [known(one) for one in value]
+        case _:
+            return value
 
 
 def _text(path: Path) -> str:

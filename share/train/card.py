@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from share.train.compare import Score
+from share.train.score import Score, table
 
 _LIMITS = (
     "It estimates the error of SHARE's own trackers over that window, not how far odometry has drifted.",
@@ -37,25 +36,3 @@ def card(about: Mapping[str, Any], scores: Sequence[Score], size: int) -> str:
             "",
         ]
     )
-
-
-def table(scores: Sequence[Score]) -> str:
-    """Markdown, as the paper's: error, and time a keyframe."""
-    head = (
-        "| | RMSE cm | mean error cm | rank correlation | QoE off | in the interval | ms |",
-        "|---|" + 6 * "---|",
-    )
-    rows = [
-        f"| {s.name} | {s.rmse_cm:.3f} | {s.mae_cm:.3f} | {s.rank:.2f} | {s.qoe_off:.3f} "
-        f"| {_percent(s.covered)} | {_told(s.ms)} |"
-        for s in scores
-    ]
-    return "\n".join([*head, *rows])
-
-
-def _percent(value: float) -> str:
-    return "–" if math.isnan(value) else f"{100 * value:.0f} %"
-
-
-def _told(value: float) -> str:
-    return "–" if math.isnan(value) else f"{value:.2f}"

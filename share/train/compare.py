@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,26 +11,11 @@ from share.config import ControlConfig
 from share.control.qoe import DELAY_MS, Needs, qoe
 from share.evaluator.model import Network, estimate
 from share.train.rivals import RIVALS, Rows, Tell
+from share.train.score import Score
 from share.train.table import Collection
 from share.types import F32, F64, AgentKind
 
 _TIMED = 200  # keyframes
-
-
-@dataclass(frozen=True)
-class Score:
-    """Of one model on N keyframes. rmse_cm, mae_cm; rank: correlation with the true error (Spearman);
-    qoe_off: by how much a headset's QoE is off, on average, where nothing is late; covered: how many errors
-    lie in their intervals, NaN without any; ms: of CPU a keyframe, the features not included, NaN where it
-    was not measured."""
-
-    name: str
-    rmse_cm: float
-    mae_cm: float
-    rank: float
-    qoe_off: float
-    covered: float = float("nan")
-    ms: float = float("nan")
 
 
 def of_network(name: str, network: Network, rows: Rows) -> Score:

@@ -57,7 +57,10 @@ def test_a_run_is_scored_compared_and_never_overwritten(evaluate, plain_session,
     assert again.code == 2
     assert "give a new name" in again.err
     before = (run / "run.json").stat().st_mtime_ns
-    assert evaluate(*arguments).code == 0  # there is nothing left to play
+    models = tmp_path / "models.json"
+    models.write_text('[{"name": "ours", "rmse_cm": 1, "mae_cm": 1, "rank": 1, "qoe_off": 0}]')
+    assert evaluate(*arguments, "--with", models).code == 0  # there is nothing left to play
+    assert "Models of the error" in (out / "report.html").read_text()
     assert (run / "run.json").stat().st_mtime_ns == before
     other = evaluate(*(word for word in arguments if word != "--true-error"))
     assert other.code == 2

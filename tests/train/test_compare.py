@@ -11,9 +11,9 @@ pytest.importorskip("torch", reason="make install-train brings it")
 pytest.importorskip("sklearn", reason="make install-train brings it")
 
 from share.evaluator.features import SHAPES, kind_of
-from share.train.card import table
 from share.train.compare import of_network, scored
 from share.train.rivals import Rows, _contrast, _numbers
+from share.train.score import table
 from share.train.table import Table
 
 ERROR_CM = np.array([0.1, 0.2, 0.4, 0.8], np.float32)

@@ -1,0 +1,47 @@
+"""What else a report may hold."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from share.errors import DataError, UsageError
+from share.run.annex import annex
+from share.train.score import Score, read_scores, to_json
+
+SCORES = [Score("always the mean", 2.5, 1.0, 0.0, 0.2), Score("ours", 1.5, 0.5, 0.8, 0.1, 0.9, 1.2)]
+
+
+def test_models_of_the_error(tmp_path):
+    file = tmp_path / "scores.json"
+    file.write_text(to_json(SCORES))
+    assert "NaN" not in file.read_text()
+    first, second = read_scores(file)
+    assert math.isnan(first.ms)
+    assert second == SCORES[1]
+    made = annex(file)
+    assert made.text.startswith("## Models of the error\n")
+    assert "| ours | 1.500 | 0.500 | 0.80 | 0.100 | 90 % | 1.20 |" in made.text
+    assert made.pictures == {}
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[1]", '[{"name": "x"}]', '[{"name": "x", "more": 1}]'])
+def test_scores_that_are_damaged_are_named(tmp_path, text):
+    file = tmp_path / "scores.json"
+    file.write_text(text)
+    with pytest.raises(DataError, match=r"scores\.json: is not by `share train compare --json`, or damaged"):
+        annex(file)
+
+
+def test_settings_tried(tmp_path):
+    folder = tmp_path / "gains"
+    folder.mkdir()
+    with pytest.raises(UsageError, match="give a folder by `share evaluate sweep`"):
+        annex(folder)
+    (folder / "sweep.md").write_text("| control.kp |\n|---|\n| 0.8 |\n")
+    assert annex(folder).pictures == {}
+    (folder / "heat.png").write_bytes(b"")
+    made = annex(folder)
+    assert made.text == "## Settings tried: gains\n\n| control.kp |\n|---|\n| 0.8 |\n"
+    assert made.pictures == {"Settings tried: gains": folder / "heat.png"}
