@@ -27,7 +27,8 @@ from share.config import Config  # noqa: E402
 from share.emulate.session import cached_session  # noqa: E402
 from share.io.files import atomic_write, writable_dir  # noqa: E402
 from share.io.source import open_source  # noqa: E402
-from share.run.versus import contenders, markdown, rows  # noqa: E402
+from share.run.versus import contenders, rows  # noqa: E402
+from share.run.versus_report import markdown  # noqa: E402
 
 
 def main() -> int:

@@ -113,7 +113,7 @@ def _run(
 def _write(out: Path, found: Sequence[Row], lacking: Sequence[str]) -> None:
     from share.io.files import atomic_write
     from share.io.page import page
-    from share.run.versus import csv_of, draw, markdown
+    from share.run.versus_report import csv_of, draw, markdown
 
     text = markdown(found, lacking)
     atomic_write(out / "table.md", text)

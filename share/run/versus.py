@@ -1,4 +1,4 @@
-"""Our tracker and those of others on the same recordings: rows are kept as they come; tables and pictures."""
+"""Our tracker and those of others on the same recordings: a row of figures each, kept as it comes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -18,24 +17,16 @@ import numpy as np
 from share import __version__
 from share.config import Config
 from share.errors import DataError, UsageError
-from share.io.charts import draw_bars
 from share.io.files import atomic_write
-from share.io.json_file import read_json
+from share.io.json_file import known, read_json
 from share.io.machine import describe_machine
 from share.io.source import Source
 from share.io.trajectory import Trajectory, format_tum
 from share.metrics.ate import ate
 from share.metrics.rpe import rpe_time
-from share.run.as_text import csv_text, markdown_table, number
 from share.run.peers import PEERS, TrackerRun, fits, ours, theirs, version_of
 from share.strict import to_mapping
 
-PROTOCOL = (
-    "causal poses of all frames, as each tracker told them at the time; truth interpolated at their stamps",
-    "ATE: rms under one SE3 alignment; RPE: rms over 1 s, without one; docs/evaluation.md",
-    "CPU: process time of all threads, decoding apart; ours with its keyframes",
-    "'in the end': not causal, the trajectory by the map that a tracker has when all is over",
-)
 _END = ", in the end"
 
 
@@ -94,9 +85,10 @@ def contenders(
         elif peer.vocabulary and vocabulary is None:
             lacking.append(f"{peer.title}: needs the vocabulary of its authors: --vocabulary ORBvoc.txt")
         else:
-            extra = ["--vocabulary", str(vocabulary)] if peer.vocabulary else []
-            command = [str(python), str(peer.path), *extra]
-            found.append(Contender(key, version, {}, fits, partial(_theirs, command)))
+            given = {"vocabulary": str(vocabulary)} if peer.vocabulary else {}
+            options = [word for name, value in given.items() for word in (f"--{name}", value)]
+            command = [str(python), str(peer.path), *options]
+            found.append(Contender(key, version, given, fits, partial(_theirs, command)))
     return found, lacking
 
 
@@ -121,15 +113,16 @@ def rows(
         told = {
             "made_by": made_by,
             "machine": describe_machine(),
-            "rows": list(map(dataclasses.asdict, found)),
+            "rows": [known(dataclasses.asdict(row)) for row in found],
         }
         atomic_write(file, json.dumps(told, indent=2) + "\n")
     kept: dict[str, Any] = read_json(file)
     if kept.get("made_by") != made_by:
         raise UsageError(f"{file}: is of another recording, version or setting; give another --out")
     try:
-        yield from (Row(**row) for row in kept["rows"])
-    except (KeyError, TypeError) as error:
+        for row in kept["rows"]:
+            yield Row(**{key: math.nan if value is None else value for key, value in row.items()})
+    except (KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{file}: is damaged: {error!r}; remove it") from None
 
 
@@ -162,74 +155,3 @@ def figures(name: str, tracker: str, source: Source, estimate: Trajectory, cpu_m
     )
     count = source.images_count
     return Row(name, tracker, count, len(estimate.stamps_ns) / max(count, 1), *errors, *cpu)
-
-
-def csv_of(found: Sequence[Row]) -> str:
-    """A line a row."""
-    return csv_text([f.name for f in dataclasses.fields(Row)], map(dataclasses.astuple, found))
-
-
-def markdown(found: Sequence[Row], lacking: Sequence[str]) -> str:
-    """The table, medians where there are several recordings, and the protocol."""
-    head = ("recording", "tracker", "ATE cm", "most cm", "RPE 1 s cm", "°", "with a pose %")
-    cpu = ("CPU ms a frame", "mean", "p99")
-    body = [_cells(row) for row in found]
-    if len({row.recording for row in found}) > 1:
-        body += [_cells(row) for row in _medians(found)]
-    machine = describe_machine()
-    lines = [
-        "# Trackers side by side",
-        markdown_table([[*head, *cpu], *body]),
-        "\n".join(
-            f"* {text[0].upper()}{text[1:]}."
-            for text in (
-                *PROTOCOL,
-                f"machine: {machine['cpu']}, {machine['cores']} cores; SHARE {__version__}",
-                *(f"left out: {text}" for text in lacking),
-            )
-        ),
-    ]
-    return "\n\n".join(lines) + "\n"
-
-
-def _medians(found: Sequence[Row]) -> Iterator[Row]:
-    """Of each tracker, over the recordings where it has figures."""
-    for tracker in dict.fromkeys(row.tracker for row in found):
-        mine = [row for row in found if row.tracker == tracker]
-        values = [
-            median(known)
-            if (known := [v for row in mine if not math.isnan(v := getattr(row, f.name))])
-            else math.nan
-            for f in dataclasses.fields(Row)[3:]
-        ]
-        yield Row(f"median of {len(mine)}", tracker, sum(row.frames for row in mine), *values)
-
-
-def _cells(row: Row) -> list[str]:
-    cm = [number(value, ".2f") for value in (row.ate_cm, row.most_cm, row.rpe_1s_cm, row.rpe_1s_deg)]
-    cpu = [number(value, ".1f") for value in (row.cpu_ms, row.cpu_mean_ms, row.cpu_p99_ms)]
-    return [row.recording, row.tracker, *cm, f"{100 * row.told:.1f}", *cpu]
-
-
-def draw(folder: Path, found: Sequence[Row]) -> dict[str, Path]:
-    """PNG files in `folder`, by what is to be said of each."""
-    recordings, trackers = (
-        list(dict.fromkeys(getattr(r, f) for r in found)) for f in ("recording", "tracker")
-    )
-    by = {(row.recording, row.tracker): row for row in found}
-
-    def values(field: str) -> dict[str, list[float]]:
-        return {
-            tracker: [getattr(by.get((one, tracker)), field, math.nan) for one in recordings]
-            for tracker in trackers
-        }
-
-    draw_bars(
-        folder / "errors.png",
-        {"ATE": values("ate_cm"), "RPE over 1 s": values("rpe_1s_cm")},
-        recordings,
-        "cm",
-    )
-    causal = {tracker: told for tracker, told in values("cpu_mean_ms").items() if not np.isnan(told).all()}
-    draw_bars(folder / "cpu.png", {"CPU a frame, mean": causal}, recordings, "ms")
-    return {"Errors of each tracker": folder / "errors.png", "What they take": folder / "cpu.png"}
