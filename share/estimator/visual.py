@@ -103,7 +103,17 @@ class VisualTracker:
         points = np.where(rows[:, None] >= 0, self._map.points[rows], np.nan)
         z = se3.transform(se3.inverse(self._T_odom_cam), points)[:, 2]
         believed = np.arange(len(rows)) < len(self._tracks.ids)
-        return Footing(found.px, believed, z, max(self._sought, len(rows)), len(self._map.ids))
+        due, known = max(self._sought, len(rows)), len(self._map.ids)
+        return Footing(found.px, believed, z, due, known, self._surprise(found.px, rows))
+
+    def _surprise(self, px: F32, rows: I64) -> float:
+        """See `Footing`: of features at px (N, 2) that the map has in rows (N,), -1 where it has not."""
+        assert self._T_odom_cam is not None
+        there = rows >= 0
+        off = (px[there] - self._project(se3.inverse(self._T_odom_cam), rows[there])) / self._config.noise_px
+        far = (off**2).sum(axis=1)
+        far = far[np.isfinite(far)]
+        return float(np.median(far)) if len(far) else 0.0
 
     # ------------------------------------------------------------------ the usual frame
 

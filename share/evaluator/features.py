@@ -32,7 +32,7 @@ def kind_of(name: str) -> type[np.generic]:
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """picture (128, 128) uint8, psd (3, 12, 16), scalars (8,) and recent (26,) float32."""
+    """picture (128, 128) uint8, psd (3, 12, 16), scalars (8,) and recent (30,) float32."""
 
     picture: U8
     psd: F32
@@ -60,7 +60,7 @@ class Observer:
         spread = psd(small, footing, (image.shape[1], image.shape[0]))
         now = scalars(small, footing, lately.sigma_cm)
         picture = _scaled(small, SHAPES["picture"])
-        return Features(picture, spread, now, self._recent.after(stamp_ns, now, lately))
+        return Features(picture, spread, now, self._recent.after(stamp_ns, now, footing.surprise, lately))
 
 
 def _scaled(image: U8, size: tuple[int, ...]) -> U8:

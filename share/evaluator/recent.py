@@ -5,6 +5,7 @@ A keyframe shows how well its tracker fares now; what was lost three seconds ago
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -13,22 +14,30 @@ from share.evaluator.odometer import Lately
 from share.evaluator.scalars import NAMES
 from share.types import F32
 
-RECENT = (*(f"{what} {name}" for what in ("mean", "least", "most") for name in NAMES), "way", "turn")
+_SURPRISE = "surprise"
+RECENT = (
+    *(f"{what} {name}" for what in ("mean", "least", "most") for name in (*NAMES, _SURPRISE)),
+    _SURPRISE,
+    "way",
+    "turn",
+)
 _FAR_M, _TURNED_RAD = 5.0, 5.0  # count as 1
+_AMAZED = 100.0  # squared sigmas, the same
 
 
 class Recent:
     """Of one agent, keyframe by keyframe."""
 
     def __init__(self) -> None:
-        self._seen: deque[tuple[int, F32]] = deque()  # stamp, its scalars
+        self._seen: deque[tuple[int, F32]] = deque()  # stamp, its scalars and its surprise
 
-    def after(self, stamp_ns: int, scalars: F32, lately: Lately) -> F32:
-        """(26,) as `RECENT`: mean, least and most of each of the scalars (8,) since `lately` began, and how
-        far the body went and turned."""
+    def after(self, stamp_ns: int, scalars: F32, surprise: float, lately: Lately) -> F32:
+        """(30,) as `RECENT`: mean, least and most of each of the scalars (8,) and of the surprise (`Footing`)
+        since `lately` began, the surprise now, and how far the body went and turned."""
         while self._seen and self._seen[0][0] < lately.since_ns:
             self._seen.popleft()
-        self._seen.append((stamp_ns, scalars))
-        seen = np.stack([scalars for _, scalars in self._seen])
-        moved = np.array([lately.way_m / _FAR_M, lately.turn_rad / _TURNED_RAD], np.float32)
-        return np.concatenate([seen.mean(axis=0), seen.min(axis=0), seen.max(axis=0), moved])
+        now = math.log1p(surprise) / math.log1p(_AMAZED)
+        self._seen.append((stamp_ns, np.append(scalars, np.float32(now))))
+        seen = np.stack([row for _, row in self._seen])
+        more = np.array([now, lately.way_m / _FAR_M, lately.turn_rad / _TURNED_RAD], np.float32)
+        return np.concatenate([seen.mean(axis=0), seen.min(axis=0), seen.max(axis=0), more])

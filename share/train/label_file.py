@@ -26,7 +26,7 @@ SCHEMA = 2
 @dataclass(frozen=True, eq=False)
 class Labels:
     """Keyframes of one run, in order: stamps_ns (N,); error_cm (N,), NaN unknown; picture (N, 128, 128), psd
-    (N, 3, 12, 16), scalars (N, 8), recent (N, 26) as in `Features`. about: plain data."""
+    (N, 3, 12, 16), scalars (N, 8), recent (N, 30) as in `Features`. about: plain data."""
 
     about: dict[str, Any]
     stamps_ns: I64

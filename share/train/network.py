@@ -20,7 +20,7 @@ LOW, HIGH = 0.05, 0.95  # quantiles
 
 
 class Head(nn.Module):  # type: ignore[misc]
-    """deep (N, 1280), psd (N, 3, 12, 16), numbers (N, 34: scalars, recent) to log of cm (N, 3):
+    """deep (N, 1280), psd (N, 3, 12, 16), numbers (N, 38: scalars, recent) to log of cm (N, 3):
     expected, low, high."""
 
     def __init__(self, dropout: float = 0.0) -> None:

@@ -23,7 +23,7 @@ _LEAST_CM, _MOST_CM = 0.01, 100.0  # beyond, a label is a tracker that was lost 
 @dataclass(frozen=True, eq=False)
 class Table(Columns):
     """N keyframes whose error is known: run (N,), of which each is; error_cm (N,); picture (N, 128, 128),
-    psd (N, 3, 12, 16), scalars (N, 8), recent (N, 26) as in `Features`."""
+    psd (N, 3, 12, 16), scalars (N, 8), recent (N, 30) as in `Features`."""
 
     run: I64
     error_cm: F32
@@ -39,7 +39,7 @@ class Table(Columns):
 
     @property
     def numbers(self) -> F32:
-        """(N, 34): scalars and recent."""
+        """(N, 38): scalars and recent."""
         return np.concatenate([self.scalars, self.recent], axis=1)
 
     def features(self) -> Iterator[Features]:

@@ -48,6 +48,7 @@ def test_what_a_pose_rests_on_is_counted_and_in_the_image(walk):
         assert points / footing.sought > 0.5
         assert rig.cam0.inside(footing.px).all()
         assert footing.known > 20
+        assert 0 < footing.surprise < 3
 
 
 def test_depths_are_those_that_stereo_measures(walk):

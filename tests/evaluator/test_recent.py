@@ -15,7 +15,7 @@ S = 1_000_000_000
 def told(recent: Recent, stamp_ns: int, value: float, since_ns: int, **moved: float) -> dict[str, float]:
     lately = Lately(since_ns, moved.get("way_m", 0.0), moved.get("turn_rad", 0.0), 1.0)
     scalars = np.linspace(value, value + 0.7, len(NAMES), dtype=np.float32)
-    return dict(zip(RECENT, recent.after(stamp_ns, scalars, lately).tolist(), strict=True))
+    return dict(zip(RECENT, recent.after(stamp_ns, scalars, moved.get("surprise", 0.0), lately).tolist(), strict=True))
 
 
 def test_of_one_keyframe_all_are_itself():
@@ -36,6 +36,14 @@ def test_what_was_worst_stays_until_the_window_has_passed():
     later = told(recent, 6 * S, 0.3, S)
     assert later["most brightness"] == pytest.approx(0.3)
     assert later["least brightness"] == pytest.approx(0.1)  # at the window's very beginning
+
+
+def test_surprise_is_told_as_it_is_and_as_it_was():
+    recent = Recent()
+    told(recent, 0, 0.5, -5 * S, surprise=100.0)
+    now = told(recent, S, 0.5, -4 * S, surprise=0.0)
+    assert (now["surprise"], now["most surprise"]) == pytest.approx((0, 1))
+    assert now["mean surprise"] == pytest.approx(0.5)
 
 
 def test_how_far_it_went_and_turned():

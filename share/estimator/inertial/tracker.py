@@ -111,7 +111,8 @@ class InertialTracker:
     def footing(self) -> Footing:
         """Of the frame just tracked, one with a pose."""
         assert self._scene is not None
-        return self._scene.footing()
+        known = self._surprise[np.isfinite(self._surprise)]
+        return self._scene.footing(float(np.median(known)) if len(known) else 0.0)
 
     def predict(self, t_ns: int, imu: ImuBatch | None = None) -> F64 | None:
         """T_odom_body (4, 4) at a time after the last frame's, IMU time: for renderers, between frames.
