@@ -1,0 +1,77 @@
+"""What ORB-SLAM3's adaptor tells it, without ORB-SLAM3: its settings as OpenCV reads them, its IMU samples."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from recordings import make_euroc
+
+from share.io.source import open_source
+from share.run.peers import PEERS, calibration, moments
+
+SCRIPT = f"""
+import json, sys, types
+sys.path.insert(0, {str(PEERS["orbslam3"].path.parent)!r})
+sys.modules["pyorbslam3"] = types.ModuleType("pyorbslam3")
+import orbslam3
+from peer_wire import read_line, read_moment, write_line
+
+told = read_line(sys.stdin.buffer)
+samples, taken = orbslam3.Samples(), []
+while (moment := read_moment(sys.stdin.buffer)) is not None:
+    taken.append(samples.until(moment, 0)[:, 0].tolist())
+write_line(orbslam3.ANSWERS, dict(settings=orbslam3.settings(told), taken=taken))
+"""
+
+
+@pytest.fixture
+def source(tmp_path):
+    return open_source(str(make_euroc(tmp_path / "recording", frames=8)))
+
+
+@pytest.fixture
+def told(source, tmp_path):
+    """What the adaptor makes of the recording."""
+    from share.peers.peer_wire import write_line, write_moment
+
+    with (tmp_path / "moments").open("wb") as file:
+        write_line(file, calibration(source))
+        for moment in moments(source):
+            write_moment(file, moment)
+    with (tmp_path / "moments").open("rb") as file:
+        done = subprocess.run([sys.executable, "-c", SCRIPT], stdin=file, capture_output=True, timeout=60)
+    assert done.returncode == 0, done.stderr.decode()
+    return json.loads(done.stdout)
+
+
+def test_settings_are_the_recordings(told, source):
+    read = cv2.FileStorage(told["settings"], cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    rig = source.rig
+    assert read.getNode("Camera.type").string() == "PinHole"
+    assert read.getNode("Camera.width").real() == rig.cam0.width
+    for name, camera in (("Camera1", rig.cam0), ("Camera2", rig.cam1)):
+        for key, value in zip(("fx", "fy", "cx", "cy"), camera.K[[0, 1, 0, 1], [0, 1, 2, 2]], strict=True):
+            node = read.getNode(f"{name}.{key}")
+            assert node.isReal()  # ORB-SLAM3 ends where a number of these is whole
+            assert node.real() == pytest.approx(value)
+        assert read.getNode(f"{name}.p2").real() == pytest.approx(camera.distortion[3])
+    T_cam0_cam1 = read.getNode("Stereo.T_c1_c2").mat()
+    assert T_cam0_cam1 == pytest.approx(np.linalg.inv(rig.T_cam1_cam0), abs=1e-6)
+    assert read.getNode("IMU.T_b_c1").mat() == pytest.approx(rig.T_body_cam0, abs=1e-6)
+    for name in ("IMU.Frequency", "IMU.NoiseGyro", "Stereo.ThDepth", "Viewer.ViewpointX"):
+        assert read.getNode(name).isReal()
+
+
+def test_each_frame_has_the_samples_since_the_one_before(told, source):
+    stamps = [moment.stamp_ns for moment in moments(source)]
+    recorded = [m.stamp_ns for m in source.measurements() if m.stream == "imu"]
+    before = 0
+    for stamp, taken in zip(stamps, told["taken"], strict=True):
+        wanted = [1e-9 * ns for ns in recorded if before < ns <= stamp]
+        assert taken == pytest.approx(wanted, abs=1e-6)
+        before = stamp
