@@ -3,8 +3,8 @@
     python tools/make_error_rooms.py --out DIR [--rooms 60] [--first 0] [--seconds 30]
     share train labels DIR/* --runs 6 --out labels
 
-Room N is always the same: a scene, its seed, two who move in it (people who stroll or hurry, robots) and, in every
-second room, lamps that go on and off. A minute or two each on two cores; a room that is there is left.
+Room N is always the same: a scene, its seed, two who move in it (people who stroll or hurry, robots) and, in
+every second room, lamps that go on and off. A minute or two each on two cores; a room that is there is left.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ def recipe(number: int, seconds: float) -> Recipe:
     first = f"ann={_person(rng)}"
     second = f"robot=robot:speed={rng.uniform(0.2, 0.7):.2f}" if number % 3 == 2 else f"bob={_person(rng)}"
     lamps = rng.uniform(4, 10), rng.uniform(1, 4)
-    effects = Effects(lamp_every_s=round(lamps[0], 1), lamp_stops=round(lamps[1], 1)) if number % 2 else Effects()
+    effects = (
+        Effects(lamp_every_s=round(lamps[0], 1), lamp_stops=round(lamps[1], 1)) if number % 2 else Effects()
+    )
     scene, sensors = _SCENES[number % len(_SCENES)], {"": "stereo"}
     return Recipe(scene, (first, second), seconds, 10_000 + number, None, sensors, _PROFILE, effects)
 

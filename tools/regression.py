@@ -1,13 +1,13 @@
 """Has anything become worse? A small fixed set in virtual time, held against what it came to before.
 
-    python tools/regression.py                 compare with the last line of the history; exit code 1 if worse
+    python tools/regression.py                 compare with the last line of the history; code 1 if worse
     python tools/regression.py --keep WHY      compare, and add this run to the history
-    python tools/regression.py --chance 6      how far figures move by chance alone, which is what NOISE is from
+    python tools/regression.py --chance 6      how far figures move by chance alone: what NOISE is from
     python tools/regression.py --picture FILE  draw the history, run nothing
 
-The set: two rooms, in each two headsets and a robot for 30 s, over wifi5 by `share` and by `covins-g`, two seeds.
-Sessions are made once and kept (--cache). In virtual time nothing depends on how busy this machine is; how quick
-it is, `make bench` says. The history: docs/results/regression.jsonl.
+The set: two rooms, in each two headsets and a robot for 30 s, over wifi5 by `share` and by `covins-g`, two
+seeds. Sessions are made once and kept (--cache). In virtual time nothing depends on how busy this machine is;
+how quick it is, `make bench` says. The history: docs/results/regression.jsonl.
 """
 
 from __future__ import annotations
@@ -139,9 +139,7 @@ def compare(options: argparse.Namespace) -> None:
 
 def played(config: Config, options: argparse.Namespace) -> Figures:
     """Raises ShareError where a run fails."""
-    sessions = [
-        read_session(cached_session(recipe, options.cache, options.workers)) for recipe in SET
-    ]
+    sessions = [read_session(cached_session(recipe, options.cache, options.workers)) for recipe in SET]
     with tempfile.TemporaryDirectory() as folder:
         terms = Terms("", link="wifi5", true_error=True, virtual=True)
         runs = plan(sessions, POLICIES, SEEDS, terms, Path(folder), config)
@@ -215,7 +213,9 @@ def commit() -> str:
     """Of this tree, with a + where it has changes; empty where there is no git."""
     try:
         told = ["git", "describe", "--always", "--dirty=+"]
-        return subprocess.run(told, cwd=HISTORY.parent, capture_output=True, text=True, check=True).stdout.strip()
+        return subprocess.run(
+            told, cwd=HISTORY.parent, capture_output=True, text=True, check=True
+        ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return ""
 

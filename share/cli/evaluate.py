@@ -20,8 +20,8 @@ from share.config import POLICIES
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.run.annex import Annex
     from share.metrics.figures import RunFigures
+    from share.run.annex import Annex
     from share.run.trial import Trial
 
 BASE = "covins-g"  # what the others are told as a part of

@@ -112,7 +112,7 @@ def no_worse_on_average(runs: Sequence[RunFigures], policy: str, other: str) -> 
             if not (math.isnan(a.ate_cm) or math.isnan(b.ate_cm)):
                 sums.setdefault((session, link, a.agent), []).append((a.ate_cm, b.ate_cm))
     means = [np.round(np.mean(pairs, axis=0), _DIGITS) for pairs in sums.values()]
-    return sum(bool(a <= b) for a, b in means), len(means)
+    return sum(bool(mean[0] <= mean[1]) for mean in means), len(means)
 
 
 def _by_place(runs: Sequence[RunFigures], policy: str) -> dict[tuple[str, str, int], RunFigures]:

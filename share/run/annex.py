@@ -26,7 +26,8 @@ def annex(path: Path) -> Annex:
         return Annex(f"## Models of the error\n\n{table(read_scores(path))}\n", {})
     if not (path / SWEEP).is_file():
         raise UsageError(
-            f"--with {path}: give a folder by `share evaluate sweep`, or a file by `share train compare --json`"
+            f"--with {path}: give a folder by `share evaluate sweep`, "
+            f"or a file by `share train compare --json`"
         )
     heat = path / HEAT
     pictures = {f"Settings tried: {path.name}": heat} if heat.is_file() else {}

@@ -15,7 +15,9 @@ S = 1_000_000_000
 def told(recent: Recent, stamp_ns: int, value: float, since_ns: int, **moved: float) -> dict[str, float]:
     lately = Lately(since_ns, moved.get("way_m", 0.0), moved.get("turn_rad", 0.0), 1.0)
     scalars = np.linspace(value, value + 0.7, len(NAMES), dtype=np.float32)
-    return dict(zip(RECENT, recent.after(stamp_ns, scalars, moved.get("surprise", 0.0), lately).tolist(), strict=True))
+    return dict(
+        zip(RECENT, recent.after(stamp_ns, scalars, moved.get("surprise", 0.0), lately).tolist(), strict=True)
+    )
 
 
 def test_of_one_keyframe_all_are_itself():

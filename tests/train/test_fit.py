@@ -15,6 +15,7 @@ pytest.importorskip("sklearn", reason="make install-train brings it")
 from made_features import made_features  # noqa: E402
 from tiny_backbone import tiny_backbone  # noqa: E402
 
+from share.evaluator.features import SHAPES  # noqa: E402
 from share.io.network import deep_of, open_network  # noqa: E402
 from share.train.fit import FitOptions, fit  # noqa: E402
 from share.train.label_file import Labels, write_labels  # noqa: E402
@@ -22,6 +23,7 @@ from share.train.table import collect  # noqa: E402
 from share.train.teach import _Scale  # noqa: E402
 
 ROOMS, EACH = 8, 150
+NOTHING = np.zeros(SHAPES["recent"], np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +38,7 @@ def labels(tmp_path_factory) -> Path:
             scalars[5] = 1 - few
             picture = np.full((128, 128), 255 * (1 - dark), np.uint8)
             error_cm = 0.2 * np.exp(2 * dark + 1.5 * few + 0.2 * rng.standard_normal())
-            seen = made_features(rng, picture=picture, scalars=scalars)
+            seen = made_features(rng, picture=picture, scalars=scalars, recent=NOTHING)
             rows.append((k, float(error_cm) if k else float("nan"), seen))
         made = {"scene": "warehouse", "seed": room, "size": None, "motions": ["ar=walk:"]}
         write_labels(
