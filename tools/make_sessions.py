@@ -4,7 +4,7 @@
 
 Names: warehouse-1 to -5 and firestation-1 to -5 (three agents, 60 s, 9 x 6 x 4 m), euroc-v1 and euroc-mh (two
 recorded flights in one room), tumvi-rooms (three recorded motions in one room). A session that is there is
-left; three to eight minutes each on two cores. Then: share evaluate ablation DIR/warehouse-* DIR/firestation-* ...
+left; three to eight minutes each on two cores.
 """
 
 from __future__ import annotations

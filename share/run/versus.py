@@ -121,8 +121,8 @@ def rows(
         raise UsageError(f"{file}: is of another recording, version or setting; give another --out")
     try:
         for row in kept["rows"]:
-            told: dict[str, Any] = {k: math.nan if v is None else v for k, v in row.items()}
-            yield Row(**told)
+            values: dict[str, Any] = {k: math.nan if v is None else v for k, v in row.items()}
+            yield Row(**values)
     except (KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{file}: is damaged: {error!r}; remove it") from None
 
