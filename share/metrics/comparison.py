@@ -111,8 +111,8 @@ def no_worse_on_average(runs: Sequence[RunFigures], policy: str, other: str) -> 
         for a, b in zip(mine[place].agents, theirs[place].agents, strict=True):
             if not (math.isnan(a.ate_cm) or math.isnan(b.ate_cm)):
                 sums.setdefault((session, link, a.agent), []).append((a.ate_cm, b.ate_cm))
-    means = [np.round(np.mean(pairs, axis=0), _DIGITS) for pairs in sums.values()]
-    return sum(bool(mean[0] <= mean[1]) for mean in means), len(means)
+    means = np.array([np.mean(pairs, axis=0) for pairs in sums.values()]).reshape(-1, 2).round(_DIGITS)
+    return int((means[:, 0] <= means[:, 1]).sum()), len(means)
 
 
 def _by_place(runs: Sequence[RunFigures], policy: str) -> dict[tuple[str, str, int], RunFigures]:

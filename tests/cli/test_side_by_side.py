@@ -70,9 +70,8 @@ def test_all_are_scored_alike_and_kept(compare, plain_session, tmp_path):
     ours, idle, end = (rows[f"{name}/ar1", key] for key in (SHARE, "Idler 1", "Idler 1, in the end"))
     frames = int(ours["frames"])
     assert float(ours["ate_cm"]) < 1 < float(idle["ate_cm"])
-    assert float(idle["told"]) == pytest.approx(
-        (frames - 3) / frames, abs=0.03
-    )  # of the last, no IMU sample comes after
+    tracked = (frames - 3) / frames  # and after the last one comes no IMU sample
+    assert float(idle["told"]) == pytest.approx(tracked, abs=0.03)
     assert float(idle["cpu_ms"]) == pytest.approx(2)
     assert float(ours["cpu_ms"]) > 0
     assert end["cpu_ms"] == ""
