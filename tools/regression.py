@@ -152,18 +152,18 @@ def played(config: Config, options: argparse.Namespace) -> Figures:
 
 
 def figures_of(runs: Sequence[RunFigures]) -> Figures:
-    """Means by name, `POLICY: MEASURE`."""
-    out = {f"{POLICIES[0]}: {_ODOMETRY}": _mean(a.odom_ate_cm for run in runs for a in run.agents)}
+    """Medians by name, `POLICY: MEASURE`: one run that ends amid a join should not be all there is to see."""
+    out = {f"{POLICIES[0]}: {_ODOMETRY}": _median(a.odom_ate_cm for run in runs for a in run.agents)}
     for policy in policies(runs):
         mine = [run for run in runs if run.conditions.policy == policy]
         for measure in (m for m in MEASURES if m.name in NOISE):
-            out[f"{policy}: {measure.name}"] = _mean(measure.of(run) for run in mine)
+            out[f"{policy}: {measure.name}"] = _median(measure.of(run) for run in mine)
     return out
 
 
-def _mean(values: Any) -> float:
+def _median(values: Any) -> float:
     known = [value for value in values if not math.isnan(value)]
-    return round(float(np.mean(known)), 6) if known else math.nan
+    return round(float(np.median(known)), 6) if known else math.nan
 
 
 def judged(now: Mapping[str, float], before: Mapping[str, float]) -> list[Verdict]:

@@ -20,6 +20,7 @@ from share.estimator.inertial.features import Looks
 from share.estimator.inertial.health import Agreement
 from share.estimator.inertial.imu import integrate
 from share.estimator.inertial.noise import louder, without
+from share.estimator.inertial.pivot import Pivot
 from share.estimator.inertial.samples import Samples, coasting, mean_rate, unclipped
 from share.estimator.inertial.scene import Scene
 from share.estimator.inertial.shown import Shown
@@ -69,7 +70,7 @@ class InertialTracker:
         self._knows_up = False  # the IMU said so
         self._new_stretch = False  # the next keyframe begins one
         self._T_keyframe = np.eye(4)
-        self._shown = Shown()
+        self._shown, self._pivot = Shown(), Pivot()
         self._places = LocalMap(places.max_keyframes)  # where to look for oneself when LOST
         self._places_config, self._seed, self._places_tried = places, seed, 0
         self._lost_ns: int | None = None
@@ -106,7 +107,8 @@ class InertialTracker:
         tilt = self._tilt(s)
         up = s.T[2, :3] if self._knows_up and tilt < _LEVEL_RAD else np.zeros(3)
         T_last_body, cov = self._shown.motion(s, new_stretch)
-        return Candidate(s.T, T_last_body, cov, up, tilt / np.sqrt(2), view, new_stretch)
+        T_odom_body = self._pivot.told(s.T)
+        return Candidate(T_odom_body, T_last_body, cov, up, tilt / np.sqrt(2), view, new_stretch)
 
     def footing(self) -> Footing:
         """Of the frame just tracked, one with a pose."""
@@ -126,7 +128,8 @@ class InertialTracker:
         silent_ns, gravity = round(self._config.silent_s * 1e9), self._config.gravity
         heard = known.between(s.stamp_ns, min(t_ns, known.last_ns), silent_ns)
         going_on = coasting(s, self._rate, t_ns, gravity) if heard is None else heard
-        return integrate(s.T, s.v, s.bg, s.ba, going_on, s.stamp_ns, t_ns, self._noise, gravity).T
+        then = integrate(s.T, s.v, s.bg, s.ba, going_on, s.stamp_ns, t_ns, self._noise, gravity)
+        return self._pivot.told(then.T)
 
     # ------------------------------------------------------------------ the usual frame
 
@@ -174,6 +177,10 @@ class InertialTracker:
     def _told(self, s: State, state: TrackState, wanted: bool, count: int) -> TrackResult:
         first, self._ready, self._window = not self._ready, True, None
         new_stretch = first and self._new_stretch
+        if first:
+            self._pivot.begin(s, new_stretch)
+        else:
+            self._pivot.after(s)
         sound = self._agreement.sound
         return TrackResult(state, self._pose(s), wanted or first, count, new_stretch, ekf.pose_cov(s), sound)
 
@@ -327,7 +334,7 @@ class InertialTracker:
 
     def _pose(self, s: State) -> F64:
         """At the frame's stamp, IMU time: the state is where the image was taken."""
-        return se3.exp(-ekf.twist(s, self._rate) * s.offset_s) @ s.T
+        return self._pivot.told(se3.exp(-ekf.twist(s, self._rate) * s.offset_s) @ s.T)
 
     # ------------------------------------------------------------------ keyframes
 
