@@ -54,7 +54,8 @@ class AgentFiles:
         self._line("map.tum", stamp_ns, T_map_body)
 
     def finish(self, log: RunLog, report: dict[str, Any]) -> None:
-        """Close what is open and give everything its name. Raises ShareError if the disk was full."""
+        """Close what is open and give everything its name; the report also says in which map map.tum is, which
+        a correction after the last frame does not change. Raises ShareError if the disk was full."""
         files = list(self._open.values())
         self._close()
         if self._out is None:
@@ -71,6 +72,7 @@ class AgentFiles:
             name = f"map.before-{number}.tum"
             (self._out / f"{name}.partial").replace(self._out / name)
         atomic_write(self._out / "latency.csv", log.csv())
+        report = report | {"map_tum": self._map_id}
         atomic_write(self._out / "report.json", json.dumps(report, indent=2) + "\n")
 
     def discard(self) -> None:

@@ -54,11 +54,12 @@ def _ate(estimate: Trajectory | None, truth: Trajectory) -> Ate | None:
 
 
 def _joint(agents: dict[str, AgentScore]) -> JointAte | None:
-    """Of the map that most agents ended in."""
+    """Of the map that most agents were in when their last pose was told."""
     members: dict[str, list[str]] = {}
     for name, agent in agents.items():
         if agent.map is not None:
-            members.setdefault(agent.report["protocol"]["map_id"], []).append(name)
+            by_report = agent.report["protocol"]["map_id"]  # of runs before map_tum was written
+            members.setdefault(agent.report.get("map_tum", by_report), []).append(name)
     if not members:
         return None
     largest = max(members.values(), key=len)

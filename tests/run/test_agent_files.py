@@ -1,0 +1,42 @@
+"""In which map an agent's poses are, and who is scored together."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from share.io.trajectory import Trajectory, format_tum, read_tum
+from share.metrics.ate import ate
+from share.metrics.runlog import RunLog
+from share.run.agent_files import AgentFiles
+from share.run.score import AgentScore, _joint
+
+
+def test_a_map_that_comes_after_the_last_pose_is_not_that_of_the_file(tmp_path):
+    files = AgentFiles(tmp_path, print)
+    files.odom(1, np.eye(4))
+    files.map(1, np.eye(4), "ann-1/0")
+    files.map(2, np.eye(4), "bob-1/0")
+    files.finish(RunLog(), {"protocol": {"map_id": "eve-1/0"}})
+    assert json.loads((tmp_path / "report.json").read_text())["map_tum"] == "bob-1/0"
+    assert len(read_tum(tmp_path / "map.tum").stamps_ns) == 1
+
+
+def test_who_was_told_of_the_join_too_late_is_not_scored_with_the_others(tmp_path):
+    stamps = np.arange(50) * 10**8
+    T = np.tile(np.eye(4), (50, 1, 1))
+    T[:, 0, 3], T[:, 1, 3] = np.linspace(0, 5, 50), np.sin(np.linspace(0, 5, 50))
+    truth = Trajectory(stamps, T)
+    elsewhere = Trajectory(stamps, T @ np.diag([-1.0, -1.0, 1.0, 1.0]))
+    elsewhere.T[:, 0, 3] += 8
+    (tmp_path / "x.tum").write_text(format_tum(elsewhere))
+
+    def agent(map_tum: str, told: Trajectory) -> AgentScore:
+        report = {"map_tum": map_tum, "protocol": {"map_id": "joined/0"}}
+        return AgentScore(report, ate(told, truth), told, truth)
+
+    found = _joint({"ann": agent("a/0", truth), "bob": agent("a/0", truth), "late": agent("b/0", elsewhere)})
+    assert found is not None
+    assert set(found.agents) == {"ann", "bob"}
+    assert found.joint.rmse < 1e-9
