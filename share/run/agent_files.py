@@ -54,8 +54,8 @@ class AgentFiles:
         self._line("map.tum", stamp_ns, T_map_body)
 
     def finish(self, log: RunLog, report: dict[str, Any]) -> None:
-        """Close what is open and give everything its name; the report also says in which map map.tum is, which
-        a correction after the last frame does not change. Raises ShareError if the disk was full."""
+        """Close what is open and give everything its name; the report also says in which map map.tum is: a
+        correction after the last frame does not change that. Raises ShareError if the disk was full."""
         files = list(self._open.values())
         self._close()
         if self._out is None:
