@@ -42,6 +42,7 @@ from share.io.session import read_session  # noqa: E402
 from share.metrics.comparison import MEASURES, policies  # noqa: E402
 from share.metrics.figures import RunFigures  # noqa: E402
 from share.run.ablation import plan  # noqa: E402
+from share.run.as_text import number  # noqa: E402
 from share.run.campaign import go_through, side_by_side  # noqa: E402
 from share.run.figures import figures  # noqa: E402
 from share.run.play import Terms  # noqa: E402
@@ -200,13 +201,9 @@ def by_chance(options: argparse.Namespace) -> None:
 def table(verdicts: Sequence[Verdict]) -> str:
     head = ("figure", "before", "now", "part", "noise", "")
     rows = [
-        [v.name, *(_told(x) for x in (v.before, v.now, v.part)), f"± {v.noise:g}", v.says] for v in verdicts
+        [v.name, *(number(x) for x in (v.before, v.now, v.part)), f"± {v.noise:g}", v.says] for v in verdicts
     ]
     return "\n".join(line(cells) for cells in (head, ["---"] * len(head), *rows))
-
-
-def _told(value: float) -> str:
-    return "–" if math.isnan(value) else f"{value:.3g}"
 
 
 def commit() -> str:

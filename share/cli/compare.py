@@ -12,12 +12,11 @@ import click
 from share.cli import options
 from share.cli.progress import LiveLine
 from share.errors import DataError, ShareError, UsageError
+from share.peers import PEERS
 
 if TYPE_CHECKING:
     from share.io.source import Source
     from share.run.versus import Contender, Row
-
-_NAMES = ("basalt", "orbslam3")
 
 
 @click.command(short_help="Our tracker and those of others, on the same recordings.")
@@ -27,7 +26,7 @@ _NAMES = ("basalt", "orbslam3")
     "peers",
     multiple=True,
     metavar="NAME=PYTHON",
-    help=f"Interpreter that has {' or '.join(_NAMES)}; may be repeated.  [default: the one that runs SHARE]",
+    help=f"Interpreter that has {' or '.join(PEERS)}; may be repeated.  [default: the one that runs SHARE]",
 )
 @click.option(
     "--vocabulary",
@@ -151,7 +150,7 @@ def pythons(peers: Sequence[str]) -> dict[str, Path]:
     found = {}
     for text in peers:
         name, _, python = text.partition("=")
-        if name not in _NAMES or not python:
-            raise UsageError(f"--peer {text}: give NAME=PYTHON, with a name of {', '.join(_NAMES)}")
+        if name not in PEERS or not python:
+            raise UsageError(f"--peer {text}: give NAME=PYTHON, with a name of {', '.join(PEERS)}")
         found[name] = Path(python)
     return found

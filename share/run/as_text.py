@@ -30,5 +30,10 @@ def markdown_table(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *body))
 
 
+def bullets(texts: Iterable[str]) -> str:
+    """A Markdown list of sentences."""
+    return "\n".join(f"* {text[0].upper()}{text[1:]}." for text in texts)
+
+
 def number(value: float, form: str = ".3g") -> str:
     return "–" if math.isnan(value) else format(value, form)

@@ -13,7 +13,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from share import peers
 from share.config import Config
 from share.core.measurement import IMU
 from share.core.sequencer import SequencerCounters
@@ -22,35 +21,12 @@ from share.geometry import se3
 from share.geometry.camera import Camera
 from share.io.source import Source
 from share.io.trajectory import Trajectory
+from share.peers import Peer
 from share.peers.peer_wire import Moment, read_line, write_line, write_moment
 from share.run.pipeline import frames_of, tracker_for
 from share.types import F64
 
 Show = Callable[[int], None]  # frames done
-
-
-@dataclass(frozen=True)
-class Peer:
-    """title: for a reader. package: as pip takes it. vocabulary: it needs a file that its package has not."""
-
-    title: str
-    package: str
-    script: str
-    vocabulary: bool = False
-
-    @property
-    def path(self) -> Path:
-        return Path(peers.__file__).parent / self.script
-
-    @property
-    def install(self) -> str:
-        return f"python -m venv DIR && DIR/bin/pip install {self.package}"
-
-
-PEERS = {
-    "basalt": Peer("Basalt", "depthai==3.12.0", "basalt.py"),
-    "orbslam3": Peer("ORB-SLAM3", "pyorbslam3==0.1.1", "orbslam3.py", vocabulary=True),
-}
 
 
 @dataclass

@@ -11,7 +11,7 @@ from typing import Any
 from share.metrics.bootstrap import Interval
 from share.metrics.comparison import MEASURES, compare, no_worse, no_worse_on_average, policies
 from share.metrics.figures import AgentFigures, Conditions, RunFigures
-from share.run.as_text import csv_text, markdown_table, number
+from share.run.as_text import bullets, csv_text, markdown_table, number
 from share.run.trial import Trial
 
 _AGENT = [field.name for field in dataclasses.fields(AgentFigures)]
@@ -98,7 +98,7 @@ def _provenance(runs: Sequence[RunFigures], trials: Sequence[Trial]) -> str:
         )
         + ".",
     ]
-    return "\n".join(f"* {line}" for line in (*told, *(f"{text[0].upper()}{text[1:]}." for text in PROTOCOL)))
+    return "\n".join([*(f"* {line}" for line in told), bullets(PROTOCOL)])
 
 
 def _how(trial: Trial) -> str:

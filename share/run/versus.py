@@ -18,13 +18,14 @@ from share import __version__
 from share.config import Config
 from share.errors import DataError, UsageError
 from share.io.files import atomic_write
-from share.io.json_file import known, read_json
+from share.io.json_file import known, read_json, with_nan
 from share.io.machine import describe_machine
 from share.io.source import Source
 from share.io.trajectory import Trajectory, format_tum
 from share.metrics.ate import ate
 from share.metrics.rpe import rpe_time
-from share.run.peers import PEERS, TrackerRun, fits, ours, theirs, version_of
+from share.peers import PEERS
+from share.run.peers import TrackerRun, fits, ours, theirs, version_of
 from share.strict import to_mapping
 
 _END = ", in the end"
@@ -121,8 +122,7 @@ def rows(
         raise UsageError(f"{file}: is of another recording, version or setting; give another --out")
     try:
         for row in kept["rows"]:
-            values: dict[str, Any] = {k: math.nan if v is None else v for k, v in row.items()}
-            yield Row(**values)
+            yield Row(**with_nan(row))
     except (KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{file}: is damaged: {error!r}; remove it") from None
 

@@ -13,7 +13,7 @@ import numpy as np
 from share import __version__
 from share.io.charts import draw_bars
 from share.io.machine import describe_machine
-from share.run.as_text import csv_text, markdown_table, number
+from share.run.as_text import bullets, csv_text, markdown_table, number
 from share.run.versus import Row
 
 PROTOCOL = (
@@ -40,9 +40,8 @@ def markdown(found: Sequence[Row], lacking: Sequence[str]) -> str:
     lines = [
         "# Trackers side by side",
         markdown_table([[*head, *cpu], *body]),
-        "\n".join(
-            f"* {text[0].upper()}{text[1:]}."
-            for text in (
+        bullets(
+            (
                 *PROTOCOL,
                 f"machine: {machine['cpu']}, {machine['cores']} cores; SHARE {__version__}",
                 *(f"left out: {text}" for text in lacking),

@@ -8,10 +8,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from share.errors import DataError
-from share.io.json_file import known
+from share.io.json_file import known, with_nan
 
 
 @dataclass(frozen=True)
@@ -54,13 +53,9 @@ def read_scores(path: Path) -> list[Score]:
         rows = json.loads(path.read_text())
         if not isinstance(rows, list):
             raise ValueError("it is no list")
-        return [_score({k: math.nan if v is None else v for k, v in row.items()}) for row in rows]
+        return [Score(**with_nan(row)) for row in rows]
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise DataError(f"{path}: is not by `share train compare --json`, or damaged: {error}") from None
-
-
-def _score(values: dict[str, Any]) -> Score:
-    return Score(**values)
 
 
 def _percent(value: float) -> str:

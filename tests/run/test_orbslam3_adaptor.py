@@ -12,7 +12,8 @@ import pytest
 from recordings import make_euroc
 
 from share.io.source import open_source
-from share.run.peers import PEERS, calibration, moments
+from share.peers import PEERS
+from share.run.peers import calibration, moments
 
 SCRIPT = f"""
 import json, sys, types

@@ -16,7 +16,8 @@ from share.core.sequencer import SequencerCounters
 from share.errors import DataError, UsageError
 from share.io.source import open_source
 from share.io.trajectory import Trajectory
-from share.run.peers import PEERS, calibration, moments, ours, theirs, version_of
+from share.peers import PEERS
+from share.run.peers import calibration, moments, ours, theirs, version_of
 from share.run.pipeline import frames_of
 from share.run.versus import figures
 

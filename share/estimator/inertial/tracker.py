@@ -107,14 +107,12 @@ class InertialTracker:
         tilt = self._tilt(s)
         up = s.T[2, :3] if self._knows_up and tilt < _LEVEL_RAD else np.zeros(3)
         T_last_body, cov = self._shown.motion(s, new_stretch)
-        T_odom_body = self._pivot.told(s.T)
-        return Candidate(T_odom_body, T_last_body, cov, up, tilt / np.sqrt(2), view, new_stretch)
+        return Candidate(self._pivot.told(s.T), T_last_body, cov, up, tilt / np.sqrt(2), view, new_stretch)
 
     def footing(self) -> Footing:
         """Of the frame just tracked, one with a pose."""
         assert self._scene is not None
-        known = self._surprise[np.isfinite(self._surprise)]
-        return self._scene.footing(float(np.median(known)) if len(known) else 0.0)
+        return self._scene.footing(self._surprise)
 
     def predict(self, t_ns: int, imu: ImuBatch | None = None) -> F64 | None:
         """T_odom_body (4, 4) at a time after the last frame's, IMU time: for renderers, between frames.
