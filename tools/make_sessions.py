@@ -25,14 +25,14 @@ from share.emulate.session import make_session  # noqa: E402
 
 _DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "motion"
 _D435I = "d435i:640x480@15"
-_V1, _MH = (11.0, 9.0, 4.5), (14.0, 11.0, 5.0)  # m, rooms in which the flights find a place
+_V1, _MH, _HALL = (11.0, 9.0, 4.5), (14.0, 11.0, 5.0), (10.0, 8.0, 4.0)  # m; the motions fit into them
 Size = tuple[float, float, float]
 
 
 def recipes(data: Path) -> dict[str, Recipe]:
     """By name. data: the folder that has euroc/NAME and tumvi/NAME."""
 
-    def real(scene: str, seed: int, profile: str, size: Size | None, **who: str) -> Recipe:
+    def real(scene: str, seed: int, profile: str, size: Size, **who: str) -> Recipe:
         motions = [f"{name}={path.partition('/')[0]}:{data / path}" for name, path in who.items()]
         return Recipe(scene, tuple(motions), 60.0, seed, size, profiles={"": profile})
 
@@ -45,7 +45,7 @@ def recipes(data: Path) -> dict[str, Recipe]:
         "euroc-v1": real("firestation", 61, "euroc", _V1, one="euroc/V1_01_easy", two="euroc/V1_02_medium"),
         "euroc-mh": real("warehouse", 62, "euroc", _MH, one="euroc/MH_01_easy", three="euroc/MH_03_medium"),
         "tumvi-rooms": real(
-            "warehouse", 63, _D435I, None, ann="tumvi/room1", bob="tumvi/room2", eve="tumvi/room3"
+            "warehouse", 63, _D435I, _HALL, ann="tumvi/room1", bob="tumvi/room2", eve="tumvi/room3"
         ),
     }
 
