@@ -206,7 +206,6 @@ class Footing:
 
     px (N, 2) float32. believed (N,) bool: those that agreed with the pose. depth (N,) m in cam0, NaN unknown.
     sought: how many should have been in view. known: how many points of the tracker's map have a depth.
-    surprise: median squared distance of the features from where they were expected, in sigmas, 0 without any.
     """
 
     px: F32
@@ -214,7 +213,6 @@ class Footing:
     depth: F64
     sought: int
     known: int
-    surprise: float = 0.0
 
     def __post_init__(self) -> None:
         n = len(self.px)
@@ -223,7 +221,6 @@ class Footing:
             px=checked("px", self.px, (n, 2), np.float32),
             believed=checked("believed", self.believed, (n,), np.bool_),
             depth=checked("depth", self.depth, (n,), np.float64, finite=False),
-            surprise=checked_sigma("surprise", self.surprise),
         )
 
 

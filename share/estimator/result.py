@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from share.types import F64, TrackState, Wait
 
 
@@ -11,10 +13,11 @@ from share.types import F64, TrackState, Wait
 class TrackResult:
     """What one frame came to. T_odom_body is None where there is no pose to be had.
 
-    keyframe: this frame became one; the tracker's `keyframe` gives what it shows. points: how many
-    the pose rests on. new_stretch: odometry broke before this keyframe. cov (6, 6): of T_odom_body, perturbed
-    on the right, where the tracker knows it. sound: False while images and IMU contradict each other. waits:
-    for what, where there is no pose yet.
+    keyframe: this frame became one; the tracker's `keyframe` gives what it shows. points: how many the pose
+    rests on. new_stretch: odometry broke before this keyframe. cov (6, 6): of T_odom_body, perturbed on the
+    right, where the tracker knows it. sound: False while images and IMU contradict each other. waits: for
+    what, where there is no pose yet. found: how many features were, also those that were not believed.
+    surprise: median squared distance of the features from where they were expected, in sigmas, 0 without any.
     """
 
     state: TrackState
@@ -25,3 +28,11 @@ class TrackResult:
     cov: F64 | None = None
     sound: bool = True
     waits: Wait | None = None
+    found: int = 0
+    surprise: float = 0.0
+
+
+def typical(surprise: F64) -> float:
+    """The median of squared distances (N,), NaN unknown, in sigmas; 0 without any."""
+    known = surprise[np.isfinite(surprise)]
+    return float(np.median(known)) if len(known) else 0.0

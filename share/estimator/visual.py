@@ -18,7 +18,7 @@ from share.config import TrackerConfig
 from share.estimator import gravity, relocalise
 from share.estimator.localmap import LocalKeyframe, LocalMap
 from share.estimator.pose import PoseEstimate, consensus, refine
-from share.estimator.result import TrackResult
+from share.estimator.result import TrackResult, typical
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
 from share.types import F32, F64, I64, U8, Candidate, Footing, Frame, TrackState, Wait
@@ -98,22 +98,23 @@ class VisualTracker:
     def footing(self) -> Footing:
         """Of the frame just tracked, one with a pose."""
         assert self._T_odom_cam is not None
-        found = self._tracks.join(self._found.take(~np.isin(self._found.ids, self._tracks.ids)))
+        found = self._all_found()
         rows = self._map.rows(found.ids)
         points = np.where(rows[:, None] >= 0, self._map.points[rows], np.nan)
         z = se3.transform(se3.inverse(self._T_odom_cam), points)[:, 2]
         believed = np.arange(len(rows)) < len(self._tracks.ids)
         due, known = max(self._sought, len(rows)), len(self._map.ids)
-        return Footing(found.px, believed, z, due, known, self._surprise(found.px, rows))
+        return Footing(found.px, believed, z, due, known)
 
-    def _surprise(self, px: F32, rows: I64) -> float:
-        """See `Footing`: of features at px (N, 2) that the map has in rows (N,), -1 where it has not."""
+    def _all_found(self) -> _Tracks:
+        """Of the last frame: those that were believed, then the others."""
+        return self._tracks.join(self._found.take(~np.isin(self._found.ids, self._tracks.ids)))
+
+    def _surprise(self, found: _Tracks) -> float:
+        """See `TrackResult`."""
         assert self._T_odom_cam is not None
-        there = rows >= 0
-        off = (px[there] - self._project(se3.inverse(self._T_odom_cam), rows[there])) / self._config.noise_px
-        far = (off**2).sum(axis=1)
-        far = far[np.isfinite(far)]
-        return float(np.median(far)) if len(far) else 0.0
+        expected = self._project(se3.inverse(self._T_odom_cam), self._map.rows(found.ids))
+        return typical((((found.px - expected) / self._config.noise_px) ** 2).sum(axis=1))
 
     # ------------------------------------------------------------------ the usual frame
 
@@ -136,7 +137,9 @@ class VisualTracker:
             self._to_anchor = True
         count = len(self._tracks.ids)
         state = TrackState.OK if count >= self._config.weak_inliers else TrackState.WEAK
-        return TrackResult(state, self._T_odom_body(), wanted, count)
+        found = self._all_found()
+        told = TrackResult(state, self._T_odom_body(), wanted, count)
+        return replace(told, found=len(found.ids), surprise=self._surprise(found))
 
     def _find(self, image: U8, T_predicted: F64) -> _Tracks:
         assert self._image is not None

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from share.evaluator.odometer import Lately
 from share.evaluator.psd import CELL_PX, CHANNELS, GRID, psd
-from share.evaluator.recent import RECENT, Recent
+from share.evaluator.recent import RECENT, recent
 from share.evaluator.scalars import NAMES, scalars
 from share.types import F32, U8, Footing, checked
 
@@ -32,7 +32,7 @@ def kind_of(name: str) -> type[np.generic]:
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """picture (128, 128) uint8, psd (3, 12, 16), scalars (8,) and recent (30,) float32."""
+    """picture (128, 128) uint8, psd (3, 12, 16), scalars (8,) and recent (14,) float32."""
 
     picture: U8
     psd: F32
@@ -47,20 +47,12 @@ class Features:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
-class Observer:
-    """Of one agent, keyframe by keyframe."""
-
-    def __init__(self) -> None:
-        self._recent = Recent()
-
-    def features(self, stamp_ns: int, image: U8, footing: Footing, lately: Lately) -> Features:
-        """Of a keyframe: its image of cam0 (H, W), what its pose stands on, and what its tracker says itself
-        (`Odometer`)."""
-        small = _scaled(image, _SMALL)
-        spread = psd(small, footing, (image.shape[1], image.shape[0]))
-        now = scalars(small, footing, lately.sigma_cm)
-        picture = _scaled(small, SHAPES["picture"])
-        return Features(picture, spread, now, self._recent.after(stamp_ns, now, footing.surprise, lately))
+def features(image: U8, footing: Footing, lately: Lately) -> Features:
+    """Of a keyframe: its image of cam0 (H, W), what its pose stands on, and how its tracker fared of late."""
+    small = _scaled(image, _SMALL)
+    spread = psd(small, footing, (image.shape[1], image.shape[0]))
+    picture = _scaled(small, SHAPES["picture"])
+    return Features(picture, spread, scalars(small, footing, lately.sigma_cm), recent(lately))
 
 
 def _scaled(image: U8, size: tuple[int, ...]) -> U8:

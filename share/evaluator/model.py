@@ -19,7 +19,7 @@ _WIDER = 2.0  # times as wide, by logarithms, where the network has seen nothing
 
 class Network(Protocol):
     """As an onnxruntime.InferenceSession: inputs picture (N, 128, 128) uint8, psd (N, 3, 12, 16), scalars
-    (N, 8), recent (N, 30); outputs log_error (N, 3), of cm: expected, low, high; embedding (N, 64); distance
+    (N, 8), recent (N, 14); outputs log_error (N, 3), of cm: expected, low, high; embedding (N, 64); distance
     (N,), from what it has learnt on, 1 where it ends."""
 
     def get_inputs(self) -> Sequence[Any]: ...

@@ -1,50 +1,78 @@
-"""What a tracker says itself of its last seconds: how far it went, and how far off it may be by now."""
+"""What a tracker went through in its last seconds, by what it says: how far, how sure, how surprised."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from share.geometry.se3 import angle, compose_cov
 from share.metrics.local_error import WINDOW_S
-from share.types import F64, Candidate
+from share.types import F64, Candidate, TrackState
 
 
-@dataclass(frozen=True)
-class Lately:
-    """Since since_ns, when the window or, if later, the stretch began: metres of way and radians of turn from
-    keyframe to keyframe; sigma_cm, one sigma of the position after that motion."""
+class Fared(NamedTuple):
+    """How a tracker fared with a frame: its state, how many features it found and how many it believed, and
+    how surprised it was (`estimator.result`)."""
 
-    since_ns: int
+    stamp_ns: int
+    state: TrackState
+    found: int
+    believed: int
+    surprise: float
+
+
+class Lately(NamedTuple):
+    """Since the window or, if later, the stretch began. frames: all, the last one being the keyframe.
+    way_m, turn_rad: from keyframe to keyframe. sigmas_cm: by each keyframe, the last one now, one sigma of
+    the position after the motion of the window before it."""
+
+    frames: tuple[Fared, ...]
     way_m: float
     turn_rad: float
-    sigma_cm: float
+    sigmas_cm: tuple[float, ...]
+
+    @property
+    def sigma_cm(self) -> float:
+        """Now."""
+        return self.sigmas_cm[-1]
 
 
 class Odometer:
-    """Of one agent, keyframe by keyframe; window_s as that of the error that is to be told."""
+    """Of one agent, frame by frame; window_s as that of the error that is to be told."""
 
     def __init__(self, window_s: float = WINDOW_S) -> None:
         self._window_ns = round(window_s * 1e9)
-        self._began_ns: int | None = None  # the stretch
+        self._frames: deque[Fared] = deque()
         self._motions: deque[tuple[int, F64, F64]] = deque()  # when, T_last_this, its covariance
+        self._sigmas: deque[tuple[int, float]] = deque()  # when, cm
+        self._moves = False  # has a keyframe to go on from
 
-    def after(self, stamp_ns: int, candidate: Candidate) -> Lately:
-        if candidate.new_stretch or self._began_ns is None:
+    def frame(self, fared: Fared) -> None:
+        """Another one, with a pose or without."""
+        self._frames.append(fared)
+        while self._frames[0].stamp_ns <= fared.stamp_ns - self._window_ns:
+            self._frames.popleft()
+
+    def keyframe(self, stamp_ns: int, candidate: Candidate) -> Lately:
+        """The last frame has become one."""
+        if candidate.new_stretch or not self._moves:
             self._motions.clear()
-            self._began_ns = stamp_ns
+            self._sigmas.clear()
+            self._frames = deque(list(self._frames)[-1:])
+            self._moves = True
         else:
             self._motions.append((stamp_ns, candidate.T_last_body, candidate.cov))
-        while self._motions and self._motions[0][0] <= stamp_ns - self._window_ns:
-            self._motions.popleft()
+        for past in (self._motions, self._sigmas):
+            while past and past[0][0] <= stamp_ns - self._window_ns:
+                past.popleft()
         way = turn = 0.0
         cov = np.zeros((6, 6))
         for _, T, more in self._motions:
             way += float(np.linalg.norm(T[:3, 3]))
             turn += float(angle(T[:3, :3]))
             cov = compose_cov(T, cov, more)
-        sigma_cm = 100 * math.sqrt(max(0.0, float(np.trace(cov[3:, 3:]))))
-        return Lately(max(stamp_ns - self._window_ns, self._began_ns), way, turn, sigma_cm)
+        self._sigmas.append((stamp_ns, 100 * math.sqrt(max(0.0, float(np.trace(cov[3:, 3:]))))))
+        return Lately(tuple(self._frames), way, turn, tuple(sigma for _, sigma in self._sigmas))

@@ -6,38 +6,60 @@ A keyframe shows how well its tracker fares now; what was lost three seconds ago
 from __future__ import annotations
 
 import math
-from collections import deque
 
 import numpy as np
 
 from share.evaluator.odometer import Lately
-from share.evaluator.scalars import NAMES
-from share.types import F32
+from share.evaluator.scalars import many, score
+from share.types import F32, TrackState
 
-_SURPRISE = "surprise"
 RECENT = (
-    *(f"{what} {name}" for what in ("mean", "least", "most") for name in (*NAMES, _SURPRISE)),
-    _SURPRISE,
+    "mean score",
+    "least score",
+    "most score",
     "way",
     "turn",
+    "mean surprise",
+    "most surprise",
+    "refused",
+    "mean matches",
+    "least matches",
+    "weak",
+    "blind",
+    "deaf",
+    "gap",
 )
+_SPELLS = (TrackState.WEAK, TrackState.INERTIAL_ONLY, TrackState.VISION_ONLY)
 _FAR_M, _TURNED_RAD = 5.0, 5.0  # count as 1
 _AMAZED = 100.0  # squared sigmas, the same
+_GAP_S, _SHORT_S = 5.0, 0.1  # between two frames: 1, and where the logarithm begins
 
 
-class Recent:
-    """Of one agent, keyframe by keyframe."""
-
-    def __init__(self) -> None:
-        self._seen: deque[tuple[int, F32]] = deque()  # stamp, its scalars and its surprise
-
-    def after(self, stamp_ns: int, scalars: F32, surprise: float, lately: Lately) -> F32:
-        """(30,) as `RECENT`: mean, least and most of each of the scalars (8,) and of the surprise (`Footing`)
-        since `lately` began, the surprise now, and how far the body went and turned."""
-        while self._seen and self._seen[0][0] < lately.since_ns:
-            self._seen.popleft()
-        now = math.log1p(surprise) / math.log1p(_AMAZED)
-        self._seen.append((stamp_ns, np.append(scalars, np.float32(now))))
-        seen = np.stack([row for _, row in self._seen])
-        more = np.array([now, lately.way_m / _FAR_M, lately.turn_rad / _TURNED_RAD], np.float32)
-        return np.concatenate([seen.mean(axis=0), seen.min(axis=0), seen.max(axis=0), more])
+def recent(lately: Lately) -> F32:
+    """(14,) as `RECENT`, each about 0 to 1: the tracking score (`scalars`) of the keyframes; how far the body
+    went and turned; and of the frames, how surprised the tracker was, what share of the features it found it
+    refused, how many it believed, in what share of them it was weak, blind (the IMU alone) and deaf (without
+    it), and the longest time between two."""
+    scores = [score(sigma_cm) for sigma_cm in lately.sigmas_cm]
+    frames = lately.frames
+    surprise = np.log1p([fared.surprise for fared in frames]) / math.log1p(_AMAZED)
+    refused = [max(0.0, 1 - fared.believed / max(fared.found, 1)) for fared in frames if fared.found]
+    believed = [many(fared.believed) for fared in frames]
+    gap_s = max(np.diff([fared.stamp_ns for fared in frames]), default=0) * 1e-9
+    return np.array(
+        [
+            np.mean(scores),
+            min(scores),
+            max(scores),
+            lately.way_m / _FAR_M,
+            lately.turn_rad / _TURNED_RAD,
+            surprise.mean(),
+            surprise.max(),
+            sum(refused) / len(frames),
+            np.mean(believed),
+            min(believed),
+            *(np.mean([fared.state is spell for fared in frames]) for spell in _SPELLS),
+            math.log1p(gap_s / _SHORT_S) / math.log1p(_GAP_S / _SHORT_S),
+        ],
+        np.float32,
+    )

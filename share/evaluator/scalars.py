@@ -39,10 +39,10 @@ def scalars(small: U8, footing: Footing, sigma_cm: float) -> F32:
             deviation / 128,
             _entropy(small) / 8,
             math.log10(1 + laplacian**2) / 4,
-            _many(footing.sought),
+            many(footing.sought),
             believed / max(footing.sought, believed, 1),
-            _many(footing.known),
-            math.log10(max(sigma_cm, _SURE_CM) / _SURE_CM) / _DECADES,
+            many(footing.known),
+            score(sigma_cm),
         ],
         np.float32,
     )
@@ -61,5 +61,11 @@ def _entropy(image: U8) -> float:
     return float(-(p * np.log2(p)).sum())
 
 
-def _many(count: int) -> float:
+def score(sigma_cm: float) -> float:
+    """The tracking score: 0 for one that is sure of itself, 1 for a metre."""
+    return math.log10(max(sigma_cm, _SURE_CM) / _SURE_CM) / _DECADES
+
+
+def many(count: int) -> float:
+    """0 for none, 1 for 200."""
     return math.log1p(count) / math.log1p(_MANY)

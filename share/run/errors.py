@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from share.estimator.result import TrackResult
-from share.evaluator.features import Observer
+from share.evaluator.features import features
 from share.evaluator.model import Estimate, Network, estimate
-from share.evaluator.odometer import Lately, Odometer
+from share.evaluator.odometer import Fared, Lately, Odometer
 from share.metrics.latency import summary
 from share.metrics.local_error import LocalError
 from share.types import U8, Candidate, Footing, Frame
@@ -37,6 +37,11 @@ class Errors(Protocol):
 
     def report(self) -> dict[str, Any]:
         """For report.json."""
+
+
+def fared(stamp_ns: int, result: TrackResult) -> Fared:
+    """What of a frame's result is remembered."""
+    return Fared(stamp_ns, result.state, result.found, result.points, result.surprise)
 
 
 class Unknown:
@@ -67,7 +72,6 @@ class ByTruth(Unknown):
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    stamp_ns: int
     image: U8
     footing: Footing
     lately: Lately
@@ -78,25 +82,24 @@ class AtOnce(Unknown):
     What it said last holds until it says something else."""
 
     def __init__(self, network: Network) -> None:
-        self._network, self._odometer, self._observer = network, Odometer(), Observer()
+        self._network, self._odometer = network, Odometer()
         self._newest: Estimate | None = None
 
     def after(self, stamp_ns: int, result: TrackResult) -> float | None:
+        self._odometer.frame(fared(stamp_ns, result))
         newest = self._newest
         return None if newest is None or result.T_odom_body is None else newest.error_cm
 
     def keyframe(self, frame: Frame, tracker: Tracker) -> Candidate:
         footing, candidate = tracker.footing(), tracker.keyframe(frame)
-        lately = self._odometer.after(frame.stamp_ns, candidate)
-        self._take(_Job(frame.stamp_ns, frame.image0, footing, lately))
+        self._take(_Job(frame.image0, footing, self._odometer.keyframe(frame.stamp_ns, candidate)))
         return candidate
 
     def _take(self, job: _Job) -> None:
         self._newest = self._estimate(job)
 
     def _estimate(self, job: _Job) -> Estimate:
-        seen = self._observer.features(job.stamp_ns, job.image, job.footing, job.lately)
-        return estimate(self._network, seen)
+        return estimate(self._network, features(job.image, job.footing, job.lately))
 
 
 class ByModel(AtOnce):

@@ -13,7 +13,7 @@ from share import __version__
 from share.config import Config
 from share.core.sequencer import SequencerCounters
 from share.errors import UsageError
-from share.evaluator.features import Features, Observer
+from share.evaluator.features import Features, features
 from share.evaluator.odometer import Odometer
 from share.io.pool import Pool
 from share.io.session import Session, read_session
@@ -21,6 +21,7 @@ from share.io.source import Source, open_source
 from share.metrics.local_error import WINDOW_S, LocalError
 from share.process import prepare
 from share.run.campaign import check_names
+from share.run.errors import fared
 from share.run.pipeline import frames_of, tracker_for
 from share.train.label_file import Labels, read_labels, write_labels
 from share.train.spoil import KINDS, Spell, draw, spoiled
@@ -108,12 +109,13 @@ def keyframes(
     if truth is None:
         raise UsageError(f"{source.name}: comes without a truth, so nobody knows how wrong a tracker is")
     tracker, error = tracker_for(source, config), LocalError(truth)
-    odometer, observer = Odometer(), Observer()
+    odometer = Odometer()
     for frame in spoiled(frames_of(source, config, SequencerCounters()), spells, seed):
         result = tracker.track(frame)
         error_cm = error.after(frame.stamp_ns, result.T_odom_body, result.new_stretch)
+        odometer.frame(fared(frame.stamp_ns, result))
         if result.keyframe:
             footing = tracker.footing()
-            lately = odometer.after(frame.stamp_ns, tracker.keyframe(frame))
+            lately = odometer.keyframe(frame.stamp_ns, tracker.keyframe(frame))
             told = float("nan") if error_cm is None else error_cm
-            yield frame.stamp_ns, told, observer.features(frame.stamp_ns, frame.image0, footing, lately)
+            yield frame.stamp_ns, told, features(frame.image0, footing, lately)

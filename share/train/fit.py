@@ -35,7 +35,7 @@ class FitOptions:
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Of N keyframes: deep (N, 1280), by the backbone; psd as in `Features`; numbers (N, 38), its scalars
+    """Of N keyframes: deep (N, 1280), by the backbone; psd as in `Features`; numbers (N, 22), its scalars
     and recent; log_error (N,)."""
 
     deep: F32

@@ -73,19 +73,21 @@ class _Head:
         spread = self._conv(self._conv("psd", "spread.0"), "spread.2")
         spread = self._node("Flatten", [self._node("GlobalAveragePool", [spread])])
         numbers = self._node("Concat", ["scalars", "recent"], axis=1)
-        numbers = self._linear(numbers, "numbers.0", relu=True)
-        joined = self._node("Concat", ["embedding", spread, numbers], axis=1)
-        self._interval(self._linear(self._linear(joined, "joined.0", relu=True), "joined.2"), fitted.margin)
+        heard = self._linear(numbers, "numbers.0", relu=True)
+        joined = self._node("Concat", ["embedding", spread, heard], axis=1)
+        told = self._linear(self._linear(joined, "joined.0", relu=True), "joined.2")
+        self._interval(told, self._linear(numbers, "straight"), fitted.margin)
         away = self._node("Sub", [joined, self._constant("mean", fitted.mean)])
         away = self._node("MatMul", [away, self._constant("whitening", fitted.whitening)])
         self._node("ReduceL2", [away], "distance", axes=[1], keepdims=0)
 
-    def _interval(self, told: str, margin: float) -> None:
-        expected, below, above = (f"{_HEAD}{name}" for name in ("expected", "below", "above"))
+    def _interval(self, told: str, straight: str, margin: float) -> None:
+        bent, below, above = (f"{_HEAD}{name}" for name in ("bent", "below", "above"))
         ones = self._constant("ones", np.ones(3, np.int64))
         self.nodes.append(
-            helper.make_node("Split", [told, ones], [expected, below, above], f"{_HEAD}split", axis=1)
+            helper.make_node("Split", [told, ones], [bent, below, above], f"{_HEAD}split", axis=1)
         )
+        expected = self._node("Add", [bent, straight])
         further = self._constant("margin", np.array(margin, np.float32))
 
         def width(raw: str) -> str:

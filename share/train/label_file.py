@@ -20,13 +20,13 @@ from share.evaluator.features import SHAPES, Features, kind_of
 from share.io.files import atomic_write
 from share.types import F32, I64, U8
 
-SCHEMA = 2
+SCHEMA = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Labels:
     """Keyframes of one run, in order: stamps_ns (N,); error_cm (N,), NaN unknown; picture (N, 128, 128), psd
-    (N, 3, 12, 16), scalars (N, 8), recent (N, 30) as in `Features`. about: plain data."""
+    (N, 3, 12, 16), scalars (N, 8), recent (N, 14) as in `Features`. about: plain data."""
 
     about: dict[str, Any]
     stamps_ns: I64

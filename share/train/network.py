@@ -20,8 +20,12 @@ LOW, HIGH = 0.05, 0.95  # quantiles
 
 
 class Head(nn.Module):  # type: ignore[misc]
-    """deep (N, 1280), psd (N, 3, 12, 16), numbers (N, 38: scalars, recent) to log of cm (N, 3):
-    expected, low, high."""
+    """deep (N, 1280), psd (N, 3, 12, 16), numbers (N, 22: scalars, recent) to log of cm (N, 3):
+    expected, low, high.
+
+    What numbers say goes to what is expected also straight on, since many are logarithms of what the error is
+    a product of powers of: so it goes on beyond what has been learnt.
+    """
 
     def __init__(self, dropout: float = 0.0) -> None:
         super().__init__()
@@ -37,6 +41,7 @@ class Head(nn.Module):  # type: ignore[misc]
         )
         self.numbers = nn.Sequential(nn.Linear(NUMBERS, 16), nn.ReLU())
         self.joined = nn.Sequential(nn.Linear(JOINED, 48), nn.ReLU(), nn.Linear(48, 3))
+        self.straight = nn.Linear(NUMBERS, 1)
 
     def join(self, deep: Tensor, psd: Tensor, numbers: Tensor) -> Tensor:
         """(N, 96)."""
@@ -45,6 +50,7 @@ class Head(nn.Module):  # type: ignore[misc]
 
     def forward(self, deep: Tensor, psd: Tensor, numbers: Tensor) -> Tensor:
         expected, below, above = self.joined(self.join(deep, psd, numbers)).unbind(dim=1)
+        expected = expected + self.straight(numbers)[:, 0]
         low, high = expected - functional.softplus(below), expected + functional.softplus(above)
         return torch.stack([expected, low, high], dim=1)
 

@@ -17,13 +17,13 @@ from share.train.label_file import Labels, read_labels
 from share.train.split import groups, split
 from share.types import F32, I64, U8
 
-_LEAST_CM, _MOST_CM = 0.01, 100.0  # beyond, a label is a tracker that was lost and did not know it
+_LEAST_CM, _MOST_CM = 0.01, 20.0  # from where on a tracker is as good as lost, whatever it is off by
 
 
 @dataclass(frozen=True, eq=False)
 class Table(Columns):
     """N keyframes whose error is known: run (N,), of which each is; error_cm (N,); picture (N, 128, 128),
-    psd (N, 3, 12, 16), scalars (N, 8), recent (N, 30) as in `Features`."""
+    psd (N, 3, 12, 16), scalars (N, 8), recent (N, 14) as in `Features`."""
 
     run: I64
     error_cm: F32
@@ -39,7 +39,7 @@ class Table(Columns):
 
     @property
     def numbers(self) -> F32:
-        """(N, 38): scalars and recent."""
+        """(N, 22): scalars and recent."""
         return np.concatenate([self.scalars, self.recent], axis=1)
 
     def features(self) -> Iterator[Features]:
@@ -79,7 +79,7 @@ def collect(folder: Path, seed: int) -> Collection:
 
 
 def tabulate(found: Sequence[Labels]) -> Table:
-    """Their keyframes with a known error, errors within a hundredth of a centimetre and a metre."""
+    """Their keyframes with a known error, errors within a hundredth of a centimetre and 20."""
     known = [np.isfinite(labels.error_cm) for labels in found]
     run = [np.full(int(k.sum()), number) for number, k in enumerate(known)]
     columns = [

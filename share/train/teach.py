@@ -32,7 +32,8 @@ def teach(
         told = head(*_tensors(parts["calibrate"])).numpy()
     weights = {name: value.numpy() for name, value in head.state_dict().items()}
     weights = folded(weights, "visual.0", *scale.deep)
-    weights = folded(weights, "numbers.0", *scale.numbers)
+    for layer in ("numbers.0", "straight"):
+        weights = folded(weights, layer, *scale.numbers)
     about = {
         "version": __version__,
         "window_s": WINDOW_S,

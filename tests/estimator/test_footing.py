@@ -8,18 +8,19 @@ import pytest
 from share.config import Config, InertialConfig, TrackerConfig
 from share.core.sequencer import SequencerCounters
 from share.estimator.inertial.tracker import InertialTracker
+from share.estimator.result import TrackResult
 from share.estimator.visual import VisualTracker
 from share.io.source import open_source
 from share.run.pipeline import frames_of
 from share.types import Footing, Frame
 from share.vision.depth import from_stereo
 
-Walk = tuple[list[Frame], list[tuple[Frame, Footing, int]]]
+Walk = tuple[list[Frame], list[tuple[Frame, Footing, TrackResult]]]
 
 
 @pytest.fixture(scope="module", params=["inertial", "visual"])
 def walk(request, plain_session):
-    """Rig, and of each keyframe: the frame, its footing and how many points the tracker counts."""
+    """Rig, and of each keyframe: the frame, its footing and what the tracker said of it."""
     source = open_source(f"{plain_session}/ar1")
     rig = source.rig
     tracker = (
@@ -31,7 +32,7 @@ def walk(request, plain_session):
     for frame in frames_of(source, Config(), SequencerCounters()):
         result = tracker.track(frame)
         if result.keyframe:
-            told.append((frame, tracker.footing(), result.points))
+            told.append((frame, tracker.footing(), result))
             before = tracker.footing()
             tracker.keyframe(frame)
             again = tracker.footing()  # what joined since is not what the pose rests on
@@ -43,12 +44,13 @@ def walk(request, plain_session):
 def test_what_a_pose_rests_on_is_counted_and_in_the_image(walk):
     rig, told = walk
     assert len(told) >= 5
-    for _, footing, points in told[1:]:
-        assert footing.believed.sum() == points > 20
-        assert points / footing.sought > 0.5
+    for _, footing, result in told[1:]:
+        assert footing.believed.sum() == result.points > 20
+        assert len(footing.px) == result.found
+        assert result.points / footing.sought > 0.5
         assert rig.cam0.inside(footing.px).all()
         assert footing.known > 20
-        assert 0 < footing.surprise < 3
+        assert 0 < result.surprise < 3
 
 
 def test_depths_are_those_that_stereo_measures(walk):

@@ -8,14 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from share.evaluator.features import PICTURE_PX, Features, Observer
-from share.evaluator.odometer import Lately
+from share.evaluator.features import PICTURE_PX, Features, features
+from share.evaluator.odometer import Fared, Lately
 from share.evaluator.psd import psd
 from share.evaluator.scalars import NAMES, scalars
-from share.types import U8, Footing
+from share.types import U8, Footing, TrackState
 
 SIZE = (640, 480)
-LATELY = Lately(0, 1.0, 0.5, 0.3)
+LATELY = Lately((Fared(0, TrackState.OK, 50, 50, 0.0),), 1.0, 0.5, (0.3,))
 GREY: U8 = np.full((240, 320), 128, np.uint8)
 
 
@@ -96,14 +96,14 @@ def test_what_is_counted_of_the_image(rng):
 def test_all_of_it_is_made_of_any_camera(rng):
     for shape in ((480, 640), (480, 752), (240, 320)):
         image = rng.integers(0, 256, shape, np.uint8)
-        made = Observer().features(0, image, footing([[5, 5]], sought=1, known=1), LATELY)
+        made = features(image, footing([[5, 5]], sought=1, known=1), LATELY)
         assert made.picture.shape == (PICTURE_PX, PICTURE_PX)
         assert abs(made.picture.mean() - image.mean()) < 1.5
         assert made.psd[1, 0, 0] == 0.25
-        assert made.recent[:8] == pytest.approx(made.scalars)
+        assert made.recent[0] == pytest.approx(made.scalars[NAMES.index("tracking score")])
 
 
 def test_features_of_another_shape_are_refused():
-    right = Observer().features(0, np.zeros((480, 640), np.uint8), footing(), LATELY)
+    right = features(np.zeros((480, 640), np.uint8), footing(), LATELY)
     with pytest.raises(ValueError, match="scalars: shape"):
         Features(right.picture, right.psd, right.scalars[:-1], right.recent)

@@ -2,53 +2,64 @@
 
 from __future__ import annotations
 
-import numpy as np
+import math
+
 import pytest
 
-from share.evaluator.odometer import Lately
-from share.evaluator.recent import RECENT, Recent
-from share.evaluator.scalars import NAMES
+from share.evaluator.odometer import Fared, Lately
+from share.evaluator.recent import RECENT, recent
+from share.types import TrackState
 
 S = 1_000_000_000
+FINE = Fared(0, TrackState.OK, 50, 50, 0.0)
 
 
-def told(recent: Recent, stamp_ns: int, value: float, since_ns: int, **moved: float) -> dict[str, float]:
-    lately = Lately(since_ns, moved.get("way_m", 0.0), moved.get("turn_rad", 0.0), 1.0)
-    scalars = np.linspace(value, value + 0.7, len(NAMES), dtype=np.float32)
-    return dict(
-        zip(RECENT, recent.after(stamp_ns, scalars, moved.get("surprise", 0.0), lately).tolist(), strict=True)
-    )
+def told(*frames: Fared, sigmas_cm=(1.0,), way_m=0.0, turn_rad=0.0) -> dict[str, float]:
+    lately = Lately(frames or (FINE,), way_m, turn_rad, sigmas_cm)
+    return dict(zip(RECENT, recent(lately).tolist(), strict=True))
 
 
-def test_of_one_keyframe_all_are_itself():
-    one = told(Recent(), 0, 0.1, 0)
-    for what in ("mean", "least", "most"):
-        assert one[f"{what} brightness"] == pytest.approx(0.1)
-        assert one[f"{what} tracking score"] == pytest.approx(0.8)
+def test_where_all_is_well_nothing_is_told():
+    fine = told(FINE, sigmas_cm=(0.0,))
+    believed = [fine.pop(f"{what} matches") for what in ("mean", "least")]
+    assert set(fine.values()) == {0.0}
+    assert believed == pytest.approx([math.log(51) / math.log(201)] * 2)
 
 
-def test_what_was_worst_stays_until_the_window_has_passed():
-    recent = Recent()
-    told(recent, 0, 0.9, -5 * S)
-    told(recent, S, 0.1, -4 * S)
-    now = told(recent, 2 * S, 0.2, -3 * S)
-    assert now["most brightness"] == pytest.approx(0.9)
-    assert now["least brightness"] == pytest.approx(0.1)
-    assert now["mean brightness"] == pytest.approx(0.4)
-    later = told(recent, 6 * S, 0.3, S)
-    assert later["most brightness"] == pytest.approx(0.3)
-    assert later["least brightness"] == pytest.approx(0.1)  # at the window's very beginning
-
-
-def test_surprise_is_told_as_it_is_and_as_it_was():
-    recent = Recent()
-    told(recent, 0, 0.5, -5 * S, surprise=100.0)
-    now = told(recent, S, 0.5, -4 * S, surprise=0.0)
-    assert (now["surprise"], now["most surprise"]) == pytest.approx((0, 1))
-    assert now["mean surprise"] == pytest.approx(0.5)
+def test_how_sure_it_was_of_itself():
+    now = told(sigmas_cm=(0.01, 100.0, 1.0))
+    assert [now[f"{what} score"] for what in ("mean", "least", "most")] == pytest.approx([0.5, 0, 1])
 
 
 def test_how_far_it_went_and_turned():
-    moved = told(Recent(), 0, 0.5, 0, way_m=2.5, turn_rad=1.0)
-    assert moved["way"] == pytest.approx(0.5)
-    assert moved["turn"] == pytest.approx(0.2)
+    moved = told(way_m=2.5, turn_rad=1.0)
+    assert (moved["way"], moved["turn"]) == pytest.approx((0.5, 0.2))
+
+
+def test_a_surprise_between_keyframes_is_told():
+    now = told(FINE, FINE._replace(surprise=100.0), FINE, FINE)
+    assert (now["mean surprise"], now["most surprise"]) == pytest.approx((0.25, 1))
+
+
+def test_what_was_found_and_not_believed():
+    now = told(FINE._replace(believed=0), FINE._replace(believed=25), FINE._replace(found=0, believed=0), FINE)
+    assert now["refused"] == pytest.approx((1 + 0.5) / 4)
+    assert now["least matches"] == 0
+
+
+def test_more_believed_than_found_is_not_less_than_none_refused():
+    """The visual tracker takes up old points after it has the pose."""
+    assert told(FINE._replace(believed=80))["refused"] == 0
+
+
+def test_in_what_state_it_was():
+    states = (TrackState.WEAK, TrackState.INERTIAL_ONLY, TrackState.INERTIAL_ONLY, TrackState.VISION_ONLY)
+    now = told(*(FINE._replace(state=state) for state in states))
+    assert (now["weak"], now["blind"], now["deaf"]) == (0.25, 0.5, 0.25)
+
+
+def test_the_longest_time_without_a_frame():
+    stamps = (0, S // 15, S, S + S // 15)
+    now = told(*(FINE._replace(stamp_ns=stamp) for stamp in stamps))
+    assert now["gap"] == pytest.approx(math.log1p(14 / 15 / 0.1) / math.log1p(50))
+    assert told(FINE, FINE._replace(stamp_ns=5 * S))["gap"] == pytest.approx(1)

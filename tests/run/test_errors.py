@@ -49,6 +49,11 @@ def frame(brightness: int) -> Frame:
     return Frame(brightness, brightness, np.full((48, 64), brightness, np.uint8))
 
 
+def keyframe(errors: AtOnce, brightness: int) -> None:
+    errors.after(brightness, TRACKED)
+    errors.keyframe(frame(brightness), Tracker())
+
+
 def until(reached, limit_s: float = 5.0) -> None:
     end = time.monotonic() + limit_s
     while not reached():
@@ -61,7 +66,7 @@ def test_what_was_said_last_holds():
     network.may.set()
     errors = ByModel(network, said.append)
     assert errors.after(0, TRACKED) is None
-    errors.keyframe(frame(3), Tracker())
+    keyframe(errors, 3)
     until(lambda: errors.after(1, TRACKED) is not None)
     assert errors.after(1, TRACKED) == pytest.approx(3)
     assert errors.after(2, LOST) is None  # there is no pose that could be wrong
@@ -75,10 +80,10 @@ def test_who_is_busy_leaves_the_older_out():
     network = Network()
     errors = ByModel(network, lambda text: None)
     began = time.monotonic()
-    errors.keyframe(frame(1), Tracker())
+    keyframe(errors, 1)
     until(lambda: network.seen == [1.0])  # it is at work, and waits
     for brightness in (2, 3, 4):
-        errors.keyframe(frame(brightness), Tracker())
+        keyframe(errors, brightness)
     assert time.monotonic() - began < 2
     network.may.set()
     until(lambda: errors.after(1, TRACKED) == pytest.approx(4))
@@ -91,12 +96,12 @@ def test_a_network_that_fails_is_left_alone_and_said_so():
     network, said = Network(), []
     network.may.set()
     errors = ByModel(network, said.append)
-    errors.keyframe(frame(5), Tracker())
+    keyframe(errors, 5)
     until(lambda: errors.after(1, TRACKED) is not None)
-    errors.keyframe(frame(250), Tracker())
+    keyframe(errors, 250)
     until(lambda: said)
     assert said == ["the error model has failed and is left alone: too bright"]
-    errors.keyframe(frame(6), Tracker())
+    keyframe(errors, 6)
     assert errors.after(2, TRACKED) is None
     errors.close()
 
@@ -106,6 +111,6 @@ def test_in_virtual_time_it_has_answered_at_once():
     network.may.set()
     errors = AtOnce(network)
     assert errors.after(0, TRACKED) is None
-    errors.keyframe(frame(7), Tracker())
+    keyframe(errors, 7)
     assert errors.after(1, TRACKED) == pytest.approx(7)
     assert errors.after(1, LOST) is None

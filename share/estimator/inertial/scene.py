@@ -86,9 +86,8 @@ class Scene:
         sure = self._is_sure() | measures_depth(frame, self._rig)
         return self.looks.px[sure], self._distance()[sure]
 
-    def footing(self, surprise: F64) -> Footing:
-        """Of the last frame; nothing for the first one, whose pose rests on nothing it shows. surprise:
-        `ekf.surprise` (M,) of that frame."""
+    def footing(self) -> Footing:
+        """Of the last frame; nothing for the first one, whose pose rests on nothing it shows."""
         sure = self._is_sure()
         if self._last is None:
             return Footing(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0), 0, int(sure.sum()))
@@ -98,9 +97,7 @@ class Scene:
         _, was, now = np.intersect1d(ids, self.state.ids, return_indices=True)  # it may be a keyframe by now
         depth[np.flatnonzero(seen)[was]] = np.where(sure, self._distance(), np.nan)[now]
         found = left.found | seen
-        known = surprise[np.isfinite(surprise)]
-        typical = float(np.median(known)) if len(known) else 0.0
-        return Footing(left.px[found], seen[found], depth[found], due, int(sure.sum()), typical)
+        return Footing(left.px[found], seen[found], depth[found], due, int(sure.sum()))
 
     def _distance(self) -> F64:
         """z (N,) m in cam0 of the features."""

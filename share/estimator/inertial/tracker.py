@@ -8,6 +8,7 @@ Without the IMU the body is taken to go on as it does, without sight the IMU car
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ from share.estimator.inertial.shown import Shown
 from share.estimator.inertial.state import VELOCITY, State
 from share.estimator.inertial.window import Window, window_for, without_force
 from share.estimator.localmap import LocalKeyframe, LocalMap
-from share.estimator.result import TrackResult
+from share.estimator.result import TrackResult, typical
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
 from share.types import F64, U8, Candidate, Footing, Frame, ImuBatch, TrackState, Wait
@@ -112,7 +113,7 @@ class InertialTracker:
     def footing(self) -> Footing:
         """Of the frame just tracked, one with a pose."""
         assert self._scene is not None
-        return self._scene.footing(self._surprise)
+        return self._scene.footing()
 
     def predict(self, t_ns: int, imu: ImuBatch | None = None) -> F64 | None:
         """T_odom_body (4, 4) at a time after the last frame's, IMU time: for renderers, between frames.
@@ -158,7 +159,8 @@ class InertialTracker:
             if not self._solved(frame, scene, wanted):
                 return self._initialising(scene.state)
             state, wanted = TrackState.OK, True
-        return self._told(scene.state, state, wanted, count)
+        told = self._told(scene.state, state, wanted, count)
+        return replace(told, found=int((left.found | seen).sum()), surprise=typical(self._surprise))
 
     def _solved(self, frame: Frame, scene: Scene, anchored: bool) -> bool:
         """Whether what a single camera saw since the beginning has told it the scale, and all that poses
