@@ -131,10 +131,10 @@ def _errors(source: Source, settings: Config, true_error: bool, say: Callable[[s
         return _by_truth(source)
     if not settings.agent.error_model:
         return None
-    from share.io.network import open_network
+    from share.io.network import error_model
     from share.run.errors import ByModel
 
-    return ByModel(open_network(Path(settings.agent.error_model)), say)
+    return ByModel(error_model(settings.agent.error_model), say)
 
 
 def _by_truth(source: Source) -> Errors:

@@ -14,6 +14,7 @@ from share.evaluator.features import Features
 from share.types import F32
 
 OUTPUTS = ("log_error", "embedding", "distance")
+MOST_CM = 20.0  # from where on a tracker is as good as lost: more is neither taught nor told
 _WIDER = 2.0  # times as wide, by logarithms, where the network has seen nothing alike
 
 
@@ -29,8 +30,8 @@ class Network(Protocol):
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """error_cm: what the tracker's position error of the last seconds is expected to be; nine times of ten it
-    is between low_cm and high_cm. strange: the model has learnt on nothing alike, so the interval is wider.
-    embedding (64,): what the picture looks like."""
+    is between low_cm and high_cm; 20 stands for all that is more. strange: the model has learnt on nothing
+    alike, so the interval is wider. embedding (64,): what the picture looks like."""
 
     error_cm: float
     low_cm: float
@@ -47,5 +48,5 @@ def estimate(network: Network, features: Features) -> Estimate:
     strange = bool(distance[0] > 1)
     if strange:
         low, high = expected + _WIDER * (low - expected), expected + _WIDER * (high - expected)
-    error_cm, low_cm, high_cm = (math.exp(x) for x in (expected, low, high))
+    error_cm, low_cm, high_cm = (min(math.exp(x), MOST_CM) for x in (expected, low, high))
     return Estimate(error_cm, low_cm, high_cm, strange, np.asarray(embedding[0], np.float32))

@@ -35,6 +35,11 @@ def open_network(model: Path | bytes) -> Network:
     return network
 
 
+def error_model(given: str) -> Network:
+    """The one that comes with SHARE (`shipped`), or a file. Raises DataError."""
+    return open_network(SHIPPED if given == "shipped" else Path(given))
+
+
 def deep_of(network: Network, pictures: U8) -> F32:
     """What the backbone of an error model makes of pictures (N, 128, 128): (N, 1280)."""
     out = []

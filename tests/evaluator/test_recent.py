@@ -42,7 +42,9 @@ def test_a_surprise_between_keyframes_is_told():
 
 
 def test_what_was_found_and_not_believed():
-    now = told(FINE._replace(believed=0), FINE._replace(believed=25), FINE._replace(found=0, believed=0), FINE)
+    now = told(
+        FINE._replace(believed=0), FINE._replace(believed=25), FINE._replace(found=0, believed=0), FINE
+    )
     assert now["refused"] == pytest.approx((1 + 0.5) / 4)
     assert now["least matches"] == 0
 
