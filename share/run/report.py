@@ -90,15 +90,17 @@ def _provenance(runs: Sequence[RunFigures], trials: Sequence[Trial]) -> str:
         f"links: {', '.join(sorted({run.conditions.link or 'loopback' for run in runs}))}; "
         f"seeds: {', '.join(map(str, sorted({run.conditions.seed for run in runs})))}.",
         f"Machine: {'; '.join(sorted(machines))}; load before a run {min(loads):g} to {max(loads):g}.",
-        f"SHARE {', '.join(sorted({r['version'] for r in records}))}; "
-        + (
-            "evaluations tell the true error"
-            if records[0]["true_error"]
-            else "evaluations tell odometry's sigma"
-        )
-        + ".",
+        f"SHARE {', '.join(sorted({r['version'] for r in records}))}; evaluations tell {_told(records[0])}.",
     ]
     return "\n".join([*(f"* {line}" for line in told), bullets(PROTOCOL)])
+
+
+def _told(record: Mapping[str, Any]) -> str:
+    """Of a run: what the edge takes for an agent's error."""
+    if record["true_error"]:
+        return "the true error"
+    model = record.get("error_model")
+    return f"what the error model says ({Path(model).name})" if model else "odometry's sigma"
 
 
 def _how(trial: Trial) -> str:

@@ -65,6 +65,7 @@ def run_trial(
             "session": str(session.folder.resolve()),
             "provenance": session.provenance,
             **{name: getattr(terms, name) for name in _TERMS},
+            "error_model": config.agent.error_model,
             "seconds": seconds,
             "began": began.isoformat(timespec="seconds"),
             "took_s": round((datetime.now(UTC) - began).total_seconds(), 1),
