@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from share.evaluator.odometer import Lately
-from share.evaluator.scalars import many, score
+from share.evaluator.scalars import MANY, score
 from share.types import F32, TrackState
 
 RECENT = (
@@ -42,10 +42,12 @@ def recent(lately: Lately) -> F32:
     it), and the longest time between two."""
     scores = [score(sigma_cm) for sigma_cm in lately.sigmas_cm]
     frames = lately.frames
+    stamps_ns, found, believed = (np.array([fared[k] for fared in frames]) for k in (0, 2, 3))
     surprise = np.log1p([fared.surprise for fared in frames]) / math.log1p(_AMAZED)
-    refused = [max(0.0, 1 - fared.believed / max(fared.found, 1)) for fared in frames if fared.found]
-    believed = [many(fared.believed) for fared in frames]
-    gap_s = max(np.diff([fared.stamp_ns for fared in frames]), default=0) * 1e-9
+    refused = np.where(found > 0, np.maximum(0, 1 - believed / np.maximum(found, 1)), 0)
+    matches = np.log1p(believed) / math.log1p(MANY)
+    gap_s = np.diff(stamps_ns).max(initial=0) * 1e-9
+    states = [fared.state for fared in frames]
     return np.array(
         [
             np.mean(scores),
@@ -55,10 +57,10 @@ def recent(lately: Lately) -> F32:
             lately.turn_rad / _TURNED_RAD,
             surprise.mean(),
             surprise.max(),
-            sum(refused) / len(frames),
-            np.mean(believed),
-            min(believed),
-            *(np.mean([fared.state is spell for fared in frames]) for spell in _SPELLS),
+            refused.mean(),
+            matches.mean(),
+            matches.min(),
+            *(states.count(spell) / len(states) for spell in _SPELLS),
             math.log1p(gap_s / _SHORT_S) / math.log1p(_GAP_S / _SHORT_S),
         ],
         np.float32,

@@ -23,7 +23,7 @@ NAMES = (
     "active map points",
     "tracking score",
 )
-_MANY = 200  # features or points that count as 1
+MANY = 200  # features or points that count as 1
 _SURE_CM, _DECADES = 0.01, 4.0  # the tracker's own sigma: 0, and what makes 1
 
 
@@ -39,9 +39,9 @@ def scalars(small: U8, footing: Footing, sigma_cm: float) -> F32:
             deviation / 128,
             _entropy(small) / 8,
             math.log10(1 + laplacian**2) / 4,
-            many(footing.sought),
+            _many(footing.sought),
             believed / max(footing.sought, believed, 1),
-            many(footing.known),
+            _many(footing.known),
             score(sigma_cm),
         ],
         np.float32,
@@ -66,6 +66,5 @@ def score(sigma_cm: float) -> float:
     return math.log10(max(sigma_cm, _SURE_CM) / _SURE_CM) / _DECADES
 
 
-def many(count: int) -> float:
-    """0 for none, 1 for 200."""
-    return math.log1p(count) / math.log1p(_MANY)
+def _many(count: int) -> float:
+    return math.log1p(count) / math.log1p(MANY)
