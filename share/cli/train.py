@@ -139,10 +139,12 @@ def export(fitted: Path, labels: Path, base: Path | None, out: Path) -> None:
     from share.train.assembly import assemble
     from share.train.card import card
     from share.train.compare import of_network
+    from share.train.graph import origin
 
     check_writable(out)
     made = assemble(fitted, labels, _base(base))
-    told = card(made.fitted.about, [of_network("this model", made.network, made.test)], len(made.model))
+    score = of_network("this model", made.network, made.test)
+    told = card(made.fitted.about, [score], len(made.model), origin(made.model))
     atomic_write(out, made.model)
     atomic_write(out.with_suffix(".md"), told)
     click.echo(told)

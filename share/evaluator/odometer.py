@@ -48,7 +48,6 @@ class Odometer:
         self._frames: deque[Fared] = deque()
         self._motions: deque[tuple[int, F64, F64]] = deque()  # when, T_last_this, its covariance
         self._sigmas: deque[tuple[int, float]] = deque()  # when, cm
-        self._moves = False  # has a keyframe to go on from
 
     def frame(self, fared: Fared) -> None:
         """Another one, with a pose or without."""
@@ -58,11 +57,10 @@ class Odometer:
 
     def keyframe(self, stamp_ns: int, candidate: Candidate) -> Lately:
         """The last frame has become one."""
-        if candidate.new_stretch or not self._moves:
+        if candidate.new_stretch or not self._sigmas:  # no keyframe yet to go on from
             self._motions.clear()
             self._sigmas.clear()
             self._frames = deque(list(self._frames)[-1:])
-            self._moves = True
         else:
             self._motions.append((stamp_ns, candidate.T_last_body, candidate.cov))
         for past in (self._motions, self._sigmas):

