@@ -1,10 +1,11 @@
 """Rooms for the error model to learn from: many, short, and unlike each other.
 
-    python tools/make_error_rooms.py --out DIR [--rooms 60] [--first 0] [--seconds 30]
+    python tools/make_error_rooms.py --out DIR [--rooms 60] [--first 0] [--seconds 30] [--sensors stereo]
     share train labels DIR/* --runs 6 --out labels
 
 Room N is always the same: a scene, its seed, two who move in it (people who stroll or hurry, robots) and, in
-every second room, lamps that go on and off. A minute or two each on two cores; a room that is there is left.
+every second room, lamps that go on and off; rgbd-N is the same room seen by a depth camera. A minute or two
+each on two cores; a room that is there is left.
 """
 
 from __future__ import annotations
@@ -28,9 +29,10 @@ from share.emulate.session import make_session  # noqa: E402
 _SEED = 20261123
 _SCENES = ("warehouse", "firestation", "warehouse", "firestation", "whitewall")
 _PROFILE = {"": "d435i:640x480@15"}
+_PREFIX = {"stereo": "room", "rgbd": "rgbd"}
 
 
-def recipe(number: int, seconds: float) -> Recipe:
+def recipe(number: int, seconds: float, sensors: str) -> Recipe:
     """Of room `number`."""
     rng = np.random.default_rng((_SEED, number))
     first = f"ann={_person(rng)}"
@@ -39,8 +41,8 @@ def recipe(number: int, seconds: float) -> Recipe:
     effects = (
         Effects(lamp_every_s=round(lamps[0], 1), lamp_stops=round(lamps[1], 1)) if number % 2 else Effects()
     )
-    scene, sensors = _SCENES[number % len(_SCENES)], {"": "stereo"}
-    return Recipe(scene, (first, second), seconds, 10_000 + number, None, sensors, _PROFILE, effects)
+    scene, seed = _SCENES[number % len(_SCENES)], 10_000 + number
+    return Recipe(scene, (first, second), seconds, seed, None, {"": sensors}, _PROFILE, effects)
 
 
 def _person(rng: np.random.Generator) -> str:
@@ -54,6 +56,7 @@ def main() -> int:
     parser.add_argument("--rooms", type=int, default=60)
     parser.add_argument("--first", type=int, default=0, help="number of the first one")
     parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--sensors", choices=("stereo", "rgbd"), default="stereo")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
     return exit_code("make_error_rooms", lambda: make(options))
@@ -61,11 +64,11 @@ def main() -> int:
 
 def make(options: argparse.Namespace) -> None:
     for number in range(options.first, options.first + options.rooms):
-        out = options.out / f"room-{number:03d}"
+        out = options.out / f"{_PREFIX[options.sensors]}-{number:03d}"
         if not out.exists():
             print(out.name, file=sys.stderr, flush=True)
             with Stages() as stages:
-                make_session(recipe(number, options.seconds), out, options.workers, stages)
+                make_session(recipe(number, options.seconds, options.sensors), out, options.workers, stages)
 
 
 if __name__ == "__main__":

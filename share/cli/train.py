@@ -42,11 +42,18 @@ def train() -> None:
     help="Of each agent: one as recorded, the others spoiled (dark, blurred, frames missing …).",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of what is spoiled.")
+@click.option("--without-imu", is_flag=True, help="As if they had none: stereo or depth alone.")
 @click.option("--workers", type=click.IntRange(1, 64), default=2, show_default=True, help="Runs at a time.")
 @options.config
 @click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="A file a run.")
 def labels(
-    sessions: tuple[Path, ...], runs: int, seed: int, workers: int, config_file: str | None, out: Path
+    sessions: tuple[Path, ...],
+    runs: int,
+    seed: int,
+    without_imu: bool,
+    workers: int,
+    config_file: str | None,
+    out: Path,
 ) -> None:
     """Run our own tracker over each agent of SESSIONS, as recorded and spoiled, and write what each keyframe
     looked like and how wrong the tracker was.
@@ -62,7 +69,7 @@ def labels(
     from share.io.session import read_session
     from share.run.labels import make, plan
 
-    jobs = plan([read_session(folder) for folder in sessions], runs, seed, out)
+    jobs = plan([read_session(folder) for folder in sessions], runs, seed, not without_imu, out)
     writable_dir(out)
     errors = []  # not what they are of: pictures of hundreds of runs would fill the memory
     for job, found in make(jobs, config, workers):

@@ -14,10 +14,11 @@ from share.types import F64, Candidate, TrackState
 
 
 class Fared(NamedTuple):
-    """How a tracker fared with a frame: its state, how many features it found and how many it believed, and
-    how surprised it was (`estimator.result`)."""
+    """How a tracker fared with a frame: whether an IMU was heard, its state, how many features it found and
+    how many it believed, and how surprised it was (`estimator.result`)."""
 
     stamp_ns: int
+    heard: bool
     state: TrackState
     found: int
     believed: int

@@ -197,7 +197,7 @@ class AgentRun:
             T_odom_body=result.T_odom_body,
             keyframe=result.keyframe,
             new_stretch=result.new_stretch,
-            error_cm=self._errors.after(frame.stamp_ns, result),
+            error_cm=self._errors.after(frame, result),
         )
         self._post(tracked)  # the pose goes out before others are served
         self._log.add_result(result.new_stretch, result.sound, result.waits)

@@ -27,7 +27,7 @@ class Tracker(Protocol):
 class Errors(Protocol):
     """Of one agent."""
 
-    def after(self, stamp_ns: int, result: TrackResult) -> float | None:
+    def after(self, frame: Frame, result: TrackResult) -> float | None:
         """cm, after another frame; None where it is not known."""
 
     def keyframe(self, frame: Frame, tracker: Tracker) -> Candidate:
@@ -39,15 +39,16 @@ class Errors(Protocol):
         """For report.json."""
 
 
-def fared(stamp_ns: int, result: TrackResult) -> Fared:
-    """What of a frame's result is remembered."""
-    return Fared(stamp_ns, result.state, result.found, result.points, result.surprise)
+def fared(frame: Frame, result: TrackResult) -> Fared:
+    """What of a frame and its result is remembered."""
+    heard = len(frame.imu) > 0
+    return Fared(frame.stamp_ns, heard, result.state, result.found, result.points, result.surprise)
 
 
 class Unknown:
     """Nobody tells."""
 
-    def after(self, stamp_ns: int, result: TrackResult) -> float | None:
+    def after(self, frame: Frame, result: TrackResult) -> float | None:
         return None
 
     def keyframe(self, frame: Frame, tracker: Tracker) -> Candidate:
@@ -66,8 +67,8 @@ class ByTruth(Unknown):
     def __init__(self, error: LocalError) -> None:
         self._error = error
 
-    def after(self, stamp_ns: int, result: TrackResult) -> float | None:
-        return self._error.after(stamp_ns, result.T_odom_body, result.new_stretch)
+    def after(self, frame: Frame, result: TrackResult) -> float | None:
+        return self._error.after(frame.stamp_ns, result.T_odom_body, result.new_stretch)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +86,8 @@ class AtOnce(Unknown):
         self._network, self._odometer = network, Odometer()
         self._newest: Estimate | None = None
 
-    def after(self, stamp_ns: int, result: TrackResult) -> float | None:
-        self._odometer.frame(fared(stamp_ns, result))
+    def after(self, frame: Frame, result: TrackResult) -> float | None:
+        self._odometer.frame(fared(frame, result))
         newest = self._newest
         return None if newest is None or result.T_odom_body is None else newest.error_cm
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,25 +22,29 @@ from share.metrics.local_error import WINDOW_S, LocalError
 from share.process import prepare
 from share.run.campaign import check_names
 from share.run.errors import fared
-from share.run.pipeline import frames_of, tracker_for
+from share.run.pipeline import check_trackable, frames_of, tracker_of
 from share.train.label_file import Labels, read_labels, write_labels
 from share.train.spoil import KINDS, Spell, draw, spoiled
+from share.types import ImuBatch
 
 _MOST_KINDS = 3  # that come together in one run
+_AS = {True: "", False: "-without-imu"}
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run of one agent. number: 0 is as recorded, each other one spoiled in its own way."""
+    """One run of one agent. number: 0 is as recorded, each other one spoiled in its own way. imu: False plays
+    it as if there were none."""
 
     session: Path
     agent: str
     number: int
     seed: int
+    imu: bool
     out: Path
 
 
-def plan(sessions: Sequence[Session], runs: int, seed: int, out: Path) -> list[Job]:
+def plan(sessions: Sequence[Session], runs: int, seed: int, imu: bool, out: Path) -> list[Job]:
     """Everything, done or not. Raises UsageError where there is no truth, or two sessions have one name."""
     check_names(sessions)
     jobs = []
@@ -50,7 +54,7 @@ def plan(sessions: Sequence[Session], runs: int, seed: int, out: Path) -> list[J
             if not (session.folder / "truth" / f"{agent}.tum").is_file():
                 raise UsageError(f"{session.folder}: has no truth/{agent}.tum to tell how wrong it is")
             jobs += [
-                Job(session.folder, agent, number, seed, out / f"{name}-{agent}-{number}.npz")
+                Job(session.folder, agent, number, seed, imu, out / f"{name}-{agent}{_AS[imu]}-{number}.npz")
                 for number in range(runs)
             ]
     return jobs
@@ -93,27 +97,32 @@ def _make(work: tuple[Job, Config]) -> None:
         "provenance": session.provenance,
         "number": job.number,
         "seed": job.seed,
+        "imu": job.imu and source.rig.imu is not None,
         "spells": [asdict(spell) for spell in spells],
         "window_s": WINDOW_S,
         "version": __version__,
     }
-    write_labels(job.out, Labels.of(about, list(keyframes(source, config, spells, job.seed))))
+    rows = list(keyframes(source, config, spells, job.seed, job.imu))
+    write_labels(job.out, Labels.of(about, rows))
 
 
 def keyframes(
-    source: Source, config: Config, spells: Sequence[Spell] = (), seed: int = 0
+    source: Source, config: Config, spells: Sequence[Spell] = (), seed: int = 0, imu: bool = True
 ) -> Iterator[tuple[int, float, Features]]:
     """Of each keyframe of our own tracker: its stamp, how wrong the tracker is by then (cm, NaN unknown),
-    and what the error model is told. Raises UsageError without a truth."""
+    and what the error model is told. imu: False plays it as if there were none. Raises UsageError without a
+    truth, or where no tracker fits."""
     truth = source.truth()
     if truth is None:
         raise UsageError(f"{source.name}: comes without a truth, so nobody knows how wrong a tracker is")
-    tracker, error = tracker_for(source, config), LocalError(truth)
-    odometer = Odometer()
-    for frame in spoiled(frames_of(source, config, SequencerCounters()), spells, seed):
+    rig = source.rig if imu else replace(source.rig, imu=None)
+    check_trackable(source.name, rig)
+    tracker, error, odometer = tracker_of(rig, config), LocalError(truth), Odometer()
+    for frame in spoiled(frames_of(source, config, SequencerCounters()), spells, seed, rig):
+        frame = frame if imu else replace(frame, imu=ImuBatch.empty())
         result = tracker.track(frame)
         error_cm = error.after(frame.stamp_ns, result.T_odom_body, result.new_stretch)
-        odometer.frame(fared(frame.stamp_ns, result))
+        odometer.frame(fared(frame, result))
         if result.keyframe:
             footing = tracker.footing()
             lately = odometer.keyframe(frame.stamp_ns, tracker.keyframe(frame))

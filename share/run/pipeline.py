@@ -48,15 +48,14 @@ def frames_of(
 
 def tracker_for(source: Source, config: Config) -> VisualTracker | InertialTracker:
     """The estimator that fits the source's rig. Raises UsageError where there is none."""
-    check_trackable(source)
+    check_trackable(source.name, source.rig)
     return tracker_of(source.rig, config)
 
 
-def check_trackable(source: Source) -> None:
-    """Raises UsageError unless some estimator fits the rig."""
-    rig = source.rig
+def check_trackable(name: str, rig: Rig) -> None:
+    """Raises UsageError unless some estimator fits the rig of the source `name`."""
     if rig.imu is None and rig.cam1 is None and rig.depth is None:
-        raise UsageError(f"{source.name}: one camera alone gives no scale; stereo, depth or an IMU is needed")
+        raise UsageError(f"{name}: one camera alone gives no scale; stereo, depth or an IMU is needed")
 
 
 def tracker_of(rig: Rig, config: Config) -> VisualTracker | InertialTracker:

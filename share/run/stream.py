@@ -23,7 +23,7 @@ class StreamRun(AgentRun):
     """As `AgentRun`; what the tracker's thread did there is done by the edge."""
 
     def _prepare(self) -> None:
-        check_trackable(self._source)
+        check_trackable(self._source.name, self._source.rig)
         self._room = threading.Semaphore(READ_AHEAD)  # frames between the threads: policy block
         self._may_begin = threading.Event()
 

@@ -95,7 +95,7 @@ def _track(source: Source, settings: Config, clock_offset_ns: int, told_by: str)
     seen = []
     for frame in frames_of(source, settings, SequencerCounters()):
         result = tracker.track(frame)
-        error_cm = errors.after(frame.stamp_ns, result)
+        error_cm = errors.after(frame, result)
         seen.append(
             Seen(
                 at_ns=frame.stamp_ns - clock_offset_ns,

@@ -20,7 +20,7 @@ from share.evaluator.features import SHAPES, Features, kind_of
 from share.io.files import atomic_write
 from share.types import F32, I64, U8
 
-SCHEMA = 3
+SCHEMA = 4
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
+from share.evaluator.recent import RECENT
 from share.metrics.local_error import LocalError
 from share.train.label_file import read_labels
 
@@ -26,8 +27,14 @@ def test_labels_of_a_session(share, plain_session, tmp_path):
     known = np.isfinite(labels.error_cm)
     assert not known[labels.stamps_ns < labels.stamps_ns[0] + 2.4e9].any()  # half a window first
     assert (labels.error_cm[known] < 1).all()
+    assert labels.about["imu"] and not labels.recent[:, RECENT.index("deaf")].any()
 
-    made = {path: path.stat().st_mtime_ns for path in out.iterdir()}
+    assert share(*arguments, "--without-imu").code == 0  # beside the others
+    bare = read_labels(out / clean.name.replace("-0", "-without-imu-0"))
+    assert not bare.about["imu"] and bare.recent[:, RECENT.index("deaf")].all()
+    assert np.nanmedian(bare.error_cm) < 2
+
+    made = {path: path.stat().st_mtime_ns for path in out.iterdir() if "without" not in path.name}
     next(iter(made)).unlink()
     assert share(*arguments).code == 0  # goes on where it was broken off
     assert sum(path.stat().st_mtime_ns == was for path, was in made.items()) == 5

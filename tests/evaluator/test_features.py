@@ -15,7 +15,7 @@ from share.evaluator.scalars import NAMES, scalars
 from share.types import U8, Footing, TrackState
 
 SIZE = (640, 480)
-LATELY = Lately((Fared(0, TrackState.OK, 50, 50, 0.0),), 1.0, 0.5, (0.3,))
+LATELY = Lately((Fared(0, True, TrackState.OK, 50, 50, 0.0),), 1.0, 0.5, (0.3,))
 GREY: U8 = np.full((240, 320), 128, np.uint8)
 
 

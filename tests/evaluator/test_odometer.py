@@ -20,7 +20,7 @@ def candidate(T: np.ndarray, sigma_rad: float, sigma_m: float, new: bool = False
 
 
 def fared(stamp_ns: int) -> Fared:
-    return Fared(stamp_ns, TrackState.OK, 50, 40, 1.4)
+    return Fared(stamp_ns, True, TrackState.OK, 50, 40, 1.4)
 
 
 def test_independent_motions_add_up_as_their_variances_do():

@@ -11,7 +11,7 @@ from share.evaluator.recent import RECENT, recent
 from share.types import TrackState
 
 S = 1_000_000_000
-FINE = Fared(0, TrackState.OK, 50, 50, 0.0)
+FINE = Fared(0, True, TrackState.OK, 50, 50, 0.0)
 
 
 def told(*frames: Fared, sigmas_cm=(1.0,), way_m=0.0, turn_rad=0.0) -> dict[str, float]:
@@ -55,9 +55,13 @@ def test_more_believed_than_found_is_not_less_than_none_refused():
 
 
 def test_in_what_state_it_was():
-    states = (TrackState.WEAK, TrackState.INERTIAL_ONLY, TrackState.INERTIAL_ONLY, TrackState.VISION_ONLY)
+    states = (TrackState.WEAK, TrackState.INERTIAL_ONLY, TrackState.LOST, TrackState.OK)
     now = told(*(FINE._replace(state=state) for state in states))
-    assert (now["weak"], now["blind"], now["deaf"]) == (0.25, 0.5, 0.25)
+    assert (now["weak"], now["blind"], now["deaf"]) == (0.25, 0.5, 0)
+
+
+def test_without_an_imu_it_was_deaf():
+    assert told(FINE, FINE._replace(heard=False))["deaf"] == 0.5
 
 
 def test_the_longest_time_without_a_frame():

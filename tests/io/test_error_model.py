@@ -24,7 +24,7 @@ def told(network, found: int, believed: int, sigma_cm: float, state=TrackState.O
     image = cv2.GaussianBlur(rng.integers(0, 256, (480, 640), np.uint8), (0, 0), 2)
     px = rng.uniform(0, 470, (found, 2)).astype(np.float32)
     footing = Footing(px, np.arange(found) < believed, np.full(found, 2.5), max(found, 30), 3 * found)
-    frames = tuple(Fared(k * 66_666_667, state, found, believed, surprise) for k in range(75))
+    frames = tuple(Fared(k * 66_666_667, True, state, found, believed, surprise) for k in range(75))
     return estimate(network, features(image, footing, Lately(frames, 2.0, 1.5, (sigma_cm,) * 12)))
 
 

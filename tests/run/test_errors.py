@@ -50,7 +50,7 @@ def frame(brightness: int) -> Frame:
 
 
 def keyframe(errors: AtOnce, brightness: int) -> None:
-    errors.after(brightness, TRACKED)
+    errors.after(frame(brightness), TRACKED)
     errors.keyframe(frame(brightness), Tracker())
 
 
@@ -65,11 +65,11 @@ def test_what_was_said_last_holds():
     network, said = Network(), []
     network.may.set()
     errors = ByModel(network, said.append)
-    assert errors.after(0, TRACKED) is None
+    assert errors.after(frame(0), TRACKED) is None
     keyframe(errors, 3)
-    until(lambda: errors.after(1, TRACKED) is not None)
-    assert errors.after(1, TRACKED) == pytest.approx(3)
-    assert errors.after(2, LOST) is None  # there is no pose that could be wrong
+    until(lambda: errors.after(frame(1), TRACKED) is not None)
+    assert errors.after(frame(1), TRACKED) == pytest.approx(3)
+    assert errors.after(frame(2), LOST) is None  # there is no pose that could be wrong
     errors.close()
     told = errors.report()["error_model"]
     assert told["estimate_ms"]["n"] == 1
@@ -86,7 +86,7 @@ def test_who_is_busy_leaves_the_older_out():
         keyframe(errors, brightness)
     assert time.monotonic() - began < 2
     network.may.set()
-    until(lambda: errors.after(1, TRACKED) == pytest.approx(4))
+    until(lambda: errors.after(frame(1), TRACKED) == pytest.approx(4))
     errors.close()
     assert network.seen == [1.0, 4.0]
     assert errors.report()["error_model"]["drop_estimate"] == 2
@@ -97,12 +97,12 @@ def test_a_network_that_fails_is_left_alone_and_said_so():
     network.may.set()
     errors = ByModel(network, said.append)
     keyframe(errors, 5)
-    until(lambda: errors.after(1, TRACKED) is not None)
+    until(lambda: errors.after(frame(1), TRACKED) is not None)
     keyframe(errors, 250)
     until(lambda: said)
     assert said == ["the error model has failed and is left alone: too bright"]
     keyframe(errors, 6)
-    assert errors.after(2, TRACKED) is None
+    assert errors.after(frame(2), TRACKED) is None
     errors.close()
 
 
@@ -110,7 +110,7 @@ def test_in_virtual_time_it_has_answered_at_once():
     network = Network()
     network.may.set()
     errors = AtOnce(network)
-    assert errors.after(0, TRACKED) is None
+    assert errors.after(frame(0), TRACKED) is None
     keyframe(errors, 7)
-    assert errors.after(1, TRACKED) == pytest.approx(7)
-    assert errors.after(1, LOST) is None
+    assert errors.after(frame(1), TRACKED) == pytest.approx(7)
+    assert errors.after(frame(1), LOST) is None

@@ -48,8 +48,8 @@ def test_what_is_in_them_is_listed_and_other_names_are_refused():
 
 def test_rooms_of_the_error_model_are_unlike_each_other_and_always_the_same(tools):
     recipe = tools("make_error_rooms").recipe
-    rooms = [recipe(number, 30.0) for number in range(30)]
+    rooms = [recipe(number, 30.0, "stereo") for number in range(30)]
     assert len({room.digest for room in rooms}) == 30
-    assert [room.digest for room in rooms] == [recipe(number, 30.0).digest for number in range(30)]
+    assert [room.digest for room in rooms] == [recipe(number, 30.0, "stereo").digest for number in range(30)]
     assert {len(room.motions) for room in rooms} == {2}
     assert {room.scene for room in rooms} == {"warehouse", "firestation", "whitewall"}

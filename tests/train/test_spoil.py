@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from share.geometry import se3
+from share.geometry.camera import Camera, Rig
 from share.train.spoil import KINDS, Spell, draw, spoiled
 from share.types import Frame, ImuBatch
 
 S = 1_000_000_000
 HZ = 10
+FOCAL, BASELINE_M = 20.0, 0.05
+LENS = Camera(64, 48, FOCAL, FOCAL, 32.0, 24.0)
+RIG = Rig(LENS, np.eye(4), LENS, se3.exp(np.array([0, 0, 0, -BASELINE_M, 0, 0])))
 
 
 def frames(seconds: float = 3.0) -> list[Frame]:
@@ -29,7 +35,7 @@ def frames(seconds: float = 3.0) -> list[Frame]:
 
 
 def during(how: str, much: float, begin_s: float = 2.0, end_s: float = 3.0) -> list[Frame]:
-    return list(spoiled(frames(), [Spell(how, round(begin_s * S), round(end_s * S), much)], seed=1))
+    return list(spoiled(frames(), [Spell(how, round(begin_s * S), round(end_s * S), much)], 1, RIG))
 
 
 @pytest.mark.parametrize("how", ["dark", "blur", "haze", "cover"])
@@ -54,6 +60,23 @@ def test_a_cover_hides_what_it_says():
         assert (covered != seen).mean() == pytest.approx(hidden, abs=0.05)
 
 
+def test_what_covers_is_near_to_both_eyes_and_to_a_depth_camera():
+    """So that it is where things right in front are, not where the sky is."""
+    for away, away_m in ((0.0, 0.1), (1.0, 0.5)):
+        spell = Spell("cover", S, 2 * S, 0.2, (0.7, 0.5, away))
+        (whole,) = (replace(frame, depth=np.ones((24, 32), np.float32)) for frame in frames(0.1))
+        (seen,) = spoiled([whole], [spell], 1, RIG)
+        assert seen.image1 is not None and seen.depth is not None and whole.image1 is not None
+        left, right = (
+            np.flatnonzero((a != b).mean(axis=0) > 0.5)
+            for a, b in zip((whole.image0, whole.image1), (seen.image0, seen.image1), strict=True)
+        )
+        assert left[0] - right[0] == pytest.approx(FOCAL * BASELINE_M / away_m, abs=1)
+        assert len(left) == len(right)
+        near = set(np.unique(seen.depth))
+        assert near == {0.0, 1.0} if away_m < 0.28 else near == {np.float32(away_m), 1.0}
+
+
 def test_imu_samples_of_frames_that_are_missing_come_with_the_next():
     given = during("drop", 1.0)
     assert [frame.index for frame in given] == [*range(10), *range(20, 30)]
@@ -71,7 +94,7 @@ def test_an_imu_is_silent_in_its_spell():
 
 def test_the_same_seed_spoils_alike():
     spells = [Spell("dark", S, 4 * S, 0.5)]
-    one, two, other = (list(spoiled(frames(), spells, seed)) for seed in (1, 1, 2))
+    one, two, other = (list(spoiled(frames(), spells, seed, RIG)) for seed in (1, 1, 2))
     assert all((a.image0 == b.image0).all() for a, b in zip(one, two, strict=True))
     assert any((a.image0 != b.image0).any() for a, b in zip(one, other, strict=True))
 
