@@ -87,7 +87,8 @@ def _make(work: tuple[Job, Config]) -> None:
     truth = source.truth()
     assert truth is not None
     rng = np.random.default_rng((job.seed, job.number, zlib.crc32(job.out.name.encode())))
-    kinds = rng.permutation(KINDS)[: rng.integers(1, _MOST_KINDS + 1)].tolist() if job.number else []
+    known = [kind for kind in KINDS if job.imu or kind != "deaf"]
+    kinds = rng.permutation(known)[: rng.integers(1, _MOST_KINDS + 1)].tolist() if job.number else []
     spells = draw(rng, int(truth.stamps_ns[0]), int(truth.stamps_ns[-1]), kinds)
     about = {
         "session": job.session.resolve().name,

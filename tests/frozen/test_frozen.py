@@ -104,6 +104,12 @@ def test_the_whole_system_and_the_same_digits_as_from_source(share, tmp_path):
     subprocess.run(source, check=True, capture_output=True)
     assert (tmp_path / "frozen.tum").read_bytes() == (tmp_path / "source.tum").read_bytes()
 
+    settings, out = tmp_path / "settings.yaml", tmp_path / "agent"
+    settings.write_text("agent: {error_model: shipped}")
+    who = ("--name", "ar1", "--kind", "ar", "--edge", "tcp://127.0.0.1:9", "--frames", "0:120")
+    share("agent", session / "ar1", *who, "--config", settings, "--out", out, code=1)  # no edge there
+    assert json.loads((out / "report.json").read_text())["error_model"]["estimate_ms"]["n"] > 0
+
 
 def test_nothing_is_in_it_that_no_command_needs(program):
     inside = program.parent / "_internal"
@@ -115,7 +121,9 @@ def test_nothing_is_in_it_that_no_command_needs(program):
         "_tkinter",
         "IPython",
         "pandas",
-        "onnxruntime",
+        "onnx",
+        "sklearn",
+        "dask",
         "pyrealsense2",
     }
     sizes = (path.lstat().st_size for path in inside.rglob("*") if not path.is_dir())
