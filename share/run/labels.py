@@ -116,6 +116,7 @@ def keyframes(
     truth = source.truth()
     if truth is None:
         raise UsageError(f"{source.name}: comes without a truth, so nobody knows how wrong a tracker is")
+    # Not `without_imu`, which makes cam0 the body: the truth stays that of the body that was recorded.
     rig = source.rig if imu else replace(source.rig, imu=None)
     check_trackable(source.name, rig)
     tracker, error, odometer = tracker_of(rig, config), LocalError(truth), Odometer()
