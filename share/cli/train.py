@@ -185,8 +185,12 @@ def compare(labels: Path, fitted: Path, base: Path | None, as_json: bool) -> Non
     live = LiveLine()
     live.write("pictures go through the backbone")
     made = assemble(fitted, labels, _base(base))
-    seed = made.fitted.about["options"]["seed"]
-    scores = of_rivals(made.collection, made.deep, seed, lambda name: live.write(f"teaching: {name}"))
+    seed, scores = made.fitted.about["options"]["seed"], []
+    for score in of_rivals(made.collection, made.deep, seed, live.write):
+        live.end()
+        click.echo(f"{score.name}: RMSE {score.rmse_cm:.2f} cm", err=True)
+        scores.append(score)
+    live.write("ours, keyframe by keyframe")
     scores.append(of_network("ours", made.network, made.test))
     live.end()
     if as_json:

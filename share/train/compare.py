@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 
 import numpy as np
 
 from share.config import ControlConfig
 from share.control.qoe import DELAY_MS, Needs, qoe
 from share.evaluator.model import Network, estimate
-from share.train.rivals import RIVALS, Rows, Tell
+from share.train.rivals import RIVALS, Rows, Say, Tell
 from share.train.score import Score
 from share.train.table import Collection
 from share.types import F32, F64, AgentKind
@@ -29,19 +29,16 @@ def of_network(name: str, network: Network, rows: Rows) -> Score:
     return scored(name, np.array([one.error_cm for one in told]), table.error_cm, covered, ms)
 
 
-def of_rivals(
-    collection: Collection, deep: F32, seed: int, say: Callable[[str], None] = lambda name: None
-) -> list[Score]:
-    """Each taught on the rooms that ours is taught on, and tried where it is tried."""
+def of_rivals(collection: Collection, deep: F32, seed: int, say: Say) -> Iterator[Score]:
+    """Each taught on the rooms that ours is taught on, and tried where it is tried; as they are done."""
     rows = Rows(collection.table, deep)
     parts = {part: rows.take(collection.of(part)) for part in collection.parts}
-    out = [_mean(parts["learn"], parts["test"])]
+    learn, stop, test = parts["learn"], parts["stop"], parts["test"]
+    yield _mean(learn, test)
     for name, rival in RIVALS.items():
-        say(name)
-        tell = rival(parts["learn"], parts["stop"], seed)
-        test = parts["test"]
-        out.append(scored(name, tell(test), test.table.error_cm, ms=_timed(tell, test)))
-    return out
+        say(f"{name}: learns")
+        tell = rival(learn, stop, seed, _of(name, say))
+        yield scored(name, tell(test), test.table.error_cm, ms=_timed(tell, test))
 
 
 def scored(
@@ -53,6 +50,10 @@ def scored(
     rank = float(spearmanr(told_cm, error_cm).statistic) if np.ptp(told_cm) else 0.0
     rmse, mae = float(np.sqrt((off**2).mean())), float(np.abs(off).mean())
     return Score(name, rmse, mae, rank, float(np.abs(_qoe(told_cm) - _qoe(error_cm)).mean()), covered, ms)
+
+
+def _of(name: str, say: Say) -> Say:
+    return lambda how_far: say(f"{name}: {how_far}")
 
 
 def _qoe(error_cm: F64 | F32) -> F64:

@@ -1,6 +1,7 @@
 """What else could estimate the error of a keyframe: the four that the paper compares its network with.
 
-Each is a function: taught on some keyframes, stopped by others, it says what error it expects of new ones.
+Each is a function: taught on some keyframes, stopped by others, it says what error it expects of new ones;
+meanwhile how far it is.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ TREES = 70
 _BLOCKS = (2, 4)  # down and across, of each channel of a PSD: 24 numbers for the forest
 _LEAST_CM = 0.01
 _EPOCHS, _PATIENCE, _BATCH = 100, 12, 256
+_CNN_EPOCHS, _CNN_PATIENCE = 24, 5  # each takes long: it sees pictures, where the others see what is known
 _CONTRAST_EPOCHS, _TEMPERATURE = 6, 0.1
 
 
@@ -33,10 +35,11 @@ class Rows(Columns):
 
 
 Tell = Callable[[Rows], F64]
-Rival = Callable[[Rows, Rows, int], Tell]  # learnt from, stopped by, seed
+Say = Callable[[str], None]  # how far it is, for a person
+Rival = Callable[[Rows, Rows, int, Say], Tell]  # learnt from, stopped by, seed
 
 
-def linear(learn: Rows, stop: Rows, seed: int) -> Tell:
+def linear(learn: Rows, stop: Rows, seed: int, say: Say) -> Tell:
     """Least squares on the eight scalars."""
     from sklearn.linear_model import LinearRegression
 
@@ -44,7 +47,7 @@ def linear(learn: Rows, stop: Rows, seed: int) -> Tell:
     return lambda rows: np.maximum(model.predict(rows.table.scalars), _LEAST_CM)
 
 
-def forest(learn: Rows, stop: Rows, seed: int) -> Tell:
+def forest(learn: Rows, stop: Rows, seed: int, say: Say) -> Tell:
     """70 trees on 1312 numbers: 1280 of the backbone, 24 of the PSD, 8 scalars."""
     from sklearn.ensemble import RandomForestRegressor
 
@@ -54,7 +57,7 @@ def forest(learn: Rows, stop: Rows, seed: int) -> Tell:
     return lambda rows: np.maximum(model.predict(_numbers(rows)), _LEAST_CM)
 
 
-def perceptron(learn: Rows, stop: Rows, seed: int) -> Tell:
+def perceptron(learn: Rows, stop: Rows, seed: int, say: Say) -> Tell:
     """A head of two layers on the backbone, which sees the picture and nothing else."""
     torch.manual_seed(seed)
     mean, deviation = learn.deep.mean(axis=0), np.maximum(learn.deep.std(axis=0), 1e-3)
@@ -63,11 +66,11 @@ def perceptron(learn: Rows, stop: Rows, seed: int) -> Tell:
         return torch.from_numpy((rows.deep - mean) / deviation)
 
     net = nn.Sequential(nn.Dropout(0.3), nn.Linear(1280, 128), nn.ReLU(), nn.Linear(128, 1))
-    _teach(net, (inputs(learn), learn), (inputs(stop), stop))
+    _teach(net, (inputs(learn), learn), (inputs(stop), stop), _EPOCHS, _PATIENCE, say)
     return lambda rows: _told(net, inputs(rows))
 
 
-def contrastive(learn: Rows, stop: Rows, seed: int) -> Tell:
+def contrastive(learn: Rows, stop: Rows, seed: int, say: Say) -> Tell:
     """A small CNN of its own on the picture: first taught to put pictures of like errors side by side
     (supervised contrast, the nearer in error the more alike; Zha et al. 2023), then to tell the error."""
     torch.manual_seed(seed)
@@ -75,12 +78,13 @@ def contrastive(learn: Rows, stop: Rows, seed: int) -> Tell:
     net = nn.Sequential(encoder, tell)
     x, y = _pictures(learn), torch.from_numpy(learn.table.log_error)
     optimiser = torch.optim.AdamW(encoder.parameters(), 1e-3, weight_decay=0.01)
-    for _ in range(_CONTRAST_EPOCHS):
+    for epoch in range(_CONTRAST_EPOCHS):
+        say(f"contrast, epoch {epoch + 1} of {_CONTRAST_EPOCHS}")
         for which in torch.randperm(len(x)).split(_BATCH):
             optimiser.zero_grad()
             _contrast(functional.normalize(encoder(x[which]), dim=1), y[which]).backward()
             optimiser.step()
-    _teach(net, (x, learn), (_pictures(stop), stop))
+    _teach(net, (x, learn), (_pictures(stop), stop), _CNN_EPOCHS, _CNN_PATIENCE, say)
     return lambda rows: _told(net, _pictures(rows))
 
 
@@ -115,22 +119,36 @@ def _encoder() -> nn.Module:
 
 
 def _contrast(z: Tensor, y: Tensor) -> Tensor:
-    """z (B, D) of length 1, y (B,): of each pair, against all that are further from the first in y."""
-    alike = z @ z.T / _TEMPERATURE
-    apart = (y[:, None] - y[None]).abs()
+    """z (B, D) of length 1, y (B,): of each pair, against all that are as far from the first in y or further.
+
+    Of anchor i, all others in falling order of that: then those against which j stands are the ones up to j,
+    and to the last that is as far as j. So it takes B^2 log B, where the sum as it is written takes B^3.
+    """
     others = ~torch.eye(len(z), dtype=torch.bool)
-    further = (apart[:, None, :] >= apart[:, :, None]) & others[:, None, :]  # of anchor i, pair j, other k
-    against = torch.logsumexp(alike[:, None, :].masked_fill(~further, -1e9), dim=2)
-    return (against - alike)[others].mean()
+    alike = (z @ z.T / _TEMPERATURE)[others].view(len(z), -1)
+    apart = (y[:, None] - y[None]).abs()[others].view(len(z), -1)
+    apart, order = apart.sort(dim=1, descending=True)
+    alike = alike.gather(1, order)
+    last = torch.searchsorted(-apart, -apart, right=True) - 1
+    against = alike.logcumsumexp(dim=1).gather(1, last)
+    return (against - alike).mean()
 
 
-def _teach(net: nn.Module, learn: tuple[Tensor, Rows], stop: tuple[Tensor, Rows]) -> None:
+def _teach(
+    net: nn.Module,
+    learn: tuple[Tensor, Rows],
+    stop: tuple[Tensor, Rows],
+    epochs: int,
+    patience: int,
+    say: Say,
+) -> None:
     """By the Poisson deviance, as ours, until it gets no better where it stops."""
     optimiser = torch.optim.AdamW(net.parameters(), 1e-3, weight_decay=0.05)
     x, y = learn[0], torch.from_numpy(learn[1].table.error_cm)
     seen, wanted = stop[0], torch.from_numpy(stop[1].table.error_cm)
     best, kept, since = float("inf"), _copy(net), 0
-    for _ in range(_EPOCHS):
+    for epoch in range(epochs):
+        say(f"epoch {epoch + 1} of {epochs} at most")
         net.train()
         for which in torch.randperm(len(x)).split(_BATCH):
             optimiser.zero_grad()
@@ -142,7 +160,7 @@ def _teach(net: nn.Module, learn: tuple[Tensor, Rows], stop: tuple[Tensor, Rows]
         since += 1
         if now < best:
             best, kept, since = now, _copy(net), 0
-        if since >= _PATIENCE:
+        if since >= patience:
             break
     net.load_state_dict(kept)
     net.eval()

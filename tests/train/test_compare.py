@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="make install-train brings it")
-pytest.importorskip("sklearn", reason="make install-train brings it")
+pytest.importorskip("torch", reason="make train-test brings it")
+pytest.importorskip("sklearn", reason="make train-test brings it")
 
 from share.evaluator.features import SHAPES, kind_of
 from share.train.compare import of_network, scored
@@ -83,3 +83,19 @@ def test_contrast_is_less_where_likes_are_together():
     )
     apart = together[[0, 2, 1, 3]]
     assert _contrast(together, y) < _contrast(apart, y)
+
+
+def test_contrast_is_the_sum_as_it_is_written():
+    """Zha et al. 2023, equation 1, over all triples; errors that are cut off are the same."""
+    import torch
+
+    rng = torch.Generator().manual_seed(0)
+    z = torch.nn.functional.normalize(torch.randn(12, 5, generator=rng), dim=1)
+    y = torch.rand(12, generator=rng).clamp(max=0.6)
+    assert len(y.unique()) < 12
+    alike, terms = z @ z.T / 0.1, []
+    for i in range(12):
+        for j in set(range(12)) - {i}:
+            against = [k for k in range(12) if k != i and abs(y[i] - y[k]) >= abs(y[i] - y[j])]
+            terms.append(torch.logsumexp(alike[i, against], 0) - alike[i, j])
+    assert _contrast(z, y) == pytest.approx(float(torch.stack(terms).mean()), rel=1e-5)

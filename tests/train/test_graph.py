@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch", reason="make install-train brings it")
-onnx = pytest.importorskip("onnx", reason="make install-train brings it")
+torch = pytest.importorskip("torch", reason="make train-test brings it")
+onnx = pytest.importorskip("onnx", reason="make train-test brings it")
 
 from made_features import made_features  # noqa: E402
 from tiny_backbone import tiny_backbone  # noqa: E402
