@@ -2,11 +2,12 @@
 
     python tools/measure_embedding.py SESSION [SESSION ...] [--model FILE]
 
-SESSION: a folder by `share emulate`. Keyframes are each 30 cm or 20 degrees of an agent's true path; each looks
-for the place among those of all other agents. True are those that `share.place.verify` finds with a pose that
-is right by 15 cm and 2 degrees. Prints, of keyframes that have a true one at all, how many have it among the
-first 1, 3, 8 and 20 found: by words, by likeness of the embeddings (cosine), of pictures of 16 x 12 pixels
-(for comparison), and by words and likeness together (reciprocal ranks, Cormack et al. 2009), at several weights.
+SESSION: a folder by `share emulate`. Keyframes are each 30 cm or 20 degrees of an agent's true path; each
+looks for the place among those of all other agents. True are those that `share.place.verify` finds with a
+pose that is right by 15 cm and 2 degrees. Prints, of keyframes that have a true one at all, how many have it
+among the first 1, 3, 8 and 20 found: by words, by likeness of the embeddings (cosine), of pictures of 16 x 12
+pixels (for comparison), and by words and likeness together (reciprocal ranks, Cormack et al. 2009), at
+several weights.
 """
 
 from __future__ import annotations
