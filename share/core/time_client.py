@@ -72,9 +72,9 @@ def read(data: bytes, nonce: int, sent_ns: int, back_ns: int) -> Answer:
         raise ValueError(f"mode {packet.mode.name} in place of an answer")
     if packet.origin != nonce:
         raise ValueError("it answers another question")
-    if packet.stratum == KISS:
-        raise KissError(packet.refid.decode("ascii", "replace").rstrip("\0 "))
-    if packet.leap == LEAP_UNKNOWN or packet.stratum == UNSYNCHRONISED:
+    if packet.stratum == KISS and (code := packet.refid.rstrip(b"\0 ")).isalnum():
+        raise KissError(code.decode("ascii"))
+    if packet.leap == LEAP_UNKNOWN or packet.stratum in (KISS, UNSYNCHRONISED):  # 0: chronyd says it so
         raise ValueError("that server does not know the time itself (unsynchronised)")
     received_ns, replied_ns = from_stamp(packet.receive, sent_ns), from_stamp(packet.transmit, sent_ns)
     exchange = Exchange(sent_ns, received_ns, replied_ns, back_ns)

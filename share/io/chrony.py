@@ -50,14 +50,12 @@ def parse(text: str) -> Tracking:
     row = text.strip().split(",")
     try:
         if len(row) < _FIELDS:
-            raise ValueError(f"{len(row)} fields")
+            raise ValueError(f"{len(row)} fields, expected {_FIELDS}")
         offset_s, _last, rms_s = (float(cell) for cell in row[4:7])
         delay_s, dispersion_s = float(row[10]), float(row[11])
         stratum = int(row[2])
     except ValueError as error:
-        raise DataError(
-            f"chronyc -c tracking: {error} where {_FIELDS} were expected: {text.strip()!r}"
-        ) from None
+        raise DataError(f"chronyc -c tracking: not understood ({error}): {text.strip()!r}") from None
     synchronised, local = row[13] != "Not synchronised", row[0].upper() == _NOBODY
     source = row[1] or row[0]
     return Tracking(source, synchronised, local, stratum, offset_s, rms_s, delay_s, dispersion_s)
