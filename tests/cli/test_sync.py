@@ -209,12 +209,15 @@ def serving(stratum: int = 10) -> Iterator[tuple[subprocess.Popen[str], int]]:
     ) as process:
         assert process.stderr is not None
         try:
-            first = process.stderr.readline()
-            found = re.fullmatch(
-                r"telling this machine's own time at 127\.0\.0\.1:(\d+) \(UDP\); .*\n", first
-            )
-            assert found, first
-            yield process, int(found[1])
+            said = [process.stderr.readline() for _ in range(3)]  # all: what is read ahead would be lost
+            found = re.match(r"telling this machine's own time at 127\.0\.0\.1:(\d+) \(UDP\); ", said[0])
+            assert found, said
+            port = int(found[1])
+            assert said[1:] == [
+                f"stratum {stratum}, reference 127.127.1.1: this machine's own clock, none better behind it\n",
+                f"clients' chrony.conf: server THIS-MACHINE port {port} iburst\n",
+            ]
+            yield process, port
         finally:
             process.kill()
 
