@@ -88,10 +88,9 @@ def _introduce(at: Host, stratum: int, by_kernel: bool) -> None:
 
 def _counts(times: TimeServer) -> str:
     c = times.counts
-    newest = "" if times.newest is None else f", the last {times.newest}"
+    clients = f"clients: {times.clients}" + ("" if times.newest is None else f" (last {times.newest})")
     return (
-        f"{c['answered']} questions of {times.clients} clients answered{newest}; "
-        f"{c['limited']} too often, {c['ignored']} no questions"
+        f"answered: {c['answered']}, {clients}, asked too often: {c['limited']}, no questions: {c['ignored']}"
     )
 
 

@@ -83,16 +83,22 @@ def _of_server(finding: Finding, limit_ms: float) -> Row:
         finding.trouble,
         _too_far(offset_ms, uncertainty_ms, limit_ms, "let chrony follow it"),
         finding.host,
-        to_follow=uncertainty_ms < limit_ms < abs(offset_ms) + uncertainty_ms,
+        to_follow=_is_off(offset_ms, uncertainty_ms, limit_ms),
     )
 
 
 def _too_far(offset_ms: float, uncertainty_ms: float, limit_ms: float, mend: str) -> str | None:
     if abs(offset_ms) + uncertainty_ms <= limit_ms:
         return None
-    if uncertainty_ms >= limit_ms:
+    if not _is_off(offset_ms, uncertainty_ms, limit_ms):
         return (
             f"known to no better than ±{uncertainty_ms:.3f} ms, the limit is {limit_ms:g} ms; "
-            "a cable or a quieter network would tell more, or give a larger --limit-ms"
+            "a cable, a quieter network or a larger --count tell more; or give a larger --limit-ms"
         )
     return f"off by {offset_ms:+.3f} ± {uncertainty_ms:.3f} ms, the limit is {limit_ms:g} ms; {mend}"
+
+
+def _is_off(offset_ms: float, uncertainty_ms: float, limit_ms: float) -> bool:
+    """Whether it is the clock that will not do, rather than what is known of it."""
+    most_ms, least_ms = abs(offset_ms) + uncertainty_ms, abs(offset_ms) - uncertainty_ms
+    return least_ms > limit_ms or uncertainty_ms < limit_ms < most_ms
