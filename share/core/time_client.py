@@ -15,11 +15,14 @@ from share.wire.ntp import KISS, LEAP_UNKNOWN, UNSYNCHRONISED, Mode, Packet, fro
 MAX_DRIFT_PPM = 15  # PHI: how fast two clocks may part during an exchange
 
 
+_WHY = {"RATE": "asked too often; wait a minute", "DENY": "it is set not to", "RSTR": "it is set not to"}
+
+
 class KissError(ValueError):
     """The server refuses (section 7.4): it must not be asked again. code: four letters, RATE, DENY, …"""
 
     def __init__(self, code: str) -> None:
-        super().__init__(f"it refuses to answer ({code})")
+        super().__init__(f"it refuses to answer ({code}): {_WHY.get(code, 'for a reason of its own')}")
         self.code = code
 
 

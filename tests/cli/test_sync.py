@@ -144,7 +144,7 @@ def test_a_kiss_of_death_ends_the_questions(share: Share) -> None:
     with udp(kiss) as port:
         done = share("sync", "check", f"127.0.0.1:{port}")
     assert (done.code, len(questions)) == (1, 1)
-    assert done.err == f"share: 127.0.0.1:{port}: it refuses to answer (DENY)\n"
+    assert done.err == f"share: 127.0.0.1:{port}: it refuses to answer (DENY): it is set not to\n"
 
 
 def test_what_was_answered_before_a_kiss_counts(share: Share) -> None:
@@ -160,7 +160,8 @@ def test_what_was_answered_before_a_kiss_counts(share: Share) -> None:
         done = share("sync", "check", f"127.0.0.1:{port}", "--limit-ms", 50)
     assert (done.code, len(questions)) == (0, 3)
     assert " 2/3 " in done.out
-    assert done.err == f"127.0.0.1:{port}: it refuses to answer (RATE)\nwithin 50 ms\n"
+    refused = f"127.0.0.1:{port}: it refuses to answer (RATE): asked too often; wait a minute"
+    assert done.err == f"{refused}\nwithin 50 ms\n"
 
 
 def test_forged_answers_are_passed_over_and_the_true_one_is_taken(share: Share) -> None:
