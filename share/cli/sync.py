@@ -95,7 +95,7 @@ def _counts(times: TimeServer) -> str:
 
 
 @sync.command(short_help="Say how far the clocks of others are from this one.")
-@click.argument("hosts", nargs=-1, metavar="[HOST[:PORT]]...")
+@click.argument("hosts", nargs=-1, metavar="[HOSTS]")
 @click.option(
     "--count", type=click.IntRange(1, 1000), default=8, show_default=True, help="Questions to each."
 )
@@ -111,8 +111,8 @@ def check(hosts: tuple[str, ...], count: int, limit_ms: float, as_json: bool) ->
     """Ask time servers how far their clocks are from this machine's, and how sure that is.
 
     Offset is theirs minus this one, ± the most that it can be wrong by. Exit code 1 if both together are more
-    than --limit-ms for any. The port is 11123, that of `share sync server`; ntpd and chronyd have 123.
-    Without HOST: what this machine's own chronyd says of itself.
+    than --limit-ms for any. HOSTS are HOST or HOST:PORT; the port is 11123 if none is given, that of `share
+    sync server` (ntpd and chronyd have 123). Without HOSTS: what this machine's own chronyd says of itself.
 
     \b
     Example:  share sync check 192.168.1.10 192.168.1.20:123
