@@ -16,11 +16,12 @@ _PATIENCE_S = 10.0
 @dataclass(frozen=True)
 class Tracking:
     """offset_s: the clock that it follows minus this one. rms_s: of that over the last updates. delay_s
-    and dispersion_s: from here to where the time comes from. synchronised: follows somebody."""
+    and dispersion_s: from here to where the time comes from. source: whom it follows, may be empty.
+    synchronised: it follows somebody. local: that is its own clock."""
 
     source: str
     synchronised: bool
-    local: bool  # follows its own clock
+    local: bool
     stratum: int
     offset_s: float
     rms_s: float
@@ -57,8 +58,7 @@ def parse(text: str) -> Tracking:
     except ValueError as error:
         raise DataError(f"chronyc -c tracking: not understood ({error}): {text.strip()!r}") from None
     synchronised, local = row[13] != "Not synchronised", row[0].upper() == _NOBODY
-    source = row[1] or row[0]
-    return Tracking(source, synchronised, local, stratum, offset_s, rms_s, delay_s, dispersion_s)
+    return Tracking(row[1], synchronised, local, stratum, offset_s, rms_s, delay_s, dispersion_s)
 
 
 def follow(server: Host) -> list[str]:

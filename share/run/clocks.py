@@ -47,21 +47,20 @@ def of_chrony(limit_ms: float) -> Row | None:
     found = chrony.tracking()
     if found is None:
         return None
-    offset_ms, uncertainty_ms = found.offset_s * 1e3, found.uncertainty_s * 1e3
+    name = f"chronyd, by {found.source}" if found.source else "chronyd"
     if not found.synchronised:
-        wrong: str | None = "follows no other clock yet; see `chronyc sources`"
-    elif found.local:
-        wrong = "follows nothing but this machine's clock: right where others follow it; check from theirs"
-    else:
-        wrong = _too_far(offset_ms, uncertainty_ms, limit_ms, "see `chronyc sources`")
+        return Row(name, wrong="follows no other clock yet; see `chronyc sources`")
+    if found.local:
+        return Row(name, wrong="follows its own clock; right where others follow it: check from theirs")
+    offset_ms, uncertainty_ms = found.offset_s * 1e3, found.uncertainty_s * 1e3
     return Row(
-        f"chronyd, by {found.source}",
+        name,
         offset_ms,
         uncertainty_ms,
         found.delay_s * 1e3,
         found.rms_s * 1e3,
         found.stratum,
-        wrong=wrong,
+        wrong=_too_far(offset_ms, uncertainty_ms, limit_ms, "see `chronyc sources`"),
     )
 
 

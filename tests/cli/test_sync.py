@@ -43,7 +43,7 @@ def asked(done: Done) -> dict[str, object]:
 
 def test_a_clock_that_agrees_is_a_row_and_exit_code_0(share: Share) -> None:
     with udp(shifted(0.0)) as port:
-        done = share("sync", "check", f"127.0.0.1:{port}", "--count", 4, "--limit-ms", 20)
+        done = share("sync", "check", f"127.0.0.1:{port}", "--count", 4, "--limit-ms", 90)
     head, row = done.out.splitlines()
     assert head.split() == [
         *("clock", "offset", "ms", "±", "ms", "delay", "ms"),
@@ -52,7 +52,7 @@ def test_a_clock_that_agrees_is_a_row_and_exit_code_0(share: Share) -> None:
     assert re.fullmatch(
         rf" *127\.0\.0\.1:{port}  +[+-]\d\.\d{{3}}(  +\d+\.\d{{3}}){{3}}  +10 +4/4 +0\.\d", row
     )
-    assert (done.code, done.err) == (0, "within 20 ms\n")
+    assert (done.code, done.err) == (0, "within 90 ms\n")
 
 
 @pytest.mark.parametrize("offset_ms", [-70.0, 5.0, 3600e3])
@@ -64,8 +64,8 @@ def test_a_clock_that_is_off_is_told_within_its_uncertainty(offset_ms: float, sh
 
 
 def test_who_is_off_is_told_what_to_write_into_chrony_conf(share: Share) -> None:
-    with udp(shifted(5.0)) as port:
-        done = share("sync", "check", f"127.0.0.1:{port}", "--limit-ms", 4)
+    with udp(shifted(50.0)) as port:
+        done = share("sync", "check", f"127.0.0.1:{port}", "--limit-ms", 20)
     *advice, last = done.err.splitlines()
     assert advice == [
         "to follow it: install chrony, put this into /etc/chrony/chrony.conf, restart it:",
@@ -73,7 +73,7 @@ def test_who_is_off_is_told_what_to_write_into_chrony_conf(share: Share) -> None
         "    makestep 0.01 3",
         "    rtcsync",
     ]
-    off = r"off by \+\d\.\d+ ± \d\.\d+ ms, the limit is 4 ms; let chrony follow it"
+    off = r"off by \+\d\d\.\d+ ± \d+\.\d+ ms, the limit is 20 ms; let chrony follow it"
     assert re.fullmatch(rf"share: 127\.0\.0\.1:{port}: {off}", last)
     assert done.code == 1
 
@@ -125,13 +125,13 @@ def test_who_does_not_answer_is_given_up_after_three(share: Share, monkeypatch: 
 
 
 def test_one_of_several_that_will_not_do_is_named_and_the_others_shown(share: Share) -> None:
-    with udp(shifted(0.0)) as good, udp(shifted(90.0)) as bad:
-        done = share("sync", "check", f"127.0.0.1:{good}", f"127.0.0.1:{bad}", "--limit-ms", 20)
+    with udp(shifted(0.0)) as good, udp(shifted(900.0)) as bad:
+        done = share("sync", "check", f"127.0.0.1:{good}", f"127.0.0.1:{bad}", "--limit-ms", 90)
     assert done.code == 1
     assert len(done.out.splitlines()) == 3
     assert re.search(rf"^127\.0\.0\.1:{bad}: off by \+\d+\.\d+ ±", done.err, re.MULTILINE)
     assert f"127.0.0.1:{good}:" not in done.err
-    assert done.err.endswith("share: 1 of 2 clocks are not known to be within 20 ms; see above\n")
+    assert done.err.endswith("share: 1 of 2 clocks are not known to be within 90 ms; see above\n")
 
 
 def test_a_kiss_of_death_ends_the_questions(share: Share) -> None:

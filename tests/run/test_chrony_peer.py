@@ -23,6 +23,7 @@ from share.run.time_server import TimeServerRun
 pytestmark = needs_chrony
 QUICK = "iburst minpoll -2 maxpoll -2"  # four questions in a second
 MS = 1_000_000
+CLOSE_MS = 2.0  # on a machine as busy as one that runs tests; tools/measure_sync.py has what is usual
 
 
 @pytest.fixture(autouse=True)
@@ -60,7 +61,7 @@ def chrony_says_ms(port: int) -> float:
 
 def test_chronyd_believes_our_server_and_finds_this_machines_own_time() -> None:
     with our_server() as (port, server):
-        assert abs(chrony_says_ms(port)) < 0.5
+        assert abs(chrony_says_ms(port)) < CLOSE_MS
         assert server.counts["answered"] >= 3  # fewer and it would not believe them
         assert server.counts["ignored"] == server.counts["limited"] == 0
 
@@ -72,8 +73,8 @@ def test_chronyd_and_our_client_agree_on_a_clock_that_is_off(offset_ms: float) -
         (ours,) = check([Host("127.0.0.1", port)], 8)
     assert ours.estimate is not None
     assert abs(ours.estimate.offset_ns / MS - offset_ms) <= ours.estimate.uncertainty_ns / MS
-    assert theirs == pytest.approx(offset_ms, abs=0.5)
-    assert theirs == pytest.approx(ours.estimate.offset_ns / MS, abs=0.5)
+    assert theirs == pytest.approx(offset_ms, abs=CLOSE_MS)
+    assert theirs == pytest.approx(ours.estimate.offset_ns / MS, abs=CLOSE_MS)
 
 
 def test_our_client_asks_a_chronyd(tmp_path: Path) -> None:
@@ -99,10 +100,35 @@ def test_a_chronyd_that_does_not_know_the_time_is_not_believed(
     )
 
 
+def own_chronyd(folder: Path, control: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From now on `chronyc` speaks to this one, and not to one that this machine may have."""
+    (folder / "chronyc").write_text(f'#!/bin/sh\nexec {CHRONYC} -h {control} "$@"\n')
+    (folder / "chronyc").chmod(0o755)
+    monkeypatch.setenv("PATH", str(folder))
+
+
 def is_settled() -> bool:
     """In its first second chronyd knows how far it is off, but not how fast that changes."""
     found = tracking()
     return found is not None and found.synchronised and found.uncertainty_s < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("config", "said"),
+    [
+        ("local stratum 10", "follows its own clock; right where others follow it: check from theirs"),
+        ("port 0", "follows no other clock yet; see `chronyc sources`"),
+    ],
+)
+def test_a_chronyd_here_that_follows_nobody_says_nothing_of_other_clocks(
+    config: str, said: str, tmp_path: Path, share: Callable[..., Done], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running_chronyd(tmp_path / "run", config, f"port {free_port()}") as control:
+        own_chronyd(tmp_path, control, monkeypatch)
+        wait_for(lambda: (found := tracking()) is not None and found.local == ("local" in config))
+        done = share("sync", "check")
+    assert (done.code, done.err) == (1, f"share: chronyd: {said}\n")
+    assert done.out.splitlines()[1].split() == ["chronyd", *"–––––––"]
 
 
 def test_what_a_chronyd_here_thinks_is_shown_without_a_host(
@@ -113,9 +139,7 @@ def test_what_a_chronyd_here_thinks_is_shown_without_a_host(
         udp(shifted(5.0)) as port,
         running_chronyd(tmp_path / "run", "port 0", f"server 127.0.0.1 port {port} {QUICK}") as control,
     ):
-        (tmp_path / "chronyc").write_text(f'#!/bin/sh\nexec {CHRONYC} -h {control} "$@"\n')
-        (tmp_path / "chronyc").chmod(0o755)
-        monkeypatch.setenv("PATH", str(tmp_path))
+        own_chronyd(tmp_path, control, monkeypatch)
         wait_for(is_settled)
         good = share("sync", "check", "--limit-ms", 8)
         bad = share("sync", "check", "--limit-ms", 2)
