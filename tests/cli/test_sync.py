@@ -18,6 +18,8 @@ import pytest
 from shell import Done
 from time_servers import shifted, udp
 
+from share.cli.agent import _clock
+from share.core.clock_claim import ClockClaim
 from share.run import time_check
 from share.wire.ntp import Mode, Packet
 
@@ -255,3 +257,21 @@ def test_a_port_in_use_is_said(share: Share) -> None:
     assert done == Done(
         1, "", f"share: 127.0.0.1:{port}: the port is in use; stop the other server or choose another port\n"
     )
+
+
+# ------------------------------------------------------------------ agents
+
+
+@pytest.mark.parametrize(
+    ("sigma_ms", "said"),
+    [
+        (0.07, "+0.431 ms from this one's, ±0.427 ms"),
+        (
+            2.8,
+            "offset too uncertain (±3.16 ms, more than clock.claim_ms, 1); latencies are by this machine's",
+        ),
+    ],
+)
+def test_share_agent_says_the_offset_or_that_it_is_too_uncertain(sigma_ms: float, said: str) -> None:
+    claim = ClockClaim(0.431, sigma_ms, 0.357, claim_ms=1.0)
+    assert _clock(claim.report()).startswith(said)
