@@ -6,7 +6,7 @@ import secrets
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -198,4 +198,14 @@ def _summary(run: AgentRun) -> str:
         lines.append(f"{r['drop_late']} more frames came too late and were left out")
     if p95 is not None:
         lines.append(f"pose after {r['track_ms']['p50']:.1f} ms (95 %: {p95:.1f} ms)")
+    if r["clock"]["uncertainty_ms"] is not None:
+        lines.append(f"clock of the edge: {_clock(r['clock'])}")
     return "\n".join(lines)
+
+
+def _clock(c: dict[str, Any]) -> str:
+    sure = f"±{c['uncertainty_ms']:.3g} ms"
+    if c["claim"]:
+        return f"{c['offset_ms']:+.3f} ms from this one's, {sure}"
+    bound = f"more than clock.claim_ms, {c['claim_ms']:g}"
+    return f"offset too uncertain ({sure}, {bound}); latencies are by this machine's clock alone"

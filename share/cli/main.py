@@ -25,6 +25,7 @@ COMMANDS = {
     "agent": ("share.cli.agent", "agent", "Track one agent at sensor rate and share its map."),
     "edge": ("share.cli.edge", "edge", "Join the maps of all agents and send corrections back."),
     "dataset": ("share.cli.dataset", "dataset", "Look into, convert and recover recordings; export maps."),
+    "sync": ("share.cli.sync", "sync", "One clock for all machines of a room, and how well they agree."),
     "emulate": ("share.cli.emulate", "emulate", "Record agents that move through a virtual room."),
     "evaluate": ("share.cli.evaluate", "evaluate", "Play sessions on stated terms, score and compare them."),
     "train": ("share.cli.train", "train", "Teach the model that estimates a tracker's error."),

@@ -13,6 +13,7 @@ from share.config import Config
 from share.core import events as ev
 from share.core.chain import Chain
 from share.core.clock import ClockFilter
+from share.core.clock_claim import ClockClaim
 from share.core.drift import Drift
 from share.core.ledger import Entry, Ledger
 from share.core.map_frame import MapFrame
@@ -117,6 +118,10 @@ class Agent:
             "revision": self._revision,
             **self._clock.report(),
         }
+
+    def clock(self, now_ns: int) -> ClockClaim:
+        """What may be said of the edge's clock at `now_ns`."""
+        return ClockClaim.of(self._clock, now_ns, self._config.clock.claim_ms)
 
     # ------------------------------------------------------------ frames
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from share.config import ClockConfig
+from share.core.exchange import Exchange
 from share.core.rate import SECOND_NS
 from share.types import F64
 
@@ -48,11 +49,11 @@ class ClockFilter:
 
         Returns whether it was believed.
         """
-        rtt_ns = (back_ns - sent_ns) - (replied_ns - received_ns)
-        if rtt_ns < 0 or back_ns < sent_ns:
+        exchange = Exchange(sent_ns, received_ns, replied_ns, back_ns)
+        if not exchange.is_possible:
             self.rejected += 1
             return False
-        offset_ns = ((received_ns - sent_ns) + (replied_ns - back_ns)) // 2
+        rtt_ns, offset_ns = exchange.delay_ns, exchange.offset_ns
         middle_ns = (sent_ns + back_ns) // 2
         self._recent_ns.append(rtt_ns)
         self._smooth(rtt_ns / 1e6)
@@ -75,6 +76,11 @@ class ClockFilter:
             return None
         P = self._predicted(now_ns)[1]
         return float(np.sqrt(P[0, 0])) * 1e3
+
+    @property
+    def asymmetry_ns(self) -> int | None:
+        """What `offset_ns` can be wrong by unseen: half of the least recent round trip."""
+        return -(-min(self._recent_ns) // 2) if self._recent_ns else None
 
     @property
     def drift_ppm(self) -> float | None:

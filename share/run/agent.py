@@ -274,6 +274,7 @@ class AgentRun:
             "drop_late": self._late.dropped,
             **self._errors.report(),
             "sequencer": dataclasses.asdict(self._counters),
+            "clock": self._machine.clock(time.monotonic_ns()).report(),
             "protocol": protocol,
             "version": __version__,
             "config": to_mapping(self._settings),

@@ -32,6 +32,7 @@ HELPS = [
     [],
     *([name] for name in COMMANDS),
     *(["dataset", name] for name in ("info", "convert", "recover")),
+    *(["sync", name] for name in ("server", "check")),
 ]
 
 

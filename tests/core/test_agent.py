@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
 import pytest
 from model_edge import COV, HELLO, MS, S, handle, tracked
 
-from share.config import Config
+from share.config import ClockConfig, Config
 from share.core import events as ev
 from share.core.agent import Agent
 from share.errors import UsageError
@@ -154,6 +154,53 @@ def test_ping_and_pong_give_round_trip_and_clock() -> None:
     assert report["rtt_ms"] == pytest.approx(2.0)
     assert report["clock_offset_ns"] == pytest.approx(3 * S, abs=20_000)
     assert abs(report["clock_drift_ppm"]) < 1
+
+
+def latencies(edge_ns: Callable[[int], int], claim_ms: float = 1.0) -> tuple[list[float], Agent]:
+    """All that is called latency or delay in 30 s of keyframes, each corrected 27 ms after its frame came,
+    with an edge whose clock shows `edge_ns` of the agent's."""
+    agent, told = welcomed(Config(clock=ClockConfig(claim_ms=claim_ms))), []
+    for k in range(1, 600):
+        now = k * 50 * MS + 4 * MS
+        effects = handle(agent, tracked(k, pose(k / 100), candidate=k % 20 == 1), now)
+        for ping in only(m.Ping, effects, messages=True):
+            pong = m.Pong(ping.sequence, ping.sent_ns, edge_ns(now + MS), edge_ns(now + 2 * MS), SESSION)
+            effects += tell(agent, pong, now + 4 * MS)
+        for keyframe in only(Keyframe, effects, messages=True):
+            tell(agent, m.Ack(keyframe.id + 1), now + 5 * MS)
+            effects += tell(agent, correction(pose(), k, answers=keyframe.id), now + 23 * MS)
+        told += [frame.track_ms for frame in only(ev.FrameDone, effects)]
+        told += [evaluation.delay_ms for evaluation in only(m.Evaluation, effects, messages=True)]
+        told += [c.corrected_ms for c in only(ev.CorrectionApplied, effects) if c.corrected_ms is not None]
+    return told, agent
+
+
+@pytest.mark.parametrize(
+    "edge_ns",
+    [
+        lambda ns: ns - 86_400 * S,
+        lambda ns: ns + 3 * S + ns // 10_000,  # and 100 ppm fast
+        lambda ns: ns + (7 * S if ns < 15 * S else 9 * S),  # set in the middle
+    ],
+    ids=["a day behind", "fast", "set"],
+)
+def test_no_latency_depends_on_how_far_the_edges_clock_is_off(edge_ns: Callable[[int], int]) -> None:
+    """So none has to be taken back where that is not known."""
+    true, _ = latencies(lambda ns: ns)
+    told, _ = latencies(edge_ns)
+    assert told == pytest.approx(true, abs=1e-3)
+    assert {round(x) for x in true} == {4, 7, 27}  # to the pose; with a round trip of 3; to the correction
+
+
+def test_an_offset_is_claimed_as_the_setting_allows() -> None:
+    """The round trip is 3 ms, 1 there and 2 back, so it is off by 0.5 and nobody can see that."""
+    _, agent = latencies(lambda ns: ns + 3 * S)
+    strict = agent.clock(30 * S)
+    assert (strict.claim_ms, strict.claimed, strict.offset_ms) == (1.0, False, None)
+    assert strict.asymmetry_ms == pytest.approx(1.5)
+    _, agent = latencies(lambda ns: ns + 3 * S, claim_ms=2.0)
+    assert agent.clock(30 * S).offset_ms == pytest.approx(2999.5, abs=0.1)
+    assert not agent.clock(7200 * S).claimed  # long after it was last heard
 
 
 # ---------------------------------------------------------------- frames

@@ -77,6 +77,11 @@ def test_two_agents_end_in_one_map(kitchen, tracked, tmp_path):
         assert own["corrections"] > 1
         assert report["agents"][name]["keyframes"] == own["sent"] <= own["keyframes"]
         assert own["corrected_ms"]["n"] > 0
+        clock = own["clock"]  # of one machine with itself: the truth is 0
+        estimate_ms = own["protocol"]["clock_offset_ns"] / 1e6
+        assert abs(estimate_ms) <= clock["asymmetry_ms"] + 4 * clock["sigma_ms"]
+        assert clock["claim"] == (clock["uncertainty_ms"] <= 1.0) == (clock["offset_ms"] is not None)
+        assert "clock of the edge: " in agents[name].said
 
 
 def test_an_edge_that_is_killed_and_started_again(kitchen, tracked, tmp_path):

@@ -113,10 +113,11 @@ def parse_address(text: str, bind: bool = False) -> Address:
     return Address("127.0.0.1" if host == "localhost" else host, int(match[3]))
 
 
-def bind_error(target: Address, number: int | None, text: str) -> TransportError:
-    """Why nothing can listen at `target`: errno `number`, which the system calls `text`."""
+def bind_error(target: object, number: int | None, text: str, other: str = "edge") -> TransportError:
+    """Why nothing can listen at `target`: errno `number`, which the system calls `text`. other: who may
+    have the port."""
     mend = {
-        errno.EADDRINUSE: "the port is in use; stop the other edge or choose another port",
+        errno.EADDRINUSE: f"the port is in use; stop the other {other} or choose another port",
         errno.EACCES: "this port needs root; choose one above 1023",
         errno.EADDRNOTAVAIL: "this machine has no such address",
         errno.ENODEV: "this machine has no such address",

@@ -1,0 +1,188 @@
+"""`share sync`: one clock for all machines of a room, and a look at how well they agree."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from share.cli import options
+from share.cli.progress import LiveLine, progress
+from share.cli.table import aligned
+from share.errors import ShareError, UsageError
+
+if TYPE_CHECKING:
+    from share.core.time_server import TimeServer
+    from share.io.udp import Host
+    from share.run.clocks import Row
+
+PORT = 11123  # NTP's own, 123, needs root
+
+
+@click.group()
+def sync() -> None:
+    """Give a room without internet one time, and see how well its machines agree with it.
+
+    \b
+    The edge's machine:  share sync server
+    Each device:         share sync check 192.168.1.10
+                         which says what to tell chrony where the clocks differ
+
+    \b
+    Example:  share sync check 192.168.1.10 --limit-ms 1
+    """
+
+
+@sync.command(short_help="Tell others the time of this machine.")
+@click.option("--bind", default=f"0.0.0.0:{PORT}", show_default=True, metavar="HOST:PORT")
+@click.option(
+    "--stratum",
+    type=click.IntRange(1, 15),
+    default=10,
+    show_default=True,
+    help="How far from a true clock this one is said to be.",
+)
+def server(bind: str, stratum: int) -> None:
+    """Tell others the time of this machine by NTP (RFC 5905), until Ctrl-C.
+
+    Its own clock is what is told, whether or not anybody corrects it: all who follow it agree. In a client's
+    chrony.conf: server HOST port 11123 iburst. Where chronyd runs here, it can serve for good: docs/sync.md.
+
+    \b
+    Example:  share sync server --bind 0.0.0.0:11123
+    """
+    from contextlib import closing
+
+    from share.core.time_server import TimeServer
+    from share.io.udp import Host, StampedSocket, clock_precision, parse_host
+    from share.run.stop import on_stop
+    from share.run.time_server import TimeServerRun
+
+    host = parse_host(bind, PORT, bind=True)
+    live = LiveLine()
+
+    def say(text: str) -> None:
+        live.end()
+        click.echo(f"share sync: {text}", err=True)
+
+    with closing(StampedSocket.bound(host)) as link:
+        times = TimeServer(stratum, clock_precision())
+        run = TimeServerRun(link, times, say, lambda: live.write(_counts(times)))
+        with on_stop(run.stop):
+            _introduce(Host(host.name, link.port), stratum, link.by_kernel)
+            run.go()
+    live.end()
+    click.echo(_counts(times))
+
+
+def _introduce(at: Host, stratum: int, by_kernel: bool) -> None:
+    stamps = "by the kernel" if by_kernel else "by this program, which is less exact"
+    click.echo(f"telling this machine's own time at {at} (UDP); arrivals are stamped {stamps}", err=True)
+    click.echo(
+        f"stratum {stratum}, reference 127.127.1.1: this machine's own clock, none better behind it", err=True
+    )
+    click.echo(f"clients' chrony.conf: server THIS-MACHINE port {at.port} iburst", err=True)
+
+
+def _counts(times: TimeServer) -> str:
+    c = times.counts
+    clients = f"clients: {times.clients}" + ("" if times.newest is None else f" (last {times.newest})")
+    return (
+        f"answered: {c['answered']}, {clients}, asked too often: {c['limited']}, no questions: {c['ignored']}"
+    )
+
+
+@sync.command(short_help="Say how far the clocks of others are from this one.")
+@click.argument("hosts", nargs=-1, metavar="[HOSTS]")
+@click.option(
+    "--count", type=click.IntRange(1, 1000), default=8, show_default=True, help="Questions to each."
+)
+@click.option(
+    "--limit-ms",
+    type=click.FloatRange(0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="How far apart clocks may be at the worst.",
+)
+@options.as_json
+def check(hosts: tuple[str, ...], count: int, limit_ms: float, as_json: bool) -> None:
+    """Ask time servers how far their clocks are from this machine's, and how sure that is.
+
+    Offset is theirs minus this one, ± the most that it can be wrong by. Exit code 1 if both together are more
+    than --limit-ms for any. HOSTS are HOST or HOST:PORT; the port is 11123 if none is given, that of `share
+    sync server` (ntpd and chronyd have 123). Without HOSTS: what this machine's own chronyd says of itself.
+
+    \b
+    Example:  share sync check 192.168.1.10 192.168.1.20:123
+    """
+    from share.io.udp import parse_host
+    from share.run.clocks import of_chrony, of_servers
+
+    asked = [parse_host(text, PORT) for text in hosts]
+    if asked:
+        with progress(count * len(asked), "asking") as bar:
+            rows = of_servers(asked, count, limit_ms, bar)
+    elif (own := of_chrony(limit_ms)) is not None:
+        rows = [own]
+    else:
+        raise UsageError(
+            "no HOST is given, and no chronyd runs on this machine; give the machine that "
+            "`share sync server` runs on, such as 192.168.1.10"
+        )
+    click.echo(json.dumps(_plain(rows, limit_ms)) if as_json else _table(rows))
+    _judge(rows, limit_ms)
+
+
+def _judge(rows: Sequence[Row], limit_ms: float) -> None:
+    """Raises ShareError where not all is well."""
+    for row in rows:
+        if row.note:
+            click.echo(f"{row.name}: {row.note}", err=True)
+    bad = [row for row in rows if row.wrong]
+    if not bad:
+        click.echo(f"within {limit_ms:g} ms", err=True)
+        return
+    to_follow = next((row.host for row in bad if row.to_follow), None)
+    if to_follow is not None:
+        _advise(to_follow)
+    if len(rows) == 1:
+        raise ShareError(f"{bad[0].name}: {bad[0].wrong}")
+    for row in bad:
+        click.echo(f"{row.name}: {row.wrong}", err=True)
+    raise ShareError(
+        f"{len(bad)} of {len(rows)} clocks are not known to be within {limit_ms:g} ms; see above"
+    )
+
+
+def _advise(host: Host) -> None:
+    from share.io.chrony import follow
+
+    click.echo("to follow it: install chrony, put this into /etc/chrony/chrony.conf, restart it:", err=True)
+    for line in follow(host):
+        click.echo(f"    {line}", err=True)
+
+
+def _plain(rows: Sequence[Row], limit_ms: float) -> dict[str, Any]:
+    return {
+        "limit_ms": limit_ms,
+        "ok": not any(row.wrong for row in rows),
+        "clocks": [r.plain() for r in rows],
+    }
+
+
+def _table(rows: Sequence[Row]) -> str:
+    head = ("clock", "offset ms", "± ms", "delay ms", "jitter ms", "stratum", "answers", "took s")
+    return aligned([head, *(_cells(row) for row in rows)])
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    ms = (row.uncertainty_ms, row.delay_ms, row.jitter_ms)
+    numbers = (_number(row.offset_ms, "+.3f"), *(_number(value, ".3f") for value in ms))
+    answers = "–" if row.asked is None else f"{row.answers}/{row.asked}"
+    return (row.name, *numbers, _number(row.stratum, "d"), answers, _number(row.took_s, ".1f"))
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)

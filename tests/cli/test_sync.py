@@ -1,0 +1,277 @@
+"""`share sync` as people use it, over real sockets."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from shell import Done
+from time_servers import shifted, udp
+
+from share.cli.agent import _clock
+from share.core.clock_claim import ClockClaim
+from share.run import time_check
+from share.wire.ntp import Mode, Packet
+
+SHARE = [sys.executable, "-m", "share"]
+Share = Callable[..., Done]
+
+
+@pytest.fixture(autouse=True)
+def _brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(time_check, "PAUSE_S", 0.02)
+
+
+def asked(done: Done) -> dict[str, object]:
+    """The one clock of `check --json`."""
+    told = json.loads(done.out)
+    (clock,) = told["clocks"]
+    assert told["ok"] == (clock["wrong"] is None) == (done.code == 0)
+    return dict(clock)
+
+
+# ------------------------------------------------------------------ check
+
+
+def test_a_clock_that_agrees_is_a_row_and_exit_code_0(share: Share) -> None:
+    with udp(shifted(0.0)) as port:
+        done = share("sync", "check", f"127.0.0.1:{port}", "--count", 4, "--limit-ms", 90)
+    head, row = done.out.splitlines()
+    assert head.split() == [
+        *("clock", "offset", "ms", "±", "ms", "delay", "ms"),
+        *("jitter", "ms", "stratum", "answers", "took", "s"),
+    ]
+    assert re.fullmatch(
+        rf" *127\.0\.0\.1:{port}  +[+-]\d\.\d{{3}}(  +\d+\.\d{{3}}){{3}}  +10 +4/4 +0\.\d", row
+    )
+    assert (done.code, done.err) == (0, "within 90 ms\n")
+
+
+@pytest.mark.parametrize("offset_ms", [-70.0, 5.0, 3600e3])
+def test_a_clock_that_is_off_is_told_within_its_uncertainty(offset_ms: float, share: Share) -> None:
+    with udp(shifted(offset_ms)) as port:
+        clock = asked(share("sync", "check", f"127.0.0.1:{port}", "--json"))
+    assert abs(clock["offset_ms"] - offset_ms) <= clock["uncertainty_ms"]  # type: ignore[operator]
+    assert f"off by {clock['offset_ms']:+.3f} ±" in str(clock["wrong"])
+
+
+def test_who_is_off_is_told_what_to_write_into_chrony_conf(share: Share) -> None:
+    with udp(shifted(50.0)) as port:
+        done = share("sync", "check", f"127.0.0.1:{port}", "--limit-ms", 20)
+    *advice, last = done.err.splitlines()
+    assert advice == [
+        "to follow it: install chrony, put this into /etc/chrony/chrony.conf, restart it:",
+        f"    server 127.0.0.1 port {port} iburst minpoll 0 maxpoll 4",
+        "    makestep 0.01 3",
+        "    rtcsync",
+    ]
+    off = r"off by \+\d\d\.\d+ ± \d+\.\d+ ms, the limit is 20 ms; let chrony follow it"
+    assert re.fullmatch(rf"share: 127\.0\.0\.1:{port}: {off}", last)
+    assert done.code == 1
+
+
+def test_a_network_too_slow_to_tell_is_said_and_chrony_not_advised(share: Share) -> None:
+    with udp(shifted(0.0, slow_ms=30.0)) as port:
+        done = share("sync", "check", f"127.0.0.1:{port}", "--count", 2, "--limit-ms", 10)
+    assert done.code == 1
+    assert done.err.count("\n") == 1
+    assert re.search(
+        r": known to no better than ±(1[5-9]|[2-9]\d)\.\d+ ms, the limit is 10 ms; a cable, a quieter",
+        done.err,
+    )
+
+
+def test_a_clock_that_is_surely_off_is_said_to_be_however_slow_the_network(share: Share) -> None:
+    with udp(shifted(900.0, slow_ms=30.0)) as port:
+        done = share("sync", "check", f"127.0.0.1:{port}", "--count", 2, "--limit-ms", 10)
+    assert re.search(r"\nshare: 127\.0\.0\.1:\d+: off by \+9\d\d\.\d+ ± ", done.err)
+
+
+def test_a_server_that_says_how_unsure_it_is_is_believed(share: Share) -> None:
+    with udp(shifted(0.0, root_dispersion=3 << 16, root_delay=2 << 16)) as port:  # 3 s, and half of 2
+        clock = asked(share("sync", "check", f"127.0.0.1:{port}", "--json"))
+    assert clock["uncertainty_ms"] == pytest.approx(4000, abs=50)
+
+
+def test_nobody_at_that_port_is_said_at_once(share: Share) -> None:
+    with udp(shifted(0.0)) as port:
+        pass
+    done = share("sync", "check", f"localhost:{port}")
+    assert done.code == 1
+    assert done.out.splitlines()[1].split() == [f"127.0.0.1:{port}", *"–––––", "0/1", "0.0"]
+    assert done.err == (
+        f"share: 127.0.0.1:{port}: nothing listens at UDP port {port}; start `share sync server` there "
+        "(ntpd and chronyd have port 123)\n"
+    )
+
+
+def test_who_does_not_answer_is_given_up_after_three(share: Share, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(time_check, "PATIENCE_S", 0.05)
+    questions = []
+    with udp(lambda data: questions.append(data) or []) as port:  # type: ignore[func-returns-value]
+        done = share("sync", "check", f"127.0.0.1:{port}", "--count", 50)
+    assert (done.code, len(questions)) == (1, 3)
+    assert (
+        f"share: 127.0.0.1:{port}: no answer; does `share sync server` run there, and is UDP port" in done.err
+    )
+
+
+def test_one_of_several_that_will_not_do_is_named_and_the_others_shown(share: Share) -> None:
+    with udp(shifted(0.0)) as good, udp(shifted(900.0)) as bad:
+        done = share("sync", "check", f"127.0.0.1:{good}", f"127.0.0.1:{bad}", "--limit-ms", 90)
+    assert done.code == 1
+    assert len(done.out.splitlines()) == 3
+    assert re.search(rf"^127\.0\.0\.1:{bad}: off by \+\d+\.\d+ ±", done.err, re.MULTILINE)
+    assert f"127.0.0.1:{good}:" not in done.err
+    assert done.err.endswith("share: 1 of 2 clocks are not known to be within 90 ms; see above\n")
+
+
+def test_a_kiss_of_death_ends_the_questions(share: Share) -> None:
+    questions = []
+
+    def kiss(data: bytes) -> list[bytes]:
+        questions.append(data)
+        return [Packet(Mode.SERVER, refid=b"DENY", origin=Packet.decode(data).transmit).encode()]
+
+    with udp(kiss) as port:
+        done = share("sync", "check", f"127.0.0.1:{port}")
+    assert (done.code, len(questions)) == (1, 1)
+    assert done.err == f"share: 127.0.0.1:{port}: it refuses to answer (DENY): it is set not to\n"
+
+
+def test_what_was_answered_before_a_kiss_counts(share: Share) -> None:
+    good, questions = shifted(0.0), []
+
+    def soon_tired(data: bytes) -> list[bytes]:
+        questions.append(data)
+        if len(questions) <= 2:
+            return good(data)
+        return [Packet(Mode.SERVER, refid=b"RATE", origin=Packet.decode(data).transmit).encode()]
+
+    with udp(soon_tired) as port:
+        done = share("sync", "check", f"127.0.0.1:{port}", "--limit-ms", 50)
+    assert (done.code, len(questions)) == (0, 3)
+    assert " 2/3 " in done.out
+    refused = f"127.0.0.1:{port}: it refuses to answer (RATE): asked too often; wait a minute"
+    assert done.err == f"{refused}\nwithin 50 ms\n"
+
+
+def test_forged_answers_are_passed_over_and_the_true_one_is_taken(share: Share) -> None:
+    good = shifted(0.0)
+
+    def besieged(data: bytes) -> list[bytes]:
+        forged = Packet(Mode.SERVER, stratum=1, origin=7, receive=1 << 60, transmit=1 << 60)
+        return [b"", b"junk", secrets.token_bytes(48), data, forged.encode(), *good(data)]
+
+    with udp(besieged) as port:
+        done = share("sync", "check", f"127.0.0.1:{port}", "--limit-ms", 50, "--count", 5)
+    assert done.code == 0, done.err
+    assert " 5/5 " in done.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (
+            "",
+            "no HOST is given, and no chronyd runs on this machine; give the machine that",
+        ),
+        ("a..b", "a..b: no such host ("),
+        ("host.invalid", "host.invalid: no such host ("),
+        ("11123", "'11123' is no address; give HOST or HOST:PORT, such as 192.168.1.10:11123"),
+        ("127.0.0.1:0", "'127.0.0.1:0' is no address"),
+        ("127.0.0.1 --count 0", "0 is not in the range 1<=x<=1000"),
+        ("127.0.0.1 --limit-ms 0", "0.0 is not in the range x>0"),
+    ],
+)
+def test_wrong_use_is_one_line_and_exit_code_2(
+    arguments: str, said: str, share: Share, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))  # no chronyc
+    done = share("sync", "check", *arguments.split())
+    assert (done.code, done.out) == (2, "")
+    assert done.err.startswith("share: ")
+    assert said in done.err
+    assert done.err.count("\n") == 1
+
+
+# ------------------------------------------------------------------ server
+
+
+@contextmanager
+def serving(stratum: int = 10) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """A server as a process, and its port."""
+    with subprocess.Popen(
+        [*SHARE, "sync", "server", "--bind", "127.0.0.1:0", "--stratum", str(stratum)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stderr is not None
+        try:
+            said = [process.stderr.readline() for _ in range(3)]  # all: what is read ahead would be lost
+            found = re.match(r"telling this machine's own time at 127\.0\.0\.1:(\d+) \(UDP\); ", said[0])
+            assert found, said
+            port = int(found[1])
+            assert said[1:] == [
+                f"stratum {stratum}, reference 127.127.1.1: this machine's own clock, none "
+                "better behind it\n",
+                f"clients' chrony.conf: server THIS-MACHINE port {port} iburst\n",
+            ]
+            yield process, port
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_server_answers_survives_whatever_comes_and_ends_in_good_order(number: int, share: Share) -> None:
+    with serving(stratum=7) as (process, port):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as enemy:
+            for k in range(100):
+                enemy.sendto(os.urandom(2 * k), ("127.0.0.1", port))
+        clock = asked(share("sync", "check", f"127.0.0.1:{port}", "--json", "--limit-ms", 50))
+        process.send_signal(number)
+        out, err = process.communicate(timeout=20)
+    assert (clock["stratum"], clock["answers"]) == (7, 8)
+    assert process.returncode == 0
+    counts = r"asked too often: 0, no questions: (\d+)"
+    told = re.fullmatch(rf"answered: (\d+), clients: 1 \(last 127\.0\.0\.1\), {counts}\n", out)
+    assert told, out
+    assert int(told[1]) + int(told[2]) == 108
+    assert err == "share sync: 127.0.0.1 asks\n"
+
+
+def test_a_port_in_use_is_said(share: Share) -> None:
+    with serving() as (_, port):
+        done = share("sync", "server", "--bind", f"127.0.0.1:{port}")
+    assert done == Done(
+        1, "", f"share: 127.0.0.1:{port}: the port is in use; stop the other server or choose another port\n"
+    )
+
+
+# ------------------------------------------------------------------ agents
+
+
+@pytest.mark.parametrize(
+    ("sigma_ms", "said"),
+    [
+        (0.07, "+0.431 ms from this one's, ±0.427 ms"),
+        (
+            2.8,
+            "offset too uncertain (±3.16 ms, more than clock.claim_ms, 1); latencies are by this machine's",
+        ),
+    ],
+)
+def test_share_agent_says_the_offset_or_that_it_is_too_uncertain(sigma_ms: float, said: str) -> None:
+    claim = ClockClaim(0.431, sigma_ms, 0.357, claim_ms=1.0)
+    assert _clock(claim.report()).startswith(said)

@@ -1,0 +1,76 @@
+"""Whom a time server answers, and with what."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from share.core.time_server import BURST, CLIENTS, PER_S, TimeServer
+from share.wire.ntp import Mode, Packet, to_stamp
+
+S = 1_000_000_000
+NOW = 1_795_446_605 * S
+QUESTION = Packet(Mode.CLIENT, version=3, poll=6, transmit=0xFEEDFACECAFEBEEF).encode()
+
+
+def ask(
+    server: TimeServer, data: bytes = QUESTION, address: str = "192.0.2.7", at_s: float = 0.0
+) -> Packet | None:
+    return server.answer(data, address, NOW, round(at_s * S))
+
+
+def test_an_answer_says_what_it_answers_and_when_it_was_asked() -> None:
+    answer = ask(TimeServer(stratum=9, precision=-23))
+    assert answer == Packet(
+        Mode.SERVER,
+        version=3,  # the client's
+        stratum=9,
+        poll=6,  # the client's
+        precision=-23,
+        refid=bytes((127, 127, 1, 1)),
+        reference=to_stamp(NOW),
+        origin=0xFEEDFACECAFEBEEF,
+        receive=to_stamp(NOW),
+    )
+
+
+@pytest.mark.parametrize("mode", [mode for mode in Mode if mode is not Mode.CLIENT])
+def test_only_questions_are_answered(mode: Mode) -> None:
+    """Above all no answers: two servers would answer each other for ever."""
+    server = TimeServer()
+    assert ask(server, Packet(mode).encode()) is None
+    assert server.counts == {"ignored": 1}
+    assert server.clients == 0
+
+
+@given(st.binary(max_size=600))
+def test_whatever_comes_nobody_gets_more_than_was_sent(data: bytes) -> None:
+    server = TimeServer()
+    for tried in (data, QUESTION + data):
+        answer = ask(server, tried)
+        assert answer is None or len(answer.encode()) <= len(tried)
+    assert ask(server) is not None
+
+
+def test_who_asks_too_often_is_not_answered_and_others_are() -> None:
+    server = TimeServer()
+    answered = [ask(server, at_s=k / 1000) is not None for k in range(1000)]
+    assert sum(answered) == BURST + int(PER_S * 0.999)
+    assert server.counts["limited"] == 1000 - sum(answered)
+    assert ask(server, address="192.0.2.8", at_s=1.0) is not None
+    assert ask(server, at_s=2.0) is not None  # and again after a while
+
+
+def test_chronyd_at_its_quickest_is_never_turned_away() -> None:
+    """iburst, 4 questions 2 s apart, then one each second with minpoll 0; 100 devices behind one address
+    would be too many, 8 are not."""
+    server = TimeServer()
+    assert all(ask(server, at_s=k + device / 8) for k in range(600) for device in range(8))
+
+
+def test_a_flood_of_forged_addresses_is_forgotten_again() -> None:
+    server = TimeServer()
+    for k in range(3 * CLIENTS):
+        ask(server, address=f"forged-{k}")
+    assert server.clients == CLIENTS

@@ -1,0 +1,110 @@
+"""UDP sockets that say when a datagram came."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+
+import pytest
+
+from share.errors import TransportError, UsageError
+from share.io import udp
+from share.io.udp import Host, StampedSocket, clock_precision, parse_host
+
+
+@contextmanager
+def pair() -> Iterator[tuple[StampedSocket, StampedSocket]]:
+    with (
+        closing(StampedSocket.bound(Host("127.0.0.1", 0))) as server,
+        closing(StampedSocket.connected(Host("127.0.0.1", server.port))) as client,
+    ):
+        yield server, client
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux is asked for stamps")
+def test_the_kernel_says_when_a_datagram_came_not_when_it_was_read() -> None:
+    with pair() as (server, client):
+        before = time.time_ns()
+        client.send(b"hello")
+        after = time.time_ns()
+        time.sleep(0.05)
+        datagram = server.receive(1.0)
+        assert server.by_kernel
+        assert datagram is not None
+        assert datagram.data == b"hello"
+        assert before <= datagram.stamp_ns <= after + 10_000_000 < time.time_ns()
+
+
+def test_without_stamps_of_the_kernel_it_stamps_itself_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(udp, "_TIMESTAMPNS", 9999)  # an option that no kernel has
+    with pair() as (server, client):
+        client.send(b"hello")
+        time.sleep(0.02)
+        before = time.time_ns()
+        datagram = server.receive(1.0)
+        assert not server.by_kernel
+        assert datagram is not None
+        assert before <= datagram.stamp_ns <= time.time_ns()
+
+
+def test_an_answer_goes_back_to_who_asked() -> None:
+    with pair() as (server, client):
+        client.send(b"hello")
+        datagram = server.receive(1.0)
+        assert datagram is not None
+        server.send(b"hello yourself", datagram.source)
+        answer = client.receive(1.0)
+        assert answer is not None
+        assert answer.data == b"hello yourself"
+        assert client.receive(0.01) is None
+
+
+def test_nobody_at_the_other_end_is_told_to_who_waits_for_an_answer() -> None:
+    with pair() as (server, client):
+        server.close()
+        client.send(b"hello")
+        with pytest.raises(ConnectionRefusedError):
+            client.receive(1.0)
+
+
+def test_a_port_in_use_is_said() -> None:
+    with pair() as (server, _):
+        at = Host("127.0.0.1", server.port)
+        with pytest.raises(TransportError, match=f"^{at}: the port is in use; stop the other server"):
+            StampedSocket.bound(at)
+
+
+def test_an_address_of_nobody_is_said() -> None:
+    with pytest.raises(TransportError, match="this machine has no such address"):
+        StampedSocket.bound(Host("192.0.2.1", 0))
+
+
+@pytest.mark.parametrize(
+    ("text", "host"),
+    [
+        ("192.168.1.10", Host("192.168.1.10", 11123)),
+        ("edge.local:123", Host("edge.local", 123)),
+        ("localhost", Host("127.0.0.1", 11123)),
+        ("[::1]", Host("::1", 11123)),
+        ("[fe80::1%eth0]:9", Host("fe80::1%eth0", 9)),
+    ],
+)
+def test_hosts_may_have_a_port_or_not(text: str, host: Host) -> None:
+    assert parse_host(text, 11123) == host
+    assert parse_host(str(host), 1) == host
+
+
+@pytest.mark.parametrize(
+    "text", ["", "11123", ":123", "a b", "udp://a:1", "a:99999", "a:0", "::1", "a:b", "ä"]
+)
+def test_what_is_no_host_is_said(text: str) -> None:
+    with pytest.raises(
+        UsageError, match=r"is no address; give HOST or HOST:PORT, such as 192.168.1.10:11123"
+    ):
+        parse_host(text, 11123)
+
+
+def test_a_clock_is_read_in_less_than_a_millisecond() -> None:
+    assert -30 <= clock_precision() <= -10

@@ -1,0 +1,82 @@
+"""A time server goes on whatever its socket does."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+from share.core.time_server import TimeServer
+from share.io.udp import Datagram
+from share.run.time_server import TimeServerRun
+from share.wire.ntp import Mode, Packet, from_stamp
+
+NOW = 1_795_446_605 * 10**9
+QUESTION = Packet(Mode.CLIENT, transmit=5).encode()
+
+
+class Script:
+    """In place of a socket: what `receive` does, one after the other, and then `over`."""
+
+    def __init__(self, *steps: Datagram | OSError, over: threading.Event) -> None:
+        self._steps, self._over = list(steps), over
+        self.sent: list[tuple[bytes, Any]] = []
+
+    def receive(self, timeout_s: float) -> Datagram | None:
+        if not self._steps:
+            self._over.set()
+            return None
+        step = self._steps.pop(0)
+        if isinstance(step, OSError):
+            raise step
+        return step
+
+    def send(self, data: bytes, to: Any = None) -> None:
+        if to[1] == 0:
+            raise OSError(22, "Invalid argument")
+        self.sent.append((data, to))
+
+
+def serve(*steps: Datagram | OSError) -> tuple[list[tuple[bytes, Any]], list[str]]:
+    """What is sent and said."""
+    over, said = threading.Event(), []
+    link = Script(*steps, over=over)
+    run = TimeServerRun(link, TimeServer(), said.append)  # type: ignore[arg-type]
+    thread = threading.Thread(target=run.go)
+    thread.start()
+    assert over.wait(10)
+    run.stop()
+    thread.join(10)
+    assert not thread.is_alive()
+    return link.sent, said
+
+
+def question(address: str, port: int) -> Datagram:
+    return Datagram(QUESTION, (address, port), NOW)
+
+
+def test_an_address_that_cannot_be_answered_costs_others_nothing_and_is_said_once() -> None:
+    forged = [question("192.0.2.9", 0)] * 5
+    sent, said = serve(*forged, question("192.0.2.1", 4000), *forged, question("192.0.2.2", 4000))
+    assert [to for _, to in sent] == [("192.0.2.1", 4000), ("192.0.2.2", 4000)]
+    assert said == [
+        "an answer could not be sent to 192.0.2.9: Invalid argument",
+        "192.0.2.9 asks",
+        "192.0.2.1 asks",
+        "192.0.2.2 asks",
+    ]
+
+
+def test_a_socket_that_fails_for_a_while_is_asked_again() -> None:
+    failing = [OSError(105, "No buffer space available")] * 2
+    sent, said = serve(*failing, question("192.0.2.1", 4000))
+    assert len(sent) == 1
+    assert said == ["nothing can be received: No buffer space available", "192.0.2.1 asks"]
+
+
+def test_an_answer_says_when_it_was_sent() -> None:
+    before = time.time_ns()
+    sent, _ = serve(question("192.0.2.1", 4000))
+    answer = Packet.decode(sent[0][0])
+    assert from_stamp(answer.receive, NOW) == NOW
+    assert before <= from_stamp(answer.transmit, before) <= time.time_ns()
