@@ -49,7 +49,8 @@ class Figure(NamedTuple):
 class AxisNoise:
     """Of one axis; u is its unit. density u/sqrt(Hz); instability u; walk u/s/sqrt(Hz); quantisation u s.
     squares (4,): c, N^2, B^2, K^2 as fitted, errors (4,) of these. low, high (T,): where the true deviation
-    lies at each averaging time of the curve, by 95 %; modelled (T,): as fitted, at those times."""
+    lies at each averaging time of the curve, by 95 %; modelled (T,): as fitted, NaN for averages
+    of fewer samples than are fitted."""
 
     density: Figure
     instability: Figure
@@ -92,7 +93,7 @@ def _axis(taus: F64, variance: F64, spread: F64, first: int, model_error: float)
         errors=errors,
         low=low,
         high=high,
-        modelled=np.sqrt(np.maximum(A @ squares, 0)),
+        modelled=np.where(np.arange(len(taus)) < first, np.nan, np.sqrt(np.maximum(A @ squares, 0))),
     )
 
 
@@ -113,7 +114,7 @@ class _Weights(NamedTuple):
     model_error: float
 
     def root(self, squares: F64, model: F64) -> F64:
-        """Cholesky factor (T, T) of the variances' covariance: as the parts have it, at the level of `model`."""
+        """Cholesky factor (T, T) of the variances' covariance: as the parts have it, at `model`'s level."""
         parts = _parts(squares)
         ratio = model / (self.A[:, 1:] @ parts)
         C = np.einsum("a,b,abij->ij", parts, parts, self.spread) * np.outer(ratio, ratio)

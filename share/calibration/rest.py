@@ -33,8 +33,8 @@ def rest(imu: ImuBatch, rate_hz: float) -> slice:
     start, end = _longest(calm)
     if end - start < LEAST_S:
         raise DataError(
-            f"IMU: at rest for {end - start} s of {len(calm)} s, at least {LEAST_S:.0f} s are needed; put the "
-            "device on a stone floor or a heavy table, start recording, and leave it alone"
+            f"IMU: at rest for {end - start} s of {len(calm)} s, at least {LEAST_S:.0f} s are needed; "
+            "put the device on a stone floor or a heavy table, start recording, and leave it alone"
         )
     return slice(start * n, len(imu) if end == len(calm) else end * n)
 

@@ -36,8 +36,8 @@ _LETTERS = {"density": "N", "instability": "B", "walk": "K"}
 )
 @options.as_json
 def imu(source: str, profile_name: str | None, inflate: float, out: Path, as_json: bool) -> None:
-    """Measure white noise, bias instability and bias random walk of an IMU (Allan deviation) from a recording in
-    which it lay still: ten minutes for the white noise, three hours for the rest.
+    """Measure white noise, bias instability and bias random walk of an IMU (Allan deviation) from a recording
+    in which it lay still: ten minutes for the white noise, three hours for the rest.
 
     \b
     Example:  share calibrate imu rest.mcap --profile d435i --out calib/mine
@@ -82,10 +82,11 @@ def _summary(nature: ImuNature, rows: list[Row], dropped: int) -> str:
             "",
             aligned([heads, *([_name(row), row.unit, *_cells(row)][: len(heads)] for row in rows)]),
             "",
-            "N: white noise, B: bias instability, K: random walk of the bias; ±: one sigma, <: not told, by 95 %",
+            "N: white noise, B: bias instability, K: random walk of the bias",
+            "± one sigma; < where the recording does not tell it, by 95 %",
             f"gyroscope's bias: {bias} rad/s",
-            f"accelerometer's mean: {norm:.4f} m/s^2, {100 * (norm / STANDARD_GRAVITY - 1):+.2f} % off standard "
-            "gravity (scale and bias, which one pose does not tell apart)",
+            f"accelerometer's mean: {norm:.4f} m/s^2, {100 * (norm / STANDARD_GRAVITY - 1):+.2f} % off "
+            "standard gravity (scale and bias: one pose does not tell them apart)",
         ]
     )
 

@@ -36,7 +36,7 @@ def allan_png(nature: ImuNature, profile: Profile | None, title: str) -> bytes:
         panel.legend(fontsize=8, loc="upper right")
     figure.suptitle(title)
     out = io.BytesIO()
-    figure.savefig(out, dpi=100, format="png")
+    figure.savefig(out, dpi=85, format="png")
     pyplot.close(figure)
     return out.getvalue()
 
@@ -52,7 +52,8 @@ def _draw(panel: Any, sensor: SensorNoise) -> None:
 
 def _draw_stated(panel: Any, sensor: SensorNoise, said: dict[str, float], profile: Profile | None) -> None:
     taus = sensor.curve.taus
-    N, B, K = (sensor.typical(name).value for name in ("density", "instability", "walk"))
+    found = [sensor.typical(name) for name in ("density", "instability", "walk")]
+    N, B, K = (one.value if one.told else 0.0 for one in found)
     for part in (N / np.sqrt(taus), np.full(len(taus), np.sqrt(FLAT) * B), K * np.sqrt(taus / 3)):
         if part.all():
             panel.plot(taus, part, ":", color="#888", linewidth=1)
