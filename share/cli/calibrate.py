@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from share.cli.calibrate_imu import imu
+from share.cli.calibrate_mocap import mocap
 
 
 @click.group()
@@ -17,3 +18,4 @@ def calibrate() -> None:
 
 
 calibrate.add_command(imu)
+calibrate.add_command(mocap)
