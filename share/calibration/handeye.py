@@ -47,10 +47,11 @@ def hand_eye(A: F64, B: F64) -> HandEye:
     alpha, beta = se3.so3_log(A[:, :3, :3]), se3.so3_log(B[:, :3, :3])
     turning = np.linalg.svd(alpha, compute_uv=False) / np.sqrt(len(alpha))
     if turning[1] < LEAST_TURN:
+        most, next_most, least = np.degrees([*turning[:2], LEAST_TURN])
         raise DataError(
-            f"hand-eye: the bodies turned by {np.degrees(turning[0]):.1f} deg rms about one axis and by "
-            f"{np.degrees(turning[1]):.1f} deg about all others, {np.degrees(LEAST_TURN):.0f} are needed; turn "
-            "the device about two axes or more: nod, roll, and look around"
+            f"hand-eye: the bodies turned by {most:.1f} deg rms about one axis and by {next_most:.1f} deg "
+            f"about the next, {least:.0f} are needed; turn the device about two axes or more: nod, roll, "
+            "look around"
         )
     R, turn_weight = _rotation(alpha, beta)
     t, weight = _translation(A, B, R)

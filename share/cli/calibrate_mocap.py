@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -80,11 +81,11 @@ def mocap(
     from share.io.mocap_report import mocap_json, mocap_text
     from share.mocap.fit import fit
     from share.mocap.options import FitOptions
+    from share.mocap.verdict import unsure
 
-    clock = (
-        {"within_s": 0.0, "offset_sigma": 1e-5, "drift_sigma": 1e-8} if one_clock else {"within_s": within}
-    )
-    chosen = FitOptions(sigma_position=sigma_mm * 1e-3, **clock)
+    chosen = FitOptions(sigma_position=sigma_mm * 1e-3, within_s=within)
+    if one_clock:
+        chosen = replace(chosen, within_s=0.0, offset_sigma=1e-5, drift_sigma=1e-8)
     noise, seen = _noise(source, calib), read_mocap(truth)
     writable_dir(out)
     with Stages() as stages:
