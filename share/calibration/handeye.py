@@ -1,8 +1,8 @@
 """How two bodies that move as one sit on each other: A X = X B.
 
 A are motions of one body, B the same motions of the other, each in its own frame; no common world is needed.
-Rotation and translation one after the other: Park and Martin, *Robot sensor calibration: solving AX = XB on
-the Euclidean group*, IEEE TRA 10(5), 1994; both with Cauchy weights.
+Start: rotation, then translation (Park and Martin, *Robot sensor calibration: solving AX = XB on the
+Euclidean group*, IEEE TRA 10(5), 1994); then both at once. All with Cauchy weights.
 """
 
 from __future__ import annotations
@@ -53,30 +53,29 @@ def hand_eye(A: F64, B: F64) -> HandEye:
             f"about the next, {least:.0f} are needed; turn the device about two axes or more: nod, roll, "
             "look around"
         )
-    R, turn_weight = _rotation(alpha, beta)
-    t, weight = _translation(A, B, R)
-    return _judged(A, B, se3.compose(R, t), turn_weight * weight, turning)
+    R = _rotation(alpha, beta)
+    return _refined(A, B, se3.compose(R, _translation(A, B, R)), turning)
 
 
-def _rotation(alpha: F64, beta: F64) -> tuple[F64, F64]:
-    """(3, 3) that takes beta to alpha, both (N, 3), and weights (N,)."""
+def _rotation(alpha: F64, beta: F64) -> F64:
+    """(3, 3) that takes beta to alpha, both (N, 3)."""
     weight = np.ones(len(alpha))
     for _ in range(_ROUNDS):
         U, _, Vt = np.linalg.svd((alpha * weight[:, None]).T @ beta)
         R = U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
         weight = _weights(np.linalg.norm(alpha - beta @ R.T, axis=1))
-    return R, weight
+    return np.asarray(R, np.float64)
 
 
-def _translation(A: F64, B: F64, R: F64) -> tuple[F64, F64]:
-    """(3,) with (R_A - I) t = R t_B - t_A, and weights (N,)."""
+def _translation(A: F64, B: F64, R: F64) -> F64:
+    """(3,) with (R_A - I) t = R t_B - t_A."""
     J, y = A[:, :3, :3] - np.eye(3), B[:, :3, 3] @ R.T - A[:, :3, 3]
     weight = np.ones(len(A))
     for _ in range(_ROUNDS):
         JW = J * weight[:, None, None]
         t = np.linalg.solve(np.einsum("nij,nik->jk", JW, J), np.einsum("nij,ni->j", JW, y))
         weight = _weights(np.linalg.norm(J @ t - y, axis=1))
-    return t, weight
+    return np.asarray(t, np.float64)
 
 
 def _weights(size: F64) -> F64:
@@ -85,12 +84,17 @@ def _weights(size: F64) -> F64:
     return np.asarray(1 / (1 + (size / (_CAUCHY * scale)) ** 2), np.float64)
 
 
-def _judged(A: F64, B: F64, X: F64, weight: F64, turning: F64) -> HandEye:
-    """Covariance from what is left: the error of X at the right moves Log(B^-1 X^-1 A X) by Ad(B^-1) xi - xi,
-    less than a radian of turn taken for small."""
-    left = se3.log(se3.inverse(B) @ se3.inverse(X) @ A @ X)
-    sizes = [float(np.sqrt(np.average((left[:, k : k + 3] ** 2).sum(1), weights=weight))) for k in (0, 3)]
-    J = np.stack([np.eye(6) - se3.adjoint(T) for T in se3.inverse(B)])
-    J /= (np.repeat(np.maximum(sizes, 1e-12), 3) / np.sqrt(3))[:, None]
-    cov = np.linalg.inv(np.einsum("n,nij,nik->jk", weight, J, J))
-    return HandEye(X, cov, turning, sizes[0], sizes[1], len(A))
+def _refined(A: F64, B: F64, X: F64, turning: F64) -> HandEye:
+    """Both at once, by Gauss-Newton from X: turns and ways weighed by what is left of each, since far ways
+    tell the rotation too. Exp(xi) at the right of X moves Log(B^-1 X^-1 A X) by xi - Ad(B^-1) xi."""
+    J = np.eye(6) - se3.adjoint(se3.inverse(B))
+    weight = np.ones(len(A))
+    for _ in range(_ROUNDS):
+        left = se3.log(se3.inverse(B) @ se3.inverse(X) @ A @ X)
+        rms = [float(np.sqrt(np.average((part**2).sum(1), weights=weight))) for part in np.split(left, 2, 1)]
+        sigma = np.repeat(np.maximum(rms, 1e-12), 3) / np.sqrt(3)
+        weight = _weights(np.linalg.norm(left / sigma, axis=1))
+        JW = J / sigma[:, None] ** 2 * weight[:, None, None]
+        cov = np.linalg.inv(np.einsum("nij,nik->jk", JW, J))
+        X = X @ se3.exp(-cov @ np.einsum("nij,ni->j", JW, left))
+    return HandEye(X, cov, turning, rms[0], rms[1], len(A))
