@@ -29,6 +29,11 @@ COMMANDS = {
     "emulate": ("share.cli.emulate", "emulate", "Record agents that move through a virtual room."),
     "evaluate": ("share.cli.evaluate", "evaluate", "Play sessions on stated terms, score and compare them."),
     "train": ("share.cli.train", "train", "Teach the model that estimates a tracker's error."),
+    "calibrate": (
+        "share.cli.calibrate",
+        "calibrate",
+        "Find out what a device's cameras and IMU are like.",
+    ),
     "keys": ("share.cli.keys", "keys", "Who may connect to an edge from another machine."),
 }
 

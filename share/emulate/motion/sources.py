@@ -21,8 +21,8 @@ from share.geometry.camera import ImuNoise
 from share.io import tables
 from share.io.calibration import CAMCHAIN, IMU_CHAIN, imu_noise, kalibr_T_imu_cam
 from share.io.euroc import TRUTHS
+from share.io.mocap_file import read_mocap
 from share.io.section import read_yaml
-from share.io.trajectory import poses
 from share.mocap.fit import fit
 from share.mocap.mocap import Mocap
 from share.mocap.options import FitOptions
@@ -79,7 +79,7 @@ def open_recording(
     if files.truth.parent.name in _RAW:
         options = TUMVI
     T_body_cam0, noise = files.mounting()
-    imu, mocap = _read_imu(files.imu), _read_mocap(files.truth)
+    imu, mocap = _read_imu(files.imu), read_mocap(files.truth)
     first, last = _span(folder, imu, mocap, start, seconds)
     margin = round(_MARGIN_S * 1e9)
     near = _imu_between(imu, first - margin, last + margin)
@@ -134,15 +134,6 @@ def _asl(root: Path) -> _Files:
 def _read_imu(path: Path) -> ImuBatch:
     stamps, values = tables.read_table(path, 7)
     return ImuBatch(stamps, values[:, :3], values[:, 3:])
-
-
-def _read_mocap(path: Path) -> Mocap:
-    stamps, values = tables.read_table(path, 8)
-    T = poses(values[:, :3], values[:, [4, 5, 6, 3]], path)
-    try:
-        return Mocap(stamps, T)
-    except DataError as error:
-        raise DataError(f"{path}: {error}") from None
 
 
 def _read_stamps(path: Path) -> I64:

@@ -155,7 +155,9 @@ def find_topics(file: McapFile, named: dict[str, str]) -> dict[str, str]:
     for stream in STREAMS:
         kinds = (ros.IMU_MSG,) if stream == IMU else _IMAGES
         candidates = [name for name, kind in topics.items() if kind in kinds]
-        topic = _named(named[stream], candidates, file) if stream in named else _guess(stream, candidates)
+        topic = (
+            _named(named[stream], candidates, file) if stream in named else guess_topic(stream, candidates)
+        )
         if topic:
             found[stream] = topic
     if CAM0 not in found:
@@ -174,7 +176,7 @@ def _named(name: str, candidates: list[str], file: McapFile) -> str:
     raise ConfigError(f"{file.path}: has no topic {name} as the calibration names it; it has {candidates}")
 
 
-def _guess(stream: str, candidates: list[str]) -> str | None:
+def guess_topic(stream: str, candidates: list[str]) -> str | None:
     """The shortest candidate with the best hint; for an IMU the only one, or one named imu."""
     if stream == IMU:
         return min(

@@ -1,0 +1,21 @@
+"""`share calibrate`: what a device's sensors are like, one command each."""
+
+from __future__ import annotations
+
+import click
+
+from share.cli.calibrate_imu import imu
+from share.cli.calibrate_mocap import mocap
+
+
+@click.group()
+def calibrate() -> None:
+    """Find out what a device's cameras and IMU are like.
+
+    \b
+    Example:  share calibrate imu rest.mcap --profile d435i --out calib/mine
+    """
+
+
+calibrate.add_command(imu)
+calibrate.add_command(mocap)

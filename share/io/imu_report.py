@@ -1,0 +1,121 @@
+"""What `share calibrate imu` leaves behind: Kalibr's IMU chain, and all that was found as JSON."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from share.calibration.imu import ImuNature, SensorNoise
+from share.calibration.noise import AxisNoise, Figure
+from share.io.profile_types import Inertial, Profile
+
+GYRO, ACCEL = "gyroscope", "accelerometer"
+FIGURES = ("density", "instability", "walk")
+UNITS = {
+    GYRO: dict(zip(FIGURES, ("rad/s/sqrt(Hz)", "rad/s", "rad/s^2/sqrt(Hz)"), strict=True)),
+    ACCEL: dict(zip(FIGURES, ("m/s^2/sqrt(Hz)", "m/s^2", "m/s^3/sqrt(Hz)"), strict=True)),
+}
+STANDARD_GRAVITY = 9.80665
+
+
+class Row(NamedTuple):
+    """One figure of one sensor: of each axis, of all as one, and as the profile has it, if it does."""
+
+    sensor: str
+    figure: str
+    unit: str
+    axes: tuple[Figure, ...]
+    together: Figure
+    stated: float | None
+
+    @property
+    def ratio(self) -> float | None:
+        """How many times the stated; None where one of the two is not known."""
+        return self.together.value / self.stated if self.stated and self.together.told else None
+
+
+def rows(nature: ImuNature, profile: Profile | None) -> list[Row]:
+    """N, B and K of the gyroscope and of the accelerometer."""
+    out = []
+    for name, sensor in ((GYRO, nature.gyro), (ACCEL, nature.accel)):
+        said = stated(profile, name)
+        for figure, unit in UNITS[name].items():
+            axes = tuple(getattr(axis, figure) for axis in sensor.axes)
+            out.append(Row(name, figure, unit, axes, sensor.typical(figure), said.get(figure)))
+    return out
+
+
+def stated(profile: Profile | None, sensor: str) -> dict[str, float]:
+    """density, with what its digits add, and walk by a profile; nothing without one."""
+    if profile is None:
+        return {}
+    imu = profile.device.imu
+    facts: Inertial = imu.gyro if sensor == GYRO else imu.accel
+    digits = facts.step**2 / 12 / facts.rate_hz  # evenly spread within a digit, as white as the samples
+    return {"density": float(np.sqrt(facts.density**2 + digits)), "walk": facts.kalibr_walk}
+
+
+def kalibr_text(nature: ImuNature, name: str, inflate: float) -> str:
+    """kalibr_imu_chain.yaml, as `share.io.calibration` and Kalibr read it. inflate: times the measured."""
+    lines = [
+        f"# share calibrate imu: {name}, {nature.rest_s:.0f} s at rest",
+        "# " + ("as measured" if inflate == 1 else f"{inflate:g} times what was measured (--inflate)"),
+        "imu0:",
+    ]
+    for sensor, noise in ((ACCEL, nature.accel), (GYRO, nature.gyro)):
+        for figure, key in (("density", "noise_density"), ("walk", "random_walk")):
+            found, unit = noise.typical(figure), UNITS[sensor][figure]
+            lines.append(f"  {sensor}_{key}: {found.cautious * inflate:.4e}  # {unit}, {_how(found)}")
+    return "\n".join([*lines, f"  update_rate: {nature.rate_hz:.3f}", ""])
+
+
+def _how(figure: Figure) -> str:
+    if figure.told:
+        return f"+- {100 * figure.sigma / figure.value:.1f} %"
+    return "an upper bound (95 %): the recording does not tell it"
+
+
+def to_json(nature: ImuNature, name: str, profile: Profile | None, inflate: float) -> dict[str, Any]:
+    """All of it. Figures are as measured, without `inflate`."""
+    return {
+        "source": name,
+        "rate_hz": nature.rate_hz,
+        "rest_s": nature.rest_s,
+        "rest_start_s": nature.start_s,
+        "recording_s": nature.total_s,
+        "samples": nature.samples,
+        "missing": nature.missing,
+        "gaps": nature.gaps,
+        "cuts": nature.cuts,
+        "inflate": inflate,
+        "profile": profile.name if profile else None,
+        "gravity": gravity(nature),
+        GYRO: _sensor(nature.gyro, GYRO, profile),
+        ACCEL: _sensor(nature.accel, ACCEL, profile),
+    }
+
+
+def gravity(nature: ImuNature) -> float:
+    """Norm of the mean specific force, m/s^2."""
+    return float(np.linalg.norm(nature.accel.mean))
+
+
+def _sensor(sensor: SensorNoise, name: str, profile: Profile | None) -> dict[str, Any]:
+    return {
+        "unit": UNITS[name]["instability"],
+        "mean": sensor.mean.tolist(),
+        **{figure: sensor.typical(figure)._asdict() for figure in FIGURES},
+        "profile": stated(profile, name) or None,
+        "tau_s": sensor.curve.taus.tolist(),
+        "clusters": sensor.curve.clusters.tolist(),
+        "axes": {
+            axis: {**_axis(noise), "deviation": sensor.curve.deviation[:, k].tolist()}
+            for k, (axis, noise) in enumerate(zip("xyz", sensor.axes, strict=True))
+        },
+    }
+
+
+def _axis(noise: AxisNoise) -> dict[str, Any]:
+    figures = {name: getattr(noise, name)._asdict() for name in (*FIGURES, "quantisation")}
+    return figures | {key: getattr(noise, key).tolist() for key in ("low", "high", "modelled")}

@@ -1,0 +1,62 @@
+"""All IMU samples of a recording in one table, whether it has cameras or not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from share.errors import DataError, UsageError
+from share.io import tables
+from share.io.session import is_session, read_session
+from share.types import F64, I64, ImuBatch
+
+_KINDS = (
+    "an .mcap recording, SESSION/NAME, a folder with imu0/data.csv (EuRoC/ASL), or such a data.csv: "
+    "t[ns],wx,wy,wz,ax,ay,az"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class ImuTable:
+    """imu: samples in order of time; dropped: such as were not later than the one before."""
+
+    name: str
+    imu: ImuBatch
+    dropped: int
+
+
+def read_imu(spec: str, told: Callable[[int, int], None] = lambda done, total: None) -> ImuTable:
+    """The samples of the recording that `spec` names. told: how many are read, of how many.
+
+    Raises UsageError where it is none, DataError where it is damaged or has no IMU.
+    """
+    path = Path(spec)
+    if path.suffix == ".mcap" and path.is_file():
+        return _table(path.stem, *_of_mcap(path, told))
+    if is_session(path.parent) and not path.exists():
+        return _table(path.name, *_of_mcap(read_session(path.parent).recording(path.name), told))
+    for csv in (path, path / "mav0" / "imu0" / "data.csv", path / "imu0" / "data.csv", path / "data.csv"):
+        if csv.is_file() and csv.suffix == ".csv":
+            return _table(path.stem, *tables.read_table(csv, 7))
+    if not path.exists():
+        raise UsageError(f"SOURCE {path}: no such file or folder")
+    raise UsageError(f"{spec}: is no recording of an IMU that SHARE reads: {_KINDS}")
+
+
+def _of_mcap(path: Path, told: Callable[[int, int], None]) -> tuple[I64, F64]:
+    from share.io.mcap.file import McapFile
+    from share.io.mcap.imu import read_imu as read
+
+    return read(McapFile(path), told)
+
+
+def _table(name: str, stamps_ns: I64, values: F64) -> ImuTable:
+    finite = np.isfinite(values).all(axis=1)
+    if not finite.all():
+        raise DataError(f"{name}: IMU sample {int((~finite).argmax()) + 1} is not finite; leave it out")
+    later = stamps_ns > np.maximum.accumulate(np.concatenate([[-(2**62)], stamps_ns[:-1]]))
+    imu = ImuBatch(stamps_ns[later], values[later, :3], values[later, 3:])
+    return ImuTable(name, imu, int(np.count_nonzero(~later)))

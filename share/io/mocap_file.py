@@ -1,0 +1,28 @@
+"""A motion capture's poses from a file: TUM, or CSV as EuRoC and TUM-VI have it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from share.errors import DataError, UsageError
+from share.io import tables
+from share.io.trajectory import poses, read_tum
+from share.mocap.mocap import Mocap
+
+
+def read_mocap(path: Path) -> Mocap:
+    """`.csv`: t[ns], x y z, qw qx qy qz, and more that is not read; else TUM: t[s] x y z qx qy qz qw.
+
+    Raises UsageError without such a file, DataError that names it for what is damaged.
+    """
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file of motion capture")
+    if path.suffix == ".csv":
+        stamps, values = tables.read_table(path, 8)
+        T = poses(values[:, :3], values[:, [4, 5, 6, 3]], path)
+    else:
+        stamps, T = read_tum(path)
+    try:
+        return Mocap(stamps, T)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None

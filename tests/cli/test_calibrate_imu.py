@@ -1,0 +1,90 @@
+"""`share calibrate imu`, over a table as an EuRoC folder has it."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from share.emulate.sensor.imu import measured
+from share.io.calibration import imu_noise
+from share.io.profile import profile
+from share.io.section import read_yaml
+
+IMU = profile("euroc").device.imu
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory) -> Path:
+    return written(tmp_path_factory.mktemp("rest") / "data.csv", 300)
+
+
+def written(path: Path, seconds: int, louder: float = 1.0) -> Path:
+    n = seconds * 200
+    gyro = measured(np.zeros((n, 3)), replace(IMU.gyro, density=IMU.gyro.density * louder), (1,))
+    accel = measured(np.tile([0, 9.81, 0], (n, 1)), IMU.accel, (2,))
+    rows = np.concatenate([np.arange(n)[:, None] * 5_000_000, gyro, accel], axis=1)
+    np.savetxt(path, rows, ["%d", *["%.8f"] * 6], delimiter=",", header="t,wx,wy,wz,ax,ay,az")
+    return path
+
+
+def test_files_and_table(share, table, tmp_path):
+    done = share("calibrate", "imu", table, "--profile", "euroc", "--out", tmp_path / "mine")
+    assert done.code == 0
+    assert "300 s at rest of 300 s, 200.00 Hz; 0 samples lost" in done.out
+    assert "gyroscope N" in done.out and "profile" in done.out
+    found = imu_noise(read_yaml(tmp_path / "mine" / "kalibr_imu_chain.yaml").section("imu0"), "update_rate")
+    assert found.gyro_density == pytest.approx(IMU.gyro.density, rel=0.05)
+    assert found.accel_density == pytest.approx(IMU.accel.density, rel=0.05)
+    assert found.accel_walk == pytest.approx(IMU.accel.walk, rel=0.4)
+    assert found.rate_hz == pytest.approx(200)
+    assert (tmp_path / "mine" / "imu-report.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_what_five_minutes_do_not_tell_is_said(share, table, tmp_path):
+    done = share("calibrate", "imu", table, "--out", tmp_path, "--json")
+    report = json.loads(done.out)
+    assert not report["gyroscope"]["walk"]["told"]
+    assert "gyroscope K is not told by 5 min; the file has an upper bound" in done.err
+    text = (tmp_path / "kalibr_imu_chain.yaml").read_text()
+    line = next(row for row in text.splitlines() if "gyroscope_random_walk" in row)
+    assert "upper bound" in line and float(line.split()[1]) > IMU.gyro.walk
+    assert report == json.loads((tmp_path / "imu-report.json").read_text())
+
+
+def test_inflated_noise_is_written_and_said(share, table, tmp_path):
+    share("calibrate", "imu", table, "--out", tmp_path / "one")
+    share("calibrate", "imu", table, "--out", tmp_path / "two", "--inflate", "2")
+    one, two = (
+        imu_noise(read_yaml(tmp_path / name / "kalibr_imu_chain.yaml").section("imu0"), "update_rate")
+        for name in ("one", "two")
+    )
+    assert two.gyro_density == pytest.approx(2 * one.gyro_density, rel=1e-3)
+    assert two.accel_walk == pytest.approx(2 * one.accel_walk, rel=1e-3) and two.rate_hz == one.rate_hz
+    assert "2 times what was measured" in (tmp_path / "two" / "kalibr_imu_chain.yaml").read_text()
+
+
+def test_noise_far_from_the_profile_is_told(share, tmp_path):
+    loud = written(tmp_path / "loud.csv", 120, louder=3.0)
+    done = share("calibrate", "imu", loud, "--profile", "euroc", "--out", tmp_path)
+    assert done.code == 0
+    times = re.search(r"gyroscope N is ([\d.]+) times the profile's 0\.00034 rad/s/sqrt", done.err)
+    assert times and 2.8 < float(times[1]) < 3.1
+
+
+def test_wrong_use_is_one_line(share, table, tmp_path):
+    def refused(code: int, *arguments: object) -> str:
+        done = share("calibrate", "imu", *arguments)
+        assert done.code == code and done.err.count("\n") == 1
+        return done.err
+
+    short = tmp_path / "short.csv"
+    short.write_text("".join(table.read_text().splitlines(True)[:5000]))
+    assert "at least 60 s are needed" in refused(1, short, "--out", tmp_path / "a")
+    assert not list((tmp_path / "a").glob("*"))
+    assert "no such file" in refused(2, tmp_path / "no.mcap", "--out", tmp_path / "a")
+    assert "profile 'd436' is not known" in refused(2, table, "--profile", "d436", "--out", tmp_path / "a")
+    assert "--inflate" in refused(2, table, "--inflate", "0.5", "--out", tmp_path / "a")
+    assert "not a folder" in refused(2, table, "--out", short)
