@@ -26,6 +26,11 @@ def pair() -> Iterator[tuple[StampedSocket, StampedSocket]]:
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux is asked for stamps")
 def test_the_kernel_says_when_a_datagram_came_not_when_it_was_read() -> None:
     with pair() as (server, client):
+        client.send(
+            b"first"
+        )  # the kernel begins to stamp a moment after it was asked to (net_enable_timestamp)
+        assert server.receive(1.0) is not None
+        time.sleep(0.05)
         before = time.time_ns()
         client.send(b"hello")
         after = time.time_ns()
