@@ -19,7 +19,9 @@ def ask(patience_s: float = _PATIENCE_S) -> Sdk:
     there.close()
     try:
         if not here.poll(patience_s):
-            return Sdk(f"librealsense said nothing for {patience_s:g} s; unplug the camera and plug it in again")
+            return Sdk(
+                f"librealsense said nothing for {patience_s:g} s; unplug the camera and plug it in again"
+            )
         answer: Sdk = here.recv()
         return answer
     except EOFError:

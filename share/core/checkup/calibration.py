@@ -32,7 +32,11 @@ def _baseline(T_cam1_cam0: F64, baseline_m: float) -> str | None:
     found = float(np.linalg.norm(T_cam1_cam0[:3, 3]))
     if abs(found - baseline_m) > _BASELINE * baseline_m:
         return f"baseline {found * 1e3:.1f} mm, the device has {baseline_m * 1e3:.1f} mm"
-    return "cam1 lies left of cam0: T_cn_cnm1 is inverted, or they are swapped" if T_cam1_cam0[0, 3] > 0 else None
+    return (
+        "cam1 lies left of cam0: T_cn_cnm1 is inverted, or they are swapped"
+        if T_cam1_cam0[0, 3] > 0
+        else None
+    )
 
 
 def _elsewhere(found: F64, expected: F64) -> Finding:

@@ -33,12 +33,16 @@ class Sdk:
 def link(cameras: Sequence[UsbCamera] | None) -> Finding:
     """cameras: None where this machine shows no USB at all."""
     if cameras is None:
-        return fail("camera", "this system shows no USB devices (a container?)", "run it on the device itself")
+        return fail(
+            "camera", "this system shows no USB devices (a container?)", "run it on the device itself"
+        )
     if not cameras:
         return fail("camera", "no D435i (8086:0b3a) at any port", "plug it in; then: lsusb -d 8086:0b3a")
     slow = [camera for camera in cameras if camera.speed_mbit_s < _USB3_MBIT_S]
     if slow:
-        what = f"{slow[0].path}: USB 2 link, {slow[0].speed_mbit_s:g} Mbit/s: too slow for two images and an IMU"
+        what = (
+            f"{slow[0].path}: USB 2 link, {slow[0].speed_mbit_s:g} Mbit/s: too slow for two images and an IMU"
+        )
         return fail("camera", what, "take a USB 3 port and cable, push the plug in fast; then: lsusb -t")
     return ok("camera", ", ".join(f"{c.path}: USB 3, {c.speed_mbit_s:g} Mbit/s" for c in cameras))
 

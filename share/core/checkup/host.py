@@ -72,7 +72,9 @@ def clock(known: tuple[float, float] | None, trouble: str | None) -> Finding:
     what = f"{offset_ms:+.3f} ± {uncertainty_ms:.3f} ms"
     if abs(offset_ms) + uncertainty_ms <= _CLOCK_LIMIT_MS:
         return ok("clock", what)
-    return warn("clock", f"{what}, should be within {_CLOCK_LIMIT_MS:g} ms", "chronyc sources; share sync check")
+    return warn(
+        "clock", f"{what}, should be within {_CLOCK_LIMIT_MS:g} ms", "chronyc sources; share sync check"
+    )
 
 
 def libraries(found: Mapping[str, str | None]) -> Finding:
