@@ -34,7 +34,8 @@ def probe(address: str, keys: AgentKeys | None, patience_s: float = _PATIENCE_S)
 
 def _round_trip(link: AgentLink, until_s: float) -> float | None:
     """Of the quickest answer to several pings, s; None where none came."""
-    sent, took = 0, []
+    sent = 0
+    took: list[float] = []
     while time.monotonic() < until_s and len(took) < 5:
         sent += link.send(encode(Ping(sent, time.monotonic_ns())))
         frames = link.receive(100)
