@@ -26,6 +26,7 @@ COMMANDS = {
     "edge": ("share.cli.edge", "edge", "Join the maps of all agents and send corrections back."),
     "dataset": ("share.cli.dataset", "dataset", "Look into, convert and recover recordings; export maps."),
     "sync": ("share.cli.sync", "sync", "One clock for all machines of a room, and how well they agree."),
+    "doctor": ("share.cli.doctor", "doctor", "What is missing on this device, and how to mend it."),
     "emulate": ("share.cli.emulate", "emulate", "Record agents that move through a virtual room."),
     "evaluate": ("share.cli.evaluate", "evaluate", "Play sessions on stated terms, score and compare them."),
     "train": ("share.cli.train", "train", "Teach the model that estimates a tracker's error."),

@@ -8,18 +8,38 @@ from pathlib import Path
 
 from share.errors import ConfigError
 from share.io.profile_types import DeviceFacts, Emulation, HostFacts, Inertial, Mode, Profile
-from share.io.section import read_yaml
+from share.io.section import Section, read_yaml
 from share.io.strict import read
 
 
 @dataclass(frozen=True, eq=False)
 class _File:
-    """The top of a profile file."""
+    """The top of a profile file. role: what the computer does: ar, robot, edge; "" where any may."""
 
     name: str
-    device: DeviceFacts
     host: HostFacts
-    emulation: Emulation
+    device: DeviceFacts | None = None
+    emulation: Emulation | None = None
+    role: str = ""
+
+    def __post_init__(self) -> None:
+        if self.role not in _ROLES:
+            raise ValueError(f"role: '{self.role}' is not one of {', '.join(_ROLES[1:])}")
+        if (self.device is None) != (self.emulation is None):
+            raise ValueError("device and emulation: give both, or neither, or a device by its name")
+
+
+_ROLES = ("", "ar", "robot", "edge")
+
+
+@dataclass(frozen=True, eq=False)
+class HostProfile:
+    """How one computer is to be set. sensor: what is plugged into it; None at an edge."""
+
+    name: str
+    role: str
+    host: HostFacts
+    sensor: Profile | None
 
 
 def profile(
@@ -35,7 +55,9 @@ def profile(
     known.
     """
     path = _path(str(name_or_file))
-    file = read(_File, read_yaml(path))
+    file = _read(path)
+    if file.device is None or file.emulation is None:
+        raise ConfigError(f"profile '{file.name}' has no device; give one that has, such as d435i")
     try:
         chosen, rate_hz = _mode(file.device, mode or file.device.default_mode)
         imu = file.device.imu
@@ -45,6 +67,26 @@ def profile(
     return Profile(
         file.name, replace(file.device, imu=imu), file.host, file.emulation, mode=chosen, rate_hz=rate_hz
     )
+
+
+def host_profile(name_or_file: str | Path) -> HostProfile:
+    """A profile as that of a computer, with its device if it has one. Raises ConfigError."""
+    file = _read(_path(str(name_or_file)))
+    sensor = None if file.device is None else profile(name_or_file)
+    return HostProfile(file.name, file.role, file.host, sensor)
+
+
+def _read(path: Path) -> _File:
+    """A `device` that is a name stands for the device and the emulation of that shipped profile."""
+    top = read_yaml(path)
+    if isinstance(name := top.data.get("device"), str):
+        if "emulation" in top or name not in shipped():
+            raise ConfigError(
+                f"{path}: device: '{name}' is no shipped profile, or emulation is given beside it"
+            )
+        of = read_yaml(shipped()[name])
+        top = Section(top.data | {key: of.section(key).data for key in ("device", "emulation")}, top.where)
+    return read(_File, top)
 
 
 def shipped() -> dict[str, Path]:

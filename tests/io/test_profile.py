@@ -7,7 +7,7 @@ import pytest
 from share.errors import ConfigError
 from share.io import profile as profiles
 from share.io.calibration import read_calibration
-from share.io.profile import profile, shipped
+from share.io.profile import host_profile, profile, shipped
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -26,8 +26,9 @@ def changed(tmp_path: Path):
 
 
 def test_every_shipped_profile_reads_in_every_mode():
-    assert set(shipped()) == {"d435i", "euroc"}
-    for name in shipped():
+    hosts = {"d435i-n100-headset", "d435i-turtlebot4", "laptop-edge"}
+    assert set(shipped()) == {"d435i", "euroc"} | hosts
+    for name in set(shipped()) - {"laptop-edge"}:
         for mode in profile(name).device.modes:
             for hz in mode.rates_hz:
                 chosen = profile(name, f"{mode.width}x{mode.height}@{hz:g}")
@@ -74,7 +75,13 @@ def test_with_depth_the_rig_is_the_left_camera_with_depth_registered_to_it():
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("d455",), "profile 'd455' is not known; known: d435i, euroc, or give a .yaml file"),
+        (
+            ("d455",),
+            (
+                ("d455",),
+                "profile 'd455' is not known; known: d435i-n100-headset, d435i-turtlebot4, d435i, euroc,",
+            ),
+        ),
         (("no/such.yaml",), "no/such.yaml: no such profile file"),
         (("d435i", "640x400"), "mode '640x400' is not known; known: 640x480@30/15/60/90, 848x480@"),
         (("d435i", "640x480@25"), "mode '640x480@25' is not known"),
@@ -124,3 +131,16 @@ def test_the_folder_is_found_in_a_frozen_bundle_and_its_absence_is_said(monkeypa
     (tmp_path / "bundle" / "firmware_profiles" / "x.yaml").write_text("name: x")
     monkeypatch.setattr(sys, "_MEIPASS", str(tmp_path / "bundle"), raising=False)
     assert set(shipped()) == {"x"}
+
+
+def test_a_device_by_its_name_is_that_of_the_shipped_profile():
+    headset, bare = host_profile("d435i-n100-headset"), profile("d435i")
+    assert headset.role == "ar" and host_profile("d435i-turtlebot4").role == "robot"
+    assert headset.sensor is not None and headset.sensor.device.firmware == bare.device.firmware
+    assert headset.sensor.emulation == bare.emulation
+
+
+def test_an_edge_has_no_device_and_is_refused_where_one_is_needed():
+    assert host_profile("laptop-edge").sensor is None
+    with pytest.raises(ConfigError, match="profile 'laptop-edge' has no device"):
+        profile("laptop-edge")

@@ -1,0 +1,73 @@
+"""`share doctor`: what is missing on this device, and how to mend it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from share.cli import options
+from share.errors import ShareError
+
+if TYPE_CHECKING:
+    from share.core.checkup import Finding
+
+
+@click.command()
+@click.option(
+    "--profile", default="d435i", show_default=True, metavar="NAME|FILE", help="What is wanted here."
+)
+@click.option("--calib", metavar="DIR", help="The calibration of this device.")
+@click.option("--edge", "address", metavar="tcp://H:P", help="An edge to try.")
+@options.keys
+@click.option("--server-key", metavar="FILE|KEY", help="Public key of that edge.")
+@click.option("--out", default=".", show_default=True, metavar="DIR", help="Where recordings will go.")
+@options.as_json
+def doctor(
+    profile: str,
+    calib: str | None,
+    address: str | None,
+    keys: str | None,
+    server_key: str | None,
+    out: str,
+    as_json: bool,
+) -> None:
+    """Look at camera, computer, clock, keys and edge, and say what to mend. Nothing is changed.
+
+    Exit code 1 if anything is FAIL; WARN works, but not as well as it could; SKIPPED could not be seen.
+
+    \b
+    Example:  share doctor --profile d435i-n100-headset --calib calib/d435i
+    """
+    from share.core.checkup import failures
+    from share.io.profile import host_profile
+    from share.run.doctor import of_calibration, of_camera, of_edge, of_host
+
+    wanted = host_profile(profile)
+    found = [
+        *of_camera(wanted),
+        of_calibration(wanted, None if calib is None else Path(calib)),
+        *of_host(wanted, Path(out)),
+        *of_edge(address, None if keys is None else Path(keys), server_key),
+    ]
+    failed = failures(found)
+    click.echo(_plain(wanted.name, found, not failed) if as_json else _table(found))
+    if failed:
+        raise ShareError(f"doctor: {len(failed)} FAIL: {', '.join(one.name for one in failed)}")
+
+
+def _plain(profile: str, found: Sequence[Finding], fine: bool) -> str:
+    rows = [{"name": f.name, "state": f.state.value, "what": f.what, "mend": list(f.mend)} for f in found]
+    return json.dumps({"profile": profile, "ok": fine, "findings": rows})
+
+
+def _table(found: Sequence[Finding]) -> str:
+    width = max(len(one.name) for one in found)
+    lines = [f"{one.state.value:7}  {one.name:{width}}  {one.what}" for one in found]
+    for one in found:
+        if one.mend:
+            lines += ["", f"{one.name}:", *(f"    {line}" for line in one.mend)]
+    return "\n".join(lines)

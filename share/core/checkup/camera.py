@@ -1,0 +1,118 @@
+"""The camera: is it there, on which link, with which firmware, and may one open it?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from share.core.checkup import Finding, fail, ok, skipped, warn
+
+_USB3_MBIT_S = 5000
+RULE = 'SUBSYSTEMS=="usb", ATTRS{idVendor}=="8086", ATTRS{idProduct}=="0b3a", MODE:="0660", GROUP:="plugdev"'
+_RULE_FILE = "/etc/udev/rules.d/99-share-realsense.rules"
+
+
+@dataclass(frozen=True)
+class UsbCamera:
+    """As the kernel sees it. path: its name in /sys/bus/usb/devices. speed_mbit_s: of the link. control:
+    power/control, "on" where it is never put to sleep; None where unknown."""
+
+    path: str
+    speed_mbit_s: float
+    control: str | None = None
+
+
+@dataclass(frozen=True)
+class Sdk:
+    """What librealsense says. trouble: why it could not be asked, None where it was. firmware: of each."""
+
+    trouble: str | None = None
+    firmware: tuple[str, ...] = ()
+
+
+def link(cameras: Sequence[UsbCamera] | None) -> Finding:
+    """cameras: None where this machine shows no USB at all."""
+    if cameras is None:
+        return fail(
+            "camera", "this system shows no USB devices (a container?)", "run it on the device itself"
+        )
+    if not cameras:
+        return fail("camera", "no D435i (8086:0b3a) at any port", "plug it in; then: lsusb -d 8086:0b3a")
+    slow = [camera for camera in cameras if camera.speed_mbit_s < _USB3_MBIT_S]
+    if slow:
+        what = (
+            f"{slow[0].path}: USB 2 link, {slow[0].speed_mbit_s:g} Mbit/s: too slow for two images and an IMU"
+        )
+        return fail("camera", what, "take a USB 3 port and cable, push the plug in fast; then: lsusb -t")
+    return ok("camera", ", ".join(f"{c.path}: USB 3, {c.speed_mbit_s:g} Mbit/s" for c in cameras))
+
+
+def firmware(sdk: Sdk, good: Sequence[str], oldest: str | None) -> Finding:
+    """good: known to be good; oldest: what is below it is not to be trusted."""
+    if sdk.trouble or not sdk.firmware:
+        return skipped("firmware", "no camera told it")
+    found = min(sdk.firmware, key=version)
+    update = "rs-fw-update -l; then rs-fw-update -f FILE, with a file of the firmware recommended: "
+    if oldest and version(found) < version(oldest):
+        return fail("firmware", f"{found} is older than {oldest}", update + ", ".join(good))
+    if version(found) in map(version, good):
+        return ok("firmware", found)
+    return warn("firmware", f"{found} is not among those tried: {', '.join(good)}", update + ", ".join(good))
+
+
+def sdk(found: Sdk) -> Finding:
+    if found.trouble is None:
+        return ok("librealsense", f"loads; cameras it sees: {len(found.firmware)}")
+    library = "libusb-1.0.so" in found.trouble
+    mend = "sudo apt install libusb-1.0-0" if library else "pip install pyrealsense2"
+    return fail("librealsense", found.trouble, mend)
+
+
+def version(text: str) -> tuple[int, ...]:
+    """Dotted numbers; trailing zeros do not count. Raises ValueError."""
+    numbers = [int(part) for part in text.strip().split(".")]
+    while numbers and not numbers[-1]:
+        numbers.pop()
+    return tuple(numbers)
+
+
+def udev(rules: Sequence[str], is_root: bool) -> Finding:
+    """rules: files that name Intel's cameras."""
+    if rules:
+        return ok("udev rule", ", ".join(rules))
+    if is_root:
+        return warn("udev rule", "none for 8086, but root needs none", *_rule())
+    return fail("udev rule", "none for 8086: only root may open the camera", *_rule())
+
+
+def _rule() -> tuple[str, ...]:
+    return (
+        f"echo '{RULE}' | sudo tee {_RULE_FILE}",
+        "sudo udevadm control --reload-rules && sudo udevadm trigger",
+        "sudo usermod -aG plugdev $USER  # then log in again",
+    )
+
+
+def autosuspend(cameras: Sequence[UsbCamera], allowed: bool) -> Finding:
+    """allowed: whether the profile lets the kernel put the camera to sleep."""
+    if allowed:
+        return skipped("USB power saving", "the profile leaves it")
+    told = [camera for camera in cameras if camera.control is not None]
+    if not told:
+        return skipped("USB power saving", "no camera to look at")
+    asleep = [camera for camera in told if camera.control != "on"]
+    if not asleep:
+        return ok("USB power saving", "off for the camera")
+    mend = (f"echo on | sudo tee /sys/bus/usb/devices/{camera.path}/power/control" for camera in asleep)
+    return warn("USB power saving", "the kernel may put the camera to sleep", *mend)
+
+
+def usb_memory(found_mb: int | None, wanted_mb: int) -> Finding:
+    if not wanted_mb:
+        return skipped("USB memory", "the profile leaves it")
+    if found_mb is None:
+        return skipped("USB memory", "usbfs_memory_mb is not to be seen here")
+    if found_mb == 0 or found_mb >= wanted_mb:  # 0: no limit
+        return ok("USB memory", f"{found_mb} MB" if found_mb else "no limit")
+    mend = f"echo {wanted_mb} | sudo tee /sys/module/usbcore/parameters/usbfs_memory_mb"
+    return warn("USB memory", f"{found_mb} MB, the profile wants {wanted_mb}", mend)

@@ -1,0 +1,100 @@
+"""What Linux tells of the computer: processor, USB, udev, limits. Every root can be a tree of a test.
+
+What is not there is None or empty: containers and virtual machines show little.
+"""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+from pathlib import Path
+
+from share.core.checkup.camera import UsbCamera
+
+_VENDOR, _D435I = "8086", "0b3a"
+_RULES = ("etc/udev/rules.d", "lib/udev/rules.d", "usr/lib/udev/rules.d")
+_CPUS = "sys/devices/system/cpu/cpu[0-9]*"
+_NATIVE = ("numpy", "cv2", "scipy.linalg", "zmq", "onnxruntime", "poselib")
+
+
+def governors(root: Path = Path("/")) -> list[str]:
+    """Of each core."""
+    return [text for path in root.glob(f"{_CPUS}/cpufreq/scaling_governor") if (text := _text(path))]
+
+
+def throttles(root: Path = Path("/")) -> list[int]:
+    """How often each core was slowed by heat since the start (Intel's; core_throttle_count)."""
+    files = root.glob(f"{_CPUS}/thermal_throttle/core_throttle_count")
+    return [count for path in files if (count := _whole(path)) is not None]
+
+
+def usb_memory_mb(root: Path = Path("/")) -> int | None:
+    return _whole(root / "sys/module/usbcore/parameters/usbfs_memory_mb")
+
+
+def cameras(root: Path = Path("/")) -> list[UsbCamera] | None:
+    """All D435i, by port; None where the system shows no USB."""
+    folder = root / "sys/bus/usb/devices"
+    if not folder.is_dir():
+        return None
+    return [_camera(path) for path in sorted(folder.iterdir()) if _is_d435i(path)]
+
+
+def camera_rules(root: Path = Path("/")) -> list[str]:
+    """Files of udev that name Intel's vendor and cameras in lines that are no comments."""
+    files = [path for folder in _RULES for path in sorted((root / folder).glob("*.rules"))]
+    found = {path.resolve(): path for path in files if _names_camera(_text(path) or "")}  # /lib is /usr/lib
+    return [f"/{path.relative_to(root)}" for path in found.values()]
+
+
+def priority_limit() -> int | None:
+    """Realtime priority that this process may ask for, -1 = any; None where there is no such limit."""
+    import resource
+
+    kind = getattr(resource, "RLIMIT_RTPRIO", None)
+    return None if kind is None else resource.getrlimit(kind)[0]
+
+
+def free_bytes(folder: Path) -> tuple[Path, int]:
+    """Of the disk of `folder`, by the nearest folder above that is there."""
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    return there, shutil.disk_usage(there).free
+
+
+def native_libraries(names: tuple[str, ...] = _NATIVE) -> dict[str, str | None]:
+    """Why each does not load; None where it does."""
+    return {name: _trouble(name) for name in names}
+
+
+def _trouble(name: str) -> str | None:
+    try:
+        importlib.import_module(name)
+    except ImportError as error:  # also a wrong glibc, a missing .so
+        return str(error).splitlines()[0]
+    return None
+
+
+def _is_d435i(path: Path) -> bool:
+    return (_text(path / "idVendor"), _text(path / "idProduct")) == (_VENDOR, _D435I)
+
+
+def _camera(path: Path) -> UsbCamera:
+    return UsbCamera(path.name, float(_text(path / "speed") or 0), _text(path / "power/control"))
+
+
+def _names_camera(text: str) -> bool:
+    """librealsense's own file names each product; ours the D435i."""
+    lines = (line.lower() for line in text.splitlines() if not line.lstrip().startswith("#"))
+    return any(_VENDOR in line and _D435I in line for line in lines)
+
+
+def _text(path: Path) -> str | None:
+    try:
+        return path.read_text(errors="replace").strip()
+    except OSError:
+        return None
+
+
+def _whole(path: Path) -> int | None:
+    text = _text(path)
+    return int(text) if text and text.isdigit() else None

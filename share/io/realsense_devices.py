@@ -1,0 +1,46 @@
+"""Which RealSense cameras librealsense sees, asked in a process of its own: it can hang or crash."""
+
+from __future__ import annotations
+
+import multiprocessing
+from multiprocessing.connection import Connection
+
+from share.core.checkup.camera import Sdk
+
+_PATIENCE_S = 10.0
+
+
+def ask(patience_s: float = _PATIENCE_S) -> Sdk:
+    """Never raises: what went wrong is in `trouble`."""
+    context = multiprocessing.get_context("fork")  # a frozen program has no Python to start
+    here, there = context.Pipe(duplex=False)
+    child = context.Process(target=_tell, args=(there,), daemon=True)
+    child.start()
+    there.close()
+    try:
+        if not here.poll(patience_s):
+            return Sdk(
+                f"librealsense said nothing for {patience_s:g} s; unplug the camera and plug it in again"
+            )
+        answer: Sdk = here.recv()
+        return answer
+    except EOFError:
+        return Sdk("librealsense crashed; unplug the camera and plug it in again")
+    finally:
+        child.kill()
+        child.join()
+        here.close()
+
+
+def _tell(to: Connection) -> None:
+    to.send(_query())
+
+
+def _query() -> Sdk:
+    try:
+        import pyrealsense2 as rs
+
+        devices = rs.context().query_devices()
+        return Sdk(firmware=tuple(d.get_info(rs.camera_info.firmware_version) for d in devices))
+    except (ImportError, RuntimeError) as error:
+        return Sdk(str(error).splitlines()[0])

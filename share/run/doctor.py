@@ -1,0 +1,104 @@
+"""Looks at this device as a profile wants it: facts read by `share.io`, judged by `share.core.checkup`."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+from share.core.checkup import Finding, camera, fail, host, ok, skipped
+from share.core.checkup.calibration import calibration
+from share.errors import ShareError
+from share.io import chrony, realsense_devices
+from share.io import host as facts
+from share.io.calibration import read_calibration
+from share.io.keys import AgentKeys, agent_keys, default_folder, has_pair, load
+from share.io.profile import HostProfile
+from share.io.profile_types import Profile
+from share.run.edge_probe import probe
+
+_REALSENSE = "RealSense"
+
+
+def of_host(profile: HostProfile, out: Path) -> list[Finding]:
+    wanted = profile.host
+    where, free = facts.free_bytes(out)
+    return [
+        host.libraries(facts.native_libraries()),
+        host.governor(facts.governors(), wanted.cpu_governor),
+        host.throttling(facts.throttles()),
+        host.priority(facts.priority_limit(), wanted.realtime_priority),
+        host.disk(str(where), free, 0.0 if profile.sensor is None else _bytes_s(profile.sensor)),
+        _clock(),
+    ]
+
+
+def of_camera(profile: HostProfile) -> list[Finding]:
+    """Only of a device that is a RealSense."""
+    if profile.sensor is None or _REALSENSE not in profile.sensor.device.model:
+        return [skipped("camera", f"profile '{profile.name}' has none that can be asked")]
+    device, wanted = profile.sensor.device, profile.host
+    found, sdk = facts.cameras(), realsense_devices.ask()
+    return [
+        camera.link(found),
+        camera.sdk(sdk),
+        camera.firmware(sdk, device.firmware, device.firmware_oldest),
+        camera.udev(facts.camera_rules(), os.geteuid() == 0),
+        camera.autosuspend(found or (), wanted.usb_autosuspend),
+        camera.usb_memory(facts.usb_memory_mb(), wanted.usbfs_mb),
+    ]
+
+
+def of_calibration(profile: HostProfile, folder: Path | None) -> Finding:
+    if profile.sensor is None:
+        return skipped("calibration", f"profile '{profile.name}' has no device")
+    if folder is None:
+        return skipped("calibration", "none given: --calib DIR")
+    try:
+        found = read_calibration(folder)
+        age_days = (time.time() - Path(found.where).stat().st_mtime) / 86400
+    except (ShareError, OSError) as error:
+        return fail("calibration", str(error))
+    return calibration(found.rig, age_days, profile.sensor.device.T_imu_cam0, profile.sensor.baseline_m)
+
+
+def of_edge(address: str | None, keys: Path | None, server_key: str | None) -> list[Finding]:
+    """This machine's keys, and the edge by them. Raises UsageError for an address that is none."""
+    pair, with_keys = _keys(keys or default_folder(), server_key)
+    if address is None:
+        return [pair, skipped("edge", "none given: --edge tcp://HOST:PORT")]
+    if server_key is not None and with_keys is None:
+        return [pair, skipped("edge", "not without keys that can be used")]
+    try:
+        return [pair, probe(address, with_keys)]
+    except ShareError as error:
+        return [pair, fail("edge", str(error))]
+
+
+def _keys(folder: Path, server_key: str | None) -> tuple[Finding, AgentKeys | None]:
+    try:
+        if server_key is not None:
+            both = agent_keys(folder, server_key)
+            return ok("keys", f"{both.own.name}, and that of the edge"), both
+        if not has_pair(folder):
+            return skipped("keys", f"{folder}: none; needed only for an edge on another machine"), None
+        return ok("keys", f"{load(folder).name}"), None
+    except ShareError as error:
+        return fail("keys", str(error)), None
+
+
+def _clock() -> Finding:
+    try:
+        found = chrony.tracking()
+    except ShareError as error:
+        return host.clock(None, str(error))
+    if found is None:
+        return host.clock(None, None)
+    if not found.synchronised or found.local:
+        return host.clock(None, "chronyd follows no other clock")
+    return host.clock((found.offset_s * 1e3, found.uncertainty_s * 1e3), None)
+
+
+def _bytes_s(sensor: Profile) -> float:
+    """Two gray images, uncompressed."""
+    return 2.0 * sensor.mode.width * sensor.mode.height * sensor.rate_hz

@@ -1,0 +1,94 @@
+"""Each judgement at both sides of its limit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from share.core.checkup import State, camera, host
+from share.core.checkup.calibration import calibration
+from share.core.checkup.camera import Sdk, UsbCamera
+from share.geometry.camera import Camera, ImuNoise, Rig
+from share.geometry.se3 import inverse
+from share.io import host as facts
+
+
+@pytest.mark.parametrize(("mbit_s", "state"), [(480, "FAIL"), (5000, "OK"), (10000, "OK")])
+def test_a_link_is_usb_3_from_5000_mbit_on(mbit_s: float, state: str) -> None:
+    assert camera.link([UsbCamera("2-1", mbit_s)]).state.value == state
+    assert camera.link([]).state is camera.link(None).state is State.FAIL
+
+
+@pytest.mark.parametrize(
+    ("found", "state"),
+    [("5.9.0.0", "FAIL"), ("5.12.0", "WARN"), ("5.13.0.50", "OK"), ("5.16.0.1", "OK"), ("5.17", "WARN")],
+)
+def test_firmware_is_compared_by_numbers_not_letters(found: str, state: str) -> None:
+    good = ["5.13.0.50", "5.16.0.1"]
+    assert camera.firmware(Sdk(firmware=(found,)), good, "5.12.0.0").state.value == state
+
+
+def test_what_cannot_be_seen_is_skipped() -> None:
+    found = [host.governor([], "performance"), host.throttling([]), camera.usb_memory(None, 128)]
+    found += [host.priority(None, 10), camera.firmware(Sdk("no"), [], None), camera.autosuspend([], False)]
+    assert {one.state for one in found} == {State.SKIPPED}
+
+
+def test_the_host_is_held_against_the_profile() -> None:
+    assert host.governor(["performance"] * 4, "performance").state is State.OK
+    assert "1 of 2 cores" in host.governor(["performance", "powersave"], "performance").what
+    assert host.throttling([0, 3]).state is host.priority(5, 10).state is State.WARN
+    assert host.priority(-1, 10).state is camera.usb_memory(128, 128).state is State.OK
+    assert camera.usb_memory(16, 128).state is State.WARN
+    assert camera.udev([], is_root=False).state is State.FAIL
+
+
+@pytest.mark.parametrize(("minutes", "state"), [(4, "FAIL"), (6, "WARN"), (61, "OK")])
+def test_a_disk_is_told_in_minutes(minutes: int, state: str) -> None:
+    assert host.disk("/", minutes * 60 * 10_000_000, 1e7).state.value == state
+
+
+@pytest.mark.parametrize(("offset", "state"), [(0.5, State.OK), (-0.5, State.OK), (0.8, State.WARN)])
+def test_the_clock_counts_with_its_uncertainty(offset: float, state: State) -> None:
+    assert host.clock((offset, 0.3), None).state is state
+    assert host.clock(None, None).state is State.WARN
+
+
+def test_an_inverted_extrinsic_is_told_from_one_that_is_elsewhere() -> None:
+    T = np.eye(4)
+    T[:3, 3] = (-0.03, 0.02, 0.01)
+    T_10 = np.eye(4)
+    T_10[0, 3] = -0.05
+    lens = Camera(640, 480, 385.0, 385.0, 320.0, 240.0)
+
+    def of(T_imu_cam0: np.ndarray, cam1: np.ndarray) -> tuple[State, str]:
+        noise = ImuNoise(1e-4, 2e-3, 2e-5, 3e-3, 200.0)
+        rig = Rig(lens, T_imu_cam0, cam1=lens, T_cam1_cam0=cam1, imu=noise)
+        found = calibration(rig, 1.0, T, 0.05)
+        return found.state, found.what
+
+    assert of(T, T_10)[0] is State.OK
+    assert of(inverse(T), T_10) == (State.FAIL, "the extrinsics to the IMU are inverted")
+    assert of(np.eye(4), T_10)[0] is State.WARN
+    assert "cam1 lies left" in of(T, inverse(T_10))[1]
+
+
+def test_facts_are_read_from_a_tree(tmp_path: Path) -> None:
+    usb, rules = tmp_path / "sys/bus/usb/devices/2-1", tmp_path / "etc/udev/rules.d"
+    assert facts.cameras(tmp_path) is None
+    (usb / "power").mkdir(parents=True)
+    rules.mkdir(parents=True)
+    for name, text in {
+        "idVendor": "8086",
+        "idProduct": "0b3a",
+        "speed": "480",
+        "power/control": "auto",
+    }.items():
+        (usb / name).write_text(text + "\n")
+    assert facts.cameras(tmp_path) == [UsbCamera("2-1", 480.0, "auto")]
+    (rules / "9.rules").write_text("# " + camera.RULE)
+    assert facts.camera_rules(tmp_path) == []
+    (rules / "9.rules").write_text(camera.RULE)
+    assert facts.camera_rules(tmp_path) == ["/etc/udev/rules.d/9.rules"]
