@@ -77,10 +77,7 @@ def test_with_depth_the_rig_is_the_left_camera_with_depth_registered_to_it():
     [
         (
             ("d455",),
-            (
-                ("d455",),
-                "profile 'd455' is not known; known: d435i-n100-headset, d435i-turtlebot4, d435i, euroc,",
-            ),
+            "profile 'd455' is not known; known: d435i-n100-headset, d435i-turtlebot4, d435i, euroc,",
         ),
         (("no/such.yaml",), "no/such.yaml: no such profile file"),
         (("d435i", "640x400"), "mode '640x400' is not known; known: 640x480@30/15/60/90, 848x480@"),
