@@ -15,6 +15,7 @@ from share.io.calibration import read_calibration
 from share.io.keys import AgentKeys, agent_keys, default_folder, has_pair, load
 from share.io.profile import HostProfile
 from share.io.profile_types import Profile
+from share.io.transport import parse_address
 from share.run.edge_probe import probe
 
 _REALSENSE = "RealSense"
@@ -64,6 +65,8 @@ def of_calibration(profile: HostProfile, folder: Path | None) -> Finding:
 
 def of_edge(address: str | None, keys: Path | None, server_key: str | None) -> list[Finding]:
     """This machine's keys, and the edge by them. Raises UsageError for an address that is none."""
+    if address is not None:
+        parse_address(address)
     pair, with_keys = _keys(keys or default_folder(), server_key)
     if address is None:
         return [pair, skipped("edge", "none given: --edge tcp://HOST:PORT")]

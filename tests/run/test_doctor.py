@@ -1,0 +1,124 @@
+"""`share doctor` as people use it: with edges that are there, are not, or do not know us."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from children import Child, start_edge
+from shell import Done
+
+from share.io import realsense_devices
+from share.io.host import governors, throttles, usb_memory_mb
+from share.run import edge_probe
+
+Share = Callable[..., Done]
+LAPTOP = ("--profile", "laptop-edge")
+
+
+@pytest.fixture
+def edge(tmp_path: Path) -> Iterator[str]:
+    child, address = start_edge(tmp_path / "room")
+    yield address
+    child.kill()
+
+
+class Guarded:
+    """An edge with keys, and the folder of ours."""
+
+    def __init__(self, folder: Path, share: Share) -> None:
+        self.keys, self.ours = folder / "its-keys", folder / "our-keys"
+        self.public = share("keys", "generate", "--name", "edge", "--keys", self.keys).out.strip()
+        self.our_public = share("keys", "generate", "--name", "ann", "--keys", self.ours).out.strip()
+        where = ("--bind", "tcp://0.0.0.0:0", "--keys", str(self.keys))
+        self.child = Child(folder / "edge.log", "edge", *where)
+        self.address = f"tcp://127.0.0.1:{self.child.wait_for(r'listening on tcp://0.0.0.0:([0-9]+),')[1]}"
+
+
+@pytest.fixture
+def guarded(tmp_path: Path, share: Share) -> Iterator[Guarded]:
+    made = Guarded(tmp_path, share)
+    yield made
+    made.child.kill()
+
+
+def of_edge(done: Done) -> dict[str, object]:
+    told = json.loads(done.out)
+    (found,) = [one for one in told["findings"] if one["name"] == "edge"]
+    assert told["ok"] == (done.code == 0) == all(one["state"] != "FAIL" for one in told["findings"])
+    return dict(found)
+
+
+def test_a_machine_without_a_camera_is_fine_where_none_is_wanted(share: Share, tmp_path: Path) -> None:
+    done = share("doctor", *LAPTOP, "--keys", tmp_path / "none")
+    states = {line.split()[0] for line in done.out.split("\n\n")[0].splitlines()}
+    assert (done.code, done.err) == (0, "")
+    assert states <= {"OK", "WARN", "SKIPPED"}
+    assert "libraries" in done.out
+
+
+def test_an_edge_that_is_there_answers_soon(share: Share, edge: str, tmp_path: Path) -> None:
+    found = of_edge(share("doctor", *LAPTOP, "--edge", edge, "--keys", tmp_path / "none", "--json"))
+    assert found["state"] == "OK"
+    assert "answers in" in str(found["what"])
+
+
+def test_an_edge_that_is_not_there_fails_in_one_line(
+    share: Share, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(edge_probe.probe, "__defaults__", (0.3,))
+    done = share("doctor", *LAPTOP, "--edge", "tcp://127.0.0.1:1", "--keys", tmp_path / "none")
+    assert done.code == 1
+    assert done.err == "share: doctor: 1 FAIL: edge\n"
+    assert "no answer within 0.3 s" in done.out
+    assert "share edge --bind tcp://127.0.0.1:1" in done.out
+
+
+def test_what_is_no_address_is_wrong_use(share: Share) -> None:
+    done = share("doctor", *LAPTOP, "--edge", "kitchen")
+    assert (done.code, done.out) == (2, "")
+    assert "kitchen" in done.err
+
+
+def test_an_edge_with_keys_takes_those_that_are_authorized(share: Share, guarded: Guarded) -> None:
+    ask = ("doctor", *LAPTOP, "--edge", guarded.address, "--keys", guarded.ours, "--json")
+    unknown = of_edge(share(*ask, "--server-key", guarded.public))
+    assert unknown["state"] == "FAIL"
+    assert "authorize" in str(unknown["what"])
+    share("keys", "authorize", "ann", guarded.our_public, "--keys", guarded.keys)
+    assert of_edge(share(*ask, "--server-key", guarded.public))["state"] == "OK"
+
+
+def test_the_key_of_another_edge_is_found_out(share: Share, guarded: Guarded) -> None:
+    ask = ("doctor", *LAPTOP, "--edge", guarded.address, "--keys", guarded.ours, "--json")
+    found = of_edge(share(*ask, "--server-key", guarded.our_public))
+    assert found["state"] == "FAIL"
+
+
+def test_librealsense_that_hangs_or_crashes_does_not_take_us_along(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(realsense_devices, "_query", lambda: time.sleep(60))
+    began = time.monotonic()
+    assert "said nothing for 0.2 s" in str(realsense_devices.ask(0.2).trouble)
+    assert time.monotonic() - began < 10
+    monkeypatch.setattr(realsense_devices, "_query", lambda: os._exit(3))
+    assert "crashed" in str(realsense_devices.ask().trouble)
+
+
+def test_what_the_computer_says_of_itself_is_read(tmp_path: Path) -> None:
+    cpu = tmp_path / "sys/devices/system/cpu"
+    for k, governor in enumerate(("performance", "powersave")):
+        (cpu / f"cpu{k}/cpufreq").mkdir(parents=True)
+        (cpu / f"cpu{k}/cpufreq/scaling_governor").write_text(f"{governor}\n")
+        (cpu / f"cpu{k}/thermal_throttle").mkdir()
+        (cpu / f"cpu{k}/thermal_throttle/core_throttle_count").write_text(f"{3 * k}\n")
+    usb = tmp_path / "sys/module/usbcore/parameters"
+    usb.mkdir(parents=True)
+    (usb / "usbfs_memory_mb").write_text("16\n")
+    assert sorted(governors(tmp_path)) == ["performance", "powersave"]
+    assert sorted(throttles(tmp_path)) == [0, 3]
+    assert usb_memory_mb(tmp_path) == 16
+    assert usb_memory_mb(tmp_path / "nowhere") is None
