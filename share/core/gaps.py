@@ -44,10 +44,8 @@ class Gaps:
 
     def _missing(self, step: int, number: int | None) -> None:
         late = step > _LATE * self._step_ns
-        counted = number is not None and self._number is not None and number > self._number
-        if counted:
-            lost = number - self._number - 1  # type: ignore[operator]
-        else:
-            lost = round(step / self._step_ns) - 1 if late else 0
+        lost = round(step / self._step_ns) - 1 if late else 0
+        if number is not None and self._number is not None and number > self._number:
+            lost = number - self._number - 1
         self.missing += lost
         self.gaps += late or lost > 0

@@ -46,7 +46,7 @@ class Intake:
 
     After a reconnection time goes on by as much as the host's clock went on. `foreign` counts samples
     whose stamps are not of the device's clock: they are used, but a person has to know; `wraps`, `jumps`,
-    `strays` and `past` are those of `StampRepair`; `streams` has the gaps of every stream as the device sent it.
+    `strays` and `past` are those of `StampRepair`; `streams` has the gaps of every stream of the device.
     """
 
     def __init__(self, rates_hz: Mapping[str, float], max_jump_s: float) -> None:

@@ -27,8 +27,9 @@ def attached(rs: Any, context: Any) -> list[Attached]:
     wanted = (kinds.serial_number, kinds.name, kinds.firmware_version, kinds.usb_type_descriptor)
     found = []
     for handle in context.query_devices():
-        told = [handle.get_info(kind) if handle.supports(kind) else "" for kind in wanted]
-        found.append(Attached(*told, handle))
+        told = (handle.get_info(kind) if handle.supports(kind) else "" for kind in wanted)
+        serial, name, firmware, usb = told
+        found.append(Attached(serial, name, firmware, usb, handle))
     return [device for device in found if device.serial]
 
 

@@ -49,5 +49,5 @@ def _motion(frame: Any) -> list[float]:
 
 
 def _pixels(frame: Any, stream: str, depth_unit_m: float) -> NDArray[Any]:
-    pixels = np.asanyarray(frame.get_data())
-    return pixels * np.float32(depth_unit_m) if stream == DEPTH else pixels.copy()
+    pixels = np.asarray(frame.get_data())
+    return np.asarray(pixels * np.float32(depth_unit_m)) if stream == DEPTH else pixels.copy()
