@@ -104,25 +104,40 @@ class Capture:
         _check_disk(self._out, self._free_least)
         self._device = device = self._connect(self._serial, 0)
         self._serial = device.serial
-        recorder = Recorder(self._out, device.rig, durable=True)
-        writer = threading.Thread(target=self._write, args=(recorder,), daemon=True)
-        writer.start()
+        device.start(self._take)  # before there is a file: the queue holds what comes meanwhile
         try:
-            device.start(self._take)
-            self._watchdog = self._new_watchdog()
-            self._loop(seconds)
-        except BaseException:
-            self._error = self._error or ShareError("interrupted")
-            raise
+            self._record(Recorder(self._out, device.rig, durable=True), seconds)
         finally:
-            if self._device is not None:
-                self._device.stop()
-            self._handover.close()
-            writer.join()
-            self._finish(recorder)
+            self._leave()
         if self._error is not None:
             raise self._error
         return self.report()
+
+    def _record(self, recorder: Recorder, seconds: float | None) -> None:
+        """Until it ends; then the file is whole, or keeps its `.part` if something went wrong."""
+        writer = threading.Thread(target=self._write, args=(recorder,), daemon=True)
+        writer.start()
+        self._watchdog = self._new_watchdog()
+        try:
+            self._loop(seconds)
+        except BaseException as error:
+            self._error = self._error or error
+        self._leave()
+        writer.join()
+        if self._error is not None:
+            recorder.abort()
+        elif not any(gaps.samples for gaps in self._intake.streams.values()):
+            recorder.abort()
+            recorder.part.unlink()
+            self._error = ShareError(f"camera {self._serial}: no sample came; nothing was recorded")
+        else:
+            recorder.close()
+
+    def _leave(self) -> None:
+        """Let the camera go; what it sent is still written."""
+        if self._device is not None:
+            self._device.stop()
+        self._handover.close()
 
     def report(self) -> dict[str, Any]:
         """What was recorded, repaired and lost."""
@@ -169,12 +184,6 @@ class Capture:
             self._error = error
             self._stop.set()
             self._handover.close()
-
-    def _finish(self, recorder: Recorder) -> None:
-        if self._error is None:
-            recorder.close()
-        else:
-            recorder.abort()
 
     # ------------------------------------------------------------------ main
 
