@@ -15,7 +15,7 @@ from tests.software_camera import SoftwareCamera
 
 
 def feed(camera: SoftwareCamera) -> None:
-    picture = np.zeros((480, 640), np.uint8)
+    picture = np.random.default_rng(1).integers(0, 255, (480, 640), np.uint8)
     for k in range(10_000):
         now = 1_000_000 + k * 33_333
         for i in range(13):

