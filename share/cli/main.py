@@ -21,6 +21,7 @@ from share.errors import ShareError, UsageError  # noqa: E402
 # name: (module, attribute, one line of help). Literal, so that a freezer sees every module.
 COMMANDS = {
     "demo": ("share.cli.demo", "demo", "The whole system on this machine, nothing else needed."),
+    "capture": ("share.cli.capture", "capture", "Record a headset or robot."),
     "track": ("share.cli.track", "track", "Track one agent, without an edge, as fast as it goes."),
     "agent": ("share.cli.agent", "agent", "Track one agent at sensor rate and share its map."),
     "edge": ("share.cli.edge", "edge", "Join the maps of all agents and send corrections back."),

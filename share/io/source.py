@@ -59,7 +59,7 @@ def open_source(spec: str, calib: str | None = None, frames: slice | None = None
     Raises UsageError, ConfigError or DataError.
     """
     if spec == "realsense" or spec.startswith("realsense:"):
-        raise UsageError(f"{spec}: live cameras come with `share capture`, which this version does not have")
+        raise UsageError(f"{spec}: a live camera is recorded with `share capture`; then give the recording")
     path = Path(spec)
     calibration = None if calib is None else read_calibration(_existing(Path(calib), "--calib"))
     for reader in READERS:

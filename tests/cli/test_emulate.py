@@ -71,7 +71,10 @@ TYPED = {
         ["--scene", "firestation", "--size", "3x3x3"],
         "a firestation cannot be 3 x 3 x 3 m: give a size between 9 x 6 x 3.6 m and 30 x 20 x 8 m",
     ),
-    "profile": (["--profile", "d436"], "profile 'd436' is not known; known: d435i, euroc, or give a .yaml"),
+    "profile": (
+        ["--profile", "d436"],
+        "profile 'd436' is not known; known: d435i-n100-headset, d435i-turtlebot4, d435i, euroc, laptop-edge, or",
+    ),
     "profile file": (["--profile", "mine.yaml"], "mine.yaml: no such profile file"),
     "mode": (["--profile", "d435i:9x9"], "mode '9x9' is not known; known: 640x480@30/15/60/90, 848x480"),
     "whose profile": (["--profile", "bob=d435i"], "'bob' is not one of the agents: walk1"),

@@ -108,7 +108,7 @@ def test_no_arguments_is_the_help_and_wrong_use(capsys):
     [
         ("trak", "no command 'trak'; did you mean 'track'?"),
         ("Edge", "no command 'Edge'; did you mean 'edge'?"),
-        ("xyz", "no command 'xyz'; there are demo, track, agent, edge, dataset"),
+        ("xyz", "no command 'xyz'; there are demo, capture, track, agent, edge, dataset"),
         ("--bogus", "No such option '--bogus'"),
         ("dataset inf", "No such command 'inf'. Did you mean 'info'?"),
         ("track", "Missing argument 'SOURCE'"),

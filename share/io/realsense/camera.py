@@ -1,0 +1,137 @@
+"""One RealSense camera: connect, read, disconnect."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+
+from share.core.intake import ACCEL, GYRO, Sample
+from share.core.measurement import CAM0, DEPTH
+from share.errors import ShareError
+from share.geometry.camera import Rig
+from share.io.realsense.devices import attached, choose
+from share.io.realsense.factory import factory_rig
+from share.io.realsense.frames import has_dots, to_sample
+from share.io.realsense.sdk import load_sdk
+from share.io.realsense.streams import Opened, Wanted, choose_streams
+
+_QUEUE = {True: 2000, False: 32}  # frames between the SDK and us: of the IMU, of images
+_WAIT_MS = 100
+_DEPTH_UNIT_M = 0.001
+
+Sink = Callable[[Sample], None]
+
+
+class RealSense:
+    """A camera that is connected. `start` reads it in threads of its own, one for each sensor.
+
+    Context manager; leaving it disconnects. Frames come through `frame_queue`s of the sensors and not
+    by the SDK's pipeline, which loses IMU samples. `lit` counts images left out for their dots.
+    Raises UsageError where no such camera can be used, ShareError where it cannot be opened.
+    """
+
+    def __init__(
+        self, wanted: Wanted, serial: str | None = None, context: Any = None, epoch: int = 0
+    ) -> None:
+        self._rs = rs = load_sdk()
+        self._context = rs.context() if context is None else context
+        self._device = choose(attached(rs, self._context), serial, wanted.profile.device)
+        self._wanted, self._epoch = wanted, epoch
+        self._opened = choose_streams(rs, self._device.handle, wanted)
+        self._stop = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self.lit = 0
+
+    @property
+    def serial(self) -> str:
+        """By which it is found again."""
+        return self._device.serial
+
+    @property
+    def rig(self) -> Rig:
+        """The factory calibration, with the profile's IMU noise; of the profile where no images are read."""
+        stated = self._wanted.profile.rig()
+        profiles = {name: profile for one in self._opened for name, profile in one.profiles.items()}
+        return factory_rig(self._rs, profiles, stated.imu) if CAM0 in profiles else stated
+
+    def start(self, sink: Sink) -> None:
+        """Deliver samples to `sink`, which is called from several threads. Raises ShareError."""
+        for one in self._opened:
+            moves = GYRO in one.profiles or ACCEL in one.profiles
+            queue = self._rs.frame_queue(_QUEUE[moves], True)
+            try:
+                self._set(one.sensor)
+                one.sensor.open(list(one.profiles.values()))
+                one.sensor.start(queue)
+            except RuntimeError as error:
+                self.stop()
+                raise ShareError(f"{self._device.name} {self.serial}: cannot be opened: {error}") from None
+            unit = _depth_unit(one)
+            thread = threading.Thread(target=self._pump, args=(queue, sink, unit), daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def stop(self) -> None:
+        """Stop reading and disconnect; does nothing the second time."""
+        self._stop.set()
+        for one in self._opened:
+            with contextlib.suppress(RuntimeError):  # it may be gone, or was never started
+                one.sensor.stop()
+            with contextlib.suppress(RuntimeError):
+                one.sensor.close()
+        for thread in self._threads:
+            thread.join(timeout=2)
+        self._threads = []
+
+    def reset(self) -> None:
+        """Reset the device by its hardware: it disconnects, and comes back after some seconds."""
+        self.stop()
+        with contextlib.suppress(RuntimeError):
+            self._device.handle.hardware_reset()
+
+    def __enter__(self) -> RealSense:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _set(self, sensor: Any) -> None:
+        """Options of a sensor, each where it has it: emitter by the profile, stamps of the device."""
+        option, emitter = self._rs.option, self._wanted.profile.device.emitter
+        dots = {
+            "off": {option.emitter_enabled: 0},
+            "on": {option.emitter_enabled: 1, option.emitter_on_off: 0},
+            "interleaved": {option.emitter_enabled: 1, option.emitter_on_off: 1},
+            "none": {},
+        }[emitter]
+        for name, value in ({option.global_time_enabled: 0} | dots).items():
+            if sensor.supports(name):
+                sensor.set_option(name, value)
+
+    def _pump(self, queue: Any, sink: Sink, depth_unit_m: float) -> None:
+        while not self._stop.is_set():
+            there, frame = queue.try_wait_for_frame(_WAIT_MS)
+            if not there:
+                continue
+            sample = to_sample(self._rs, frame, depth_unit_m, time.monotonic_ns(), self._epoch)
+            if self._spoiled(sample.stream, frame):
+                self.lit += 1
+            else:
+                sink(sample)
+
+    def _spoiled(self, stream: str, frame: Any) -> bool:
+        """An infrared image with dots in it, where every other one has none."""
+        infrared = stream not in (ACCEL, GYRO, DEPTH)
+        return infrared and self._wanted.interleaved and has_dots(self._rs, frame)
+
+
+def _depth_unit(one: Opened) -> float:
+    """Metres of one step of a depth map."""
+    depth = DEPTH in one.profiles and one.sensor.is_depth_sensor()
+    return float(one.sensor.as_depth_sensor().get_depth_scale()) if depth else _DEPTH_UNIT_M

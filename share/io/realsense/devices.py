@@ -1,0 +1,67 @@
+"""Which cameras are attached, and whether the one that is wanted can be used."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from share.errors import UsageError
+from share.io.profile_types import DeviceFacts
+
+
+@dataclass(frozen=True, eq=False)
+class Attached:
+    """A device as the SDK lists it. usb: the kind of port, such as 3.2; empty if it is not told."""
+
+    serial: str
+    name: str
+    firmware: str
+    usb: str
+    handle: Any
+
+
+def attached(rs: Any, context: Any) -> list[Attached]:
+    """All devices with a serial number, in the SDK's order."""
+    kinds = rs.camera_info
+    wanted = (kinds.serial_number, kinds.name, kinds.firmware_version, kinds.usb_type_descriptor)
+    found = []
+    for handle in context.query_devices():
+        told = (handle.get_info(kind) if handle.supports(kind) else "" for kind in wanted)
+        serial, name, firmware, usb = told
+        found.append(Attached(serial, name, firmware, usb, handle))
+    return [device for device in found if device.serial]
+
+
+def choose(devices: list[Attached], serial: str | None, facts: DeviceFacts) -> Attached:
+    """The device `serial`, or the only one. Raises UsageError if it is not there or cannot be used."""
+    listed = ", ".join(f"{device.serial} ({device.name})" for device in devices)
+    if not devices:
+        raise UsageError("no RealSense camera is attached; plug one into a USB 3 port and see `lsusb`")
+    if serial is None:
+        if len(devices) > 1:
+            raise UsageError(f"several RealSense cameras are attached; name one, realsense:SERIAL: {listed}")
+        return _usable(devices[0], facts)
+    for device in devices:
+        if device.serial == serial:
+            return _usable(device, facts)
+    raise UsageError(f"no RealSense camera with serial number {serial} is attached; there is {listed}")
+
+
+def _usable(device: Attached, facts: DeviceFacts) -> Attached:
+    who = f"{device.name} {device.serial}"
+    if device.usb.startswith("2"):
+        raise UsageError(
+            f"{who}: is on USB {device.usb}, too slow for it; use a USB 3 port and a USB 3 cable"
+        )
+    oldest = facts.firmware_oldest
+    if oldest and device.firmware and _numbers(device.firmware) < _numbers(oldest):
+        raise UsageError(
+            f"{who}: its firmware {device.firmware} is older than {oldest}; update it with rs-fw-update "
+            f"(known to be good: {', '.join(facts.firmware)})"
+        )
+    return device
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in re.findall(r"\d+", version))

@@ -1,0 +1,21 @@
+"""The SDK, imported when a camera is asked for: it is an extra of SHARE."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from share.errors import UsageError
+
+
+def load_sdk() -> Any:
+    """The module pyrealsense2. Raises UsageError that says how to get it."""
+    try:
+        import pyrealsense2
+    except ModuleNotFoundError:
+        raise UsageError(
+            "a RealSense camera needs pyrealsense2: pip install 'share-slam[realsense]'"
+        ) from None
+    except ImportError as error:
+        hint = " (apt install libusb-1.0-0)" if "libusb" in str(error) else ""
+        raise UsageError(f"pyrealsense2 cannot be loaded: {error}{hint}") from None
+    return pyrealsense2

@@ -1,0 +1,55 @@
+"""Silence, told step by step: one reset, then vision only; a lost device is looked for."""
+
+from __future__ import annotations
+
+from share.core.watchdog import Action, Health, Watchdog
+
+MS = 10**6
+
+
+def run(dog: Watchdog, begin_ms: int, end_ms: int, *streams: str) -> list[Action]:
+    """What it asks for, every 100 ms, while these streams are heard."""
+    asked = []
+    for now in range(begin_ms, end_ms, 100):
+        for stream in streams:
+            dog.heard(stream, now * MS)
+        asked.append(dog.tick(now * MS))
+    return [action for action in asked if action is not Action.NOTHING]
+
+
+def test_a_camera_that_delivers_is_left_alone() -> None:
+    assert run(Watchdog(0), 0, 60_000, "cam0", "imu") == []
+
+
+def test_nothing_is_asked_while_it_warms_up() -> None:
+    assert run(Watchdog(0), 0, 4000) == []
+
+
+def test_a_silent_imu_is_reset_once_and_then_done_without() -> None:
+    dog = Watchdog(0)
+    assert run(dog, 0, 5000, "cam0", "imu") == []
+    assert run(dog, 5000, 6100, "cam0") == [Action.RESET]
+    assert dog.health is Health.AWAY
+    dog.connected(8000 * MS)
+    assert run(dog, 8000, 20_000, "cam0") == [Action.VISION_ONLY]
+    assert dog.health is Health.VISION_ONLY
+    assert run(dog, 20_000, 22_000, "cam0", "imu") == [Action.HEARD_AGAIN]
+    assert dog.health is Health.OK
+    assert run(dog, 22_000, 24_000, "cam0") == [Action.VISION_ONLY]
+    assert dog.resets == 1
+
+
+def test_a_lost_camera_is_looked_for_once_a_second_until_it_is_there() -> None:
+    dog = Watchdog(0)
+    run(dog, 0, 5000, "cam0", "imu")
+    assert run(dog, 5000, 10_000) == [Action.RECONNECT] * 4
+    dog.connected(10_000 * MS)
+    assert run(dog, 10_000, 20_000, "cam0", "imu") == []
+    assert dog.resets == 0
+
+
+def test_without_images_a_silent_imu_is_a_lost_camera_after_its_reset() -> None:
+    dog = Watchdog(0, has_images=False)
+    assert run(dog, 0, 5000) == [Action.RESET]
+    dog.connected(5000 * MS)
+    assert run(dog, 5000, 9500) == [Action.RECONNECT]

@@ -1,0 +1,137 @@
+"""The camera's adapter on the real SDK, with a device that is made of software."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from share.core.intake import Sample
+from share.errors import UsageError
+from share.io.profile import profile
+from share.io.realsense.camera import RealSense
+from share.io.realsense.devices import Attached, choose
+from share.io.realsense.streams import Wanted
+from tests.software_camera import BASELINE, T_GYRO_IR, SoftwareCamera
+
+rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
+
+D435I = profile("d435i")
+FACTS = D435I.device
+
+
+def attached(serial: str = "1", firmware: str = "5.16.0.1", usb: str = "3.2") -> Attached:
+    return Attached(serial, "Intel RealSense D435I", firmware, usb, None)
+
+
+@pytest.fixture
+def camera() -> SoftwareCamera:
+    return SoftwareCamera(rs)
+
+
+def read(
+    camera: SoftwareCamera, count: int, feed: Callable[[], None], wanted: Wanted | None = None
+) -> list[Sample]:
+    """The samples that come out when `feed` puts them in; waits for `count`, at most 5 s."""
+    got: list[Sample] = []
+    with RealSense(wanted or Wanted(D435I), context=camera.context) as device:
+        device.start(got.append)
+        feed()
+        until = time.monotonic() + 5
+        while len(got) < count and time.monotonic() < until:
+            time.sleep(0.01)
+        time.sleep(0.05)
+    return got
+
+
+def test_pictures_and_motion_come_out_as_they_went_in(camera: SoftwareCamera) -> None:
+    left, right = (np.random.default_rng(k).integers(0, 255, (480, 640), np.uint8) for k in (0, 1))
+
+    def feed() -> None:
+        camera.image(0, 4_294_967_295, left)
+        camera.image(1, 4_294_967_295, right)
+        camera.turn(12_345, 0.25, -0.5, 1.0)
+        camera.force(23_456, 0.5, 9.75, -1.0)
+
+    got = {sample.stream: sample for sample in read(camera, 4, feed)}
+    assert np.array_equal(got["cam0"].payload.load(), left)
+    assert np.array_equal(got["cam1"].payload.load(), right)
+    assert got["cam0"].stamp_ns == 4_294_967_295_000
+    assert (got["gyro"].stamp_ns, got["gyro"].payload) == (12_345_000, [0.25, -0.5, 1.0])
+    assert (got["accel"].stamp_ns, got["accel"].payload) == (23_456_000, [0.5, 9.75, -1.0])
+    assert all(sample.hardware for sample in got.values())
+
+
+def test_a_thousand_samples_of_the_imu_are_all_there(camera: SoftwareCamera) -> None:
+    def feed() -> None:
+        for k in range(1000):
+            camera.turn(2500 * k, k, 0, 0)
+
+    assert [s.payload[0] for s in read(camera, 1000, feed)] == [float(k) for k in range(1000)]
+
+
+def test_a_stamp_of_the_hosts_clock_is_told_apart(camera: SoftwareCamera) -> None:
+    picture = np.zeros((480, 640), np.uint8)
+    got = read(camera, 1, lambda: camera.image(0, 1000, picture, rs.timestamp_domain.system_time))
+    assert [sample.hardware for sample in got] == [False]
+
+
+def test_the_factory_calibration_becomes_a_rig_with_the_body_in_the_imu(camera: SoftwareCamera) -> None:
+    rig = RealSense(Wanted(D435I), context=camera.context).rig
+    assert (rig.cam0.fx, rig.cam0.fy, rig.cam0.cx, rig.cam0.cy) == (385.0, 386.0, 320.5, 239.5)
+    assert rig.T_cam1_cam0 is not None
+    assert rig.baseline == pytest.approx(BASELINE)
+    np.testing.assert_allclose(rig.T_cam1_cam0[:3, 3], (-BASELINE, 0, 0), atol=1e-7)
+    np.testing.assert_allclose(rig.T_body_cam0[:3, 3], T_GYRO_IR, atol=1e-7)
+    assert rig.imu == D435I.rig().imu
+
+
+def test_a_rotation_of_the_sdk_is_read_column_by_column() -> None:
+    from share.io.realsense.factory import transform
+
+    class Told:
+        rotation, translation = (0, 1, 0, -1, 0, 0, 0, 0, 1), (1, 2, 3)  # rs2_extrinsics: column-major
+
+        def get_extrinsics_to(self, other: object) -> Any:
+            return self
+
+    T = transform(Told(), None)
+    np.testing.assert_allclose(T @ [1, 0, 0, 1], [1, 3, 3, 1], atol=1e-12)
+
+
+def test_a_mode_that_the_camera_lacks_is_named(camera: SoftwareCamera) -> None:
+    with pytest.raises(UsageError, match=r"cam0 \(848x480@30\), cam1 \(848x480@30\); choose another mode"):
+        RealSense(Wanted(profile("d435i", "848x480@30")), context=camera.context)
+    with pytest.raises(UsageError, match=r"does not offer depth"):
+        RealSense(Wanted(D435I, depth=True), context=camera.context)
+
+
+def test_without_a_camera_one_line_says_so() -> None:
+    with pytest.raises(UsageError, match="no RealSense camera is attached"):
+        RealSense(Wanted(D435I), context=rs.context())
+
+
+def test_a_serial_number_that_is_not_there_lists_those_that_are(camera: SoftwareCamera) -> None:
+    with pytest.raises(UsageError, match=r"serial number 99 is attached; there is 0123 \(Intel"):
+        RealSense(Wanted(D435I), "99", camera.context)
+
+
+@pytest.mark.parametrize(
+    ("devices", "says"),
+    [
+        ([attached("1"), attached("2")], "several RealSense cameras"),
+        ([attached(usb="2.1")], "USB 2.1, too slow"),
+        ([attached(firmware="5.9.14.0")], "firmware 5.9.14.0 is older than 5.12.0.0; update"),
+    ],
+)
+def test_a_camera_that_cannot_be_used_is_refused(devices: list[Attached], says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        choose(devices, None, FACTS)
+
+
+def test_firmware_is_compared_by_number_and_not_by_letter() -> None:
+    assert choose([attached(firmware="5.12.10.0")], None, replace(FACTS, firmware_oldest="5.12.9.0"))

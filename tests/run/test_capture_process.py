@@ -1,0 +1,72 @@
+"""`share capture` as a process on a camera of software: ended by a person, by time, by a power cut."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from share.io.mcap.recover import recover
+from share.io.source import open_source
+
+pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@contextmanager
+def capturing(out: Path, *more: str) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-m", "tests.run.capture_child", str(out), *more]
+    child = subprocess.Popen(command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        yield child
+    finally:
+        child.kill()
+        child.communicate()
+
+
+def grown(part: Path, size: int) -> None:
+    """Waits until the file has `size` bytes."""
+    end = time.monotonic() + 20
+    while not part.exists() or part.stat().st_size < size:
+        assert time.monotonic() < end, "nothing is recorded"
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_person_ends_it_and_the_file_is_whole(tmp_path: Path, number: int) -> None:
+    out = tmp_path / "a.mcap"
+    with capturing(out, "--json") as child:
+        grown(tmp_path / "a.mcap.part", 10_000_000)
+        child.send_signal(number)
+        told, complaints = child.communicate(timeout=20)
+    assert (child.returncode, complaints) == (0, "")
+    report = json.loads(told)
+    assert report["ended"] == "stopped"
+    assert len(open_source(str(out)).stamps()["cam0"]) == report["streams"]["cam0"]["samples"] > 10
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_what_a_power_cut_leaves_is_mended(tmp_path: Path) -> None:
+    with capturing(tmp_path / "a.mcap"):
+        grown(tmp_path / "a.mcap.part", 20_000_000)
+    recover(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
+    stamps = open_source(str(tmp_path / "b.mcap")).stamps()
+    assert len(stamps["cam0"]) > 25
+    np.testing.assert_array_equal(np.diff(stamps["cam0"]), np.full(len(stamps["cam0"]) - 1, 33_333_000))
+
+
+def test_it_ends_when_the_time_is_over_and_prints_a_table(tmp_path: Path) -> None:
+    with capturing(tmp_path / "a.mcap", "--seconds", "1") as child:
+        told, complaints = child.communicate(timeout=30)
+    assert complaints == ""
+    assert told.splitlines()[0].split()[:3] == ["stream", "samples", "seconds"]
+    assert told.splitlines()[-1] == f"{tmp_path / 'a.mcap'} (time is over)"
