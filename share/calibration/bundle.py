@@ -72,7 +72,9 @@ def calibrate(views: Sequence[View], target: Target, size: tuple[int, int]) -> S
         raise ValueError("no view of the target")
     if eyes == 1:
         return _solve(views, target, alone[0][0])
-    return _solve(views, target, _together([state for state, _ in alone], [at for _, at in alone], len(views)))
+    return _solve(
+        views, target, _together([state for state, _ in alone], [at for _, at in alone], len(views))
+    )
 
 
 def errors(state: State, views: Sequence[View], target: Target) -> tuple[tuple[F64, ...], ...]:
@@ -89,9 +91,7 @@ def refit(state: State, views: Sequence[View], target: Target) -> State:
     return _solve(views, target, replace(state, T_cam0_target=poses), cameras_fixed=True).state
 
 
-def _alone(
-    views: Sequence[View], target: Target, size: tuple[int, int], eye: int
-) -> tuple[State, list[int]]:
+def _alone(views: Sequence[View], target: Target, size: tuple[int, int], eye: int) -> tuple[State, list[int]]:
     """One camera by itself, and which views it has."""
     at = [k for k, view in enumerate(views) if len(view.seen[eye]) >= start.LEAST_CORNERS]
     if len(at) < LEAST_VIEWS:

@@ -2,8 +2,8 @@
 
 Each view of a flat target gives a homography H = K [r1 r2 t]; that r1 and r2 are orthonormal makes two
 equations linear in 1/fx^2 and 1/fy^2 when the principal point is taken at the image's middle (Zhang, A
-flexible new technique for camera calibration, PAMI 2000; the fixed middle as in Bouguet's toolbox). OpenCV only
-fits the homographies: normalised least squares, which there is no reason to write again.
+flexible new technique for camera calibration, PAMI 2000; the fixed middle as in Bouguet's toolbox). OpenCV
+only fits the homographies: normalised least squares, which there is no reason to write again.
 """
 
 from __future__ import annotations
