@@ -7,7 +7,6 @@ from share.calibration.bundle import View, calibrate
 from share.calibration.coverage import choose, coverage
 from share.calibration.detect import Detection
 from share.calibration.projection import camera_of, intrinsics, moved, project
-from share.calibration.verdict import judge
 from share.geometry import se3
 from share.geometry.camera import Camera
 from share.geometry.target import AprilGrid
@@ -97,7 +96,7 @@ def test_corners_that_were_found_wrongly_do_little_harm(rng: np.random.Generator
     assert solution.state.cameras[1].cx == pytest.approx(RIGHT.cx, abs=0.5)
 
 
-def test_a_board_that_never_leans_is_refused_or_not_believed(rng: np.random.Generator) -> None:
+def test_a_board_that_never_leans_is_refused(rng: np.random.Generator) -> None:
     facing = se3.exp(np.array([np.pi, 0, 0, 0, 0, 0]))
     views = []
     for k in range(15):
@@ -105,13 +104,8 @@ def test_a_board_that_never_leans_is_refused_or_not_believed(rng: np.random.Gene
         T[:3, 3] = (-0.35, 0.3, 0.9 + 0.001 * k)
         px = LEFT.project(se3.transform(T, GRID.corners)) + rng.normal(0, 0.1, (144, 2))
         views.append(View(str(k), (Detection(np.arange(144), px),)))
-    try:
-        solution = calibrate(views, GRID, SIZE)
-    except ValueError as error:
-        assert "tilt" in str(error)
-        return
-    cover = coverage([v.seen[0].px for v in views], solution.state.T_cam0_target, GRID, SIZE)
-    assert not judge(solution, [cover]).passed
+    with pytest.raises(ValueError, match="tilt the board"):
+        calibrate(views, GRID, SIZE)
 
 
 def test_too_few_views_are_refused(rng: np.random.Generator) -> None:
