@@ -8,7 +8,7 @@ from share.geometry.target import AprilGrid, CharucoBoard, Target
 from share.types import F64, U8
 from share.vision.target_picture import darkness, ink
 
-_TEXEL = 0.001  # m
+_TEXEL = 0.002  # m: tags of 44 px
 _MARGIN = 0.04
 
 
