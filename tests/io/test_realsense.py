@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from software_camera import BASELINE, T_GYRO_IR, SoftwareCamera
 
 from share.core.intake import Sample
 from share.errors import UsageError
@@ -16,7 +17,6 @@ from share.io.profile import profile
 from share.io.realsense.camera import RealSense
 from share.io.realsense.devices import Attached, choose
 from share.io.realsense.streams import Wanted
-from tests.software_camera import BASELINE, T_GYRO_IR, SoftwareCamera
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 

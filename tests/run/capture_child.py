@@ -8,10 +8,10 @@ import time
 
 import numpy as np
 import pyrealsense2 as rs
+from software_camera import SoftwareCamera
 
 from share.cli import main as command_line
 from share.io.realsense import camera as adapter
-from tests.software_camera import SoftwareCamera
 
 
 def feed(camera: SoftwareCamera) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from software_camera import SoftwareCamera
 
 from share.config import SequencerConfig
 from share.core.intake import Sample
@@ -22,7 +23,6 @@ from share.io.realsense.streams import Wanted
 from share.io.source import open_source
 from share.run.capture import Capture
 from share.run.handover import Handover
-from tests.software_camera import SoftwareCamera
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 

@@ -1,0 +1,241 @@
+"""Calibration of one or two cameras from views of a flat target, by bundle adjustment.
+
+Found together: fx fy cx cy k1 k2 p1 p2 of each camera, T_cam1_cam0 and a pose of the target in each view.
+Levenberg-Marquardt on the corners' reprojection errors; the poses, each of which meets only its own view, are
+eliminated by the Schur complement (Triggs et al., Bundle adjustment: a modern synthesis, 2000, section 6.1).
+Huber's weights hold back corners that were found wrongly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from share.calibration import start
+from share.calibration.detect import Detection
+from share.calibration.projection import INTRINSICS, camera_of, intrinsics, moved, project
+from share.geometry import se3
+from share.geometry.camera import Camera
+from share.geometry.target import Target
+from share.types import F64
+
+LEAST_VIEWS = 4
+_ROUNDS = 60
+_HUBER = 2.5  # times the residuals' own spread
+_LEAST_SPREAD = 0.01  # px: below this corners are not found, whatever the residuals say
+_STILL = 1e-9  # relative fall of the cost at which it has arrived
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One look at the target: corners of each camera, in the order of the cameras; none is an empty one."""
+
+    name: str
+    seen: tuple[Detection, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What is sought. T_cam0_target: (V, 4, 4)."""
+
+    cameras: tuple[Camera, ...]
+    T_cam1_cam0: F64
+    T_cam0_target: F64
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """`state`, with the covariance (S, S) of 8 intrinsics a camera and, of two, xi of T_cam1_cam0 Exp(xi); of
+    each view and camera the residuals (N, 2) px, seen less predicted; sigma_px: noise of a coordinate."""
+
+    state: State
+    covariance: F64
+    residuals: tuple[tuple[F64, ...], ...]
+    sigma_px: float
+
+    @property
+    def sigmas(self) -> F64:
+        """(S,): one sigma, as far as residuals are independent."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def calibrate(views: Sequence[View], target: Target, size: tuple[int, int]) -> Solution:
+    """From views in which each camera sees `LEAST_CORNERS` or nothing. size: (width, height) of an image.
+
+    Raises ValueError where the views are too few, or do not tell what is sought.
+    """
+    eyes = len(views[0].seen) if views else 0
+    alone = [_alone(views, target, size, eye) for eye in range(eyes)]
+    if eyes == 0:
+        raise ValueError("no view of the target")
+    if eyes == 1:
+        return _solve(views, target, alone[0][0])
+    return _solve(
+        views, target, _together([state for state, _ in alone], [at for _, at in alone], len(views))
+    )
+
+
+def errors(state: State, views: Sequence[View], target: Target) -> tuple[tuple[F64, ...], ...]:
+    """Of each view and camera the residuals (N, 2) px, seen less predicted."""
+    return tuple(
+        tuple(_linear(state, view, k, eye, target)[0] for eye in range(len(state.cameras)))
+        for k, view in enumerate(views)
+    )
+
+
+def refit(state: State, views: Sequence[View], target: Target) -> State:
+    """Poses of other views by cameras that are known: intrinsics and T_cam1_cam0 stay."""
+    poses = np.stack([_first_pose(state, view, target) for view in views])
+    return _solve(views, target, replace(state, T_cam0_target=poses), cameras_fixed=True).state
+
+
+def _alone(views: Sequence[View], target: Target, size: tuple[int, int], eye: int) -> tuple[State, list[int]]:
+    """One camera by itself, and which views it has."""
+    at = [k for k, view in enumerate(views) if len(view.seen[eye]) >= start.LEAST_CORNERS]
+    if len(at) < LEAST_VIEWS:
+        raise ValueError(f"cam{eye}: {len(at)} views of the target; {LEAST_VIEWS} are needed at least")
+    mine = [View(views[k].name, (views[k].seen[eye],)) for k in at]
+    boards = [target.corners[view.seen[0].ids, :2] for view in mine]
+    camera = start.first_camera(boards, [view.seen[0].px for view in mine], size)
+    poses = [start.pose(camera, xy, view.seen[0].px) for xy, view in zip(boards, mine, strict=True)]
+    return _solve(mine, target, State((camera,), np.eye(4), np.stack(poses))).state, at
+
+
+def _together(alone: list[State], at: list[list[int]], count: int) -> State:
+    """Both cameras, where each begins where it ended alone."""
+    first, second = (dict(zip(k, s.T_cam0_target, strict=True)) for s, k in zip(alone, at, strict=True))
+    both = sorted(first.keys() & second.keys())
+    if len(both) < LEAST_VIEWS:
+        raise ValueError(f"both cameras see the target in {len(both)} views; {LEAST_VIEWS} are needed")
+    pairs = np.stack([second[k] @ se3.inverse(first[k]) for k in both])
+    middle = pairs[np.argmin([np.linalg.norm(se3.log(se3.inverse(T) @ pairs), axis=1).sum() for T in pairs])]
+    poses = [first[k] if k in first else se3.inverse(middle) @ second[k] for k in range(count)]
+    return State((alone[0].cameras[0], alone[1].cameras[0]), middle, np.stack(poses))
+
+
+def _first_pose(state: State, view: View, target: Target) -> F64:
+    eye = int(np.argmax([len(seen) for seen in view.seen]))
+    seen = view.seen[eye]
+    T = start.pose(state.cameras[eye], target.corners[seen.ids, :2], seen.px)
+    return T if eye == 0 else se3.inverse(state.T_cam1_cam0) @ T
+
+
+def _linear(state: State, view: View, k: int, eye: int, target: Target) -> tuple[F64, F64, F64, F64]:
+    """Residuals (N, 2) and the derivatives of what is predicted, by intrinsics (N, 2, 8), by xi of
+    T_cam1_cam0 and by xi of T_cam0_target (N, 2, 6)."""
+    seen = view.seen[eye]
+    points, by_pose = moved(state.T_cam0_target[k], target.corners[seen.ids])
+    by_mount = np.zeros((len(seen), 3, 6))
+    if eye == 1:
+        points, by_mount = moved(state.T_cam1_cam0, points)
+        by_pose = state.T_cam1_cam0[:3, :3] @ by_pose
+    px, by_intrinsics, by_points = project(state.cameras[eye], points)
+    return seen.px - px, by_intrinsics, by_points @ by_mount, by_points @ by_pose
+
+
+def _block(state: State, view: View, k: int, target: Target) -> tuple[F64, F64]:
+    """Residuals (M, 2) of one view and derivatives (M, 2, S + 6): shared parameters, then its pose."""
+    eyes = len(state.cameras)
+    shared = _shared(eyes)
+    rs, Js = [], []
+    for eye in range(eyes):
+        r, by_intrinsics, by_mount, by_pose = _linear(state, view, k, eye, target)
+        J = np.zeros((len(r), 2, shared + 6))
+        J[:, :, INTRINSICS * eye : INTRINSICS * (eye + 1)] = by_intrinsics
+        J[:, :, shared:] = by_pose
+        if eyes == 2:
+            J[:, :, shared - 6 : shared] = by_mount
+        rs.append(r)
+        Js.append(J)
+    return np.concatenate(rs), np.concatenate(Js)
+
+
+def _shared(eyes: int) -> int:
+    return INTRINSICS * eyes + 6 * (eyes - 1)
+
+
+def _solve(views: Sequence[View], target: Target, state: State, cameras_fixed: bool = False) -> Solution:
+    """Levenberg-Marquardt; the spread that Huber's weights go by is fixed in each of three runs."""
+    for _ in range(3):
+        blocks = [_block(state, view, k, target) for k, view in enumerate(views)]
+        spread = _spread(np.concatenate([r for r, _ in blocks]))
+        state = _descend(views, target, state, _HUBER * spread, cameras_fixed)
+    return _solution(views, target, state, _HUBER * spread)
+
+
+def _spread(residuals: F64) -> float:
+    """Of one coordinate, px, by the median distance: 1.1774 sigma of two normal ones."""
+    return max(float(np.median(np.linalg.norm(residuals, axis=1))) / 1.1774, _LEAST_SPREAD)
+
+
+def _descend(views: Sequence[View], target: Target, state: State, limit: float, fixed: bool) -> State:
+    damping, blocks = 1e-4, [_block(state, view, k, target) for k, view in enumerate(views)]
+    cost = _cost(blocks, limit)
+    for _ in range(_ROUNDS):
+        trial = _moved(state, *_step(blocks, limit, damping, fixed))
+        after = [_block(trial, v, k, target) for k, v in enumerate(views)] if trial else blocks
+        fallen = cost - _cost(after, limit) if trial else -1.0
+        if trial is None or not fallen > 0:
+            damping *= 8
+            if damping > 1e8:
+                break
+            continue
+        state, blocks, cost, damping = trial, after, cost - fallen, damping / 5
+        if fallen < _STILL * cost:
+            break
+    return state
+
+
+def _cost(blocks: list[tuple[F64, F64]], limit: float) -> float:
+    d = np.linalg.norm(np.concatenate([r for r, _ in blocks]), axis=1)
+    if np.isnan(d).any():  # a corner behind the camera
+        return np.inf
+    return float(np.where(d <= limit, d * d / 2, limit * (d - limit / 2)).sum())
+
+
+def _normal(block: tuple[F64, F64], limit: float) -> tuple[F64, F64]:
+    """H (S + 6, S + 6) and g (S + 6,) of one view, weighted by Huber."""
+    r, J = block
+    root = np.sqrt(np.minimum(1, limit / np.maximum(np.linalg.norm(r, axis=1), 1e-12)))[:, None]
+    A, b = (J * root[..., None]).reshape(-1, J.shape[2]), (r * root).reshape(-1)
+    return A.T @ A, A.T @ b
+
+
+def _step(blocks: list[tuple[F64, F64]], limit: float, damping: float, fixed: bool) -> tuple[F64, F64]:
+    """Of the shared parameters (S,) and of the poses (V, 6)."""
+    H, g = (np.stack(parts) for parts in zip(*(_normal(b, limit) for b in blocks), strict=True))
+    S = H.shape[1] - 6
+    Hss, gs = H[:, :S, :S].sum(axis=0), g[:, :S].sum(axis=0)
+    Hss = Hss + damping * np.diag(np.diag(Hss))
+    Hpp = H[:, S:, S:] + damping * H[:, S:, S:] * np.eye(6)
+    back = np.linalg.solve(Hpp, np.concatenate([H[:, S:, :S], g[:, S:, None]], axis=2))
+    if fixed:
+        return np.zeros(S), back[..., -1]
+    Y = np.einsum("vsp,vpk->sk", H[:, :S, S:], back)
+    shared = np.linalg.solve(Hss - Y[:, :S], gs - Y[:, S])
+    return shared, back[..., -1] - back[..., :S] @ shared
+
+
+def _moved(state: State, shared: F64, poses: F64) -> State | None:
+    """None where a step leads to no camera."""
+    try:
+        cameras = tuple(
+            camera_of(intrinsics(c) + shared[INTRINSICS * k : INTRINSICS * (k + 1)], (c.width, c.height))
+            for k, c in enumerate(state.cameras)
+        )
+    except ValueError:
+        return None
+    mount = state.T_cam1_cam0 @ se3.exp(shared[-6:]) if len(cameras) == 2 else state.T_cam1_cam0
+    return State(cameras, mount, state.T_cam0_target @ se3.exp(poses))
+
+
+def _solution(views: Sequence[View], target: Target, state: State, limit: float) -> Solution:
+    blocks = [_block(state, view, k, target) for k, view in enumerate(views)]
+    H = np.stack([_normal(block, limit)[0] for block in blocks])
+    S = _shared(len(state.cameras))
+    inner = H[:, :S, S:] @ np.linalg.solve(H[:, S:, S:], H[:, S:, :S])
+    spread = _spread(np.concatenate([r for r, _ in blocks]))
+    covariance = spread**2 * np.linalg.inv(H[:, :S, :S].sum(axis=0) - inner.sum(axis=0))
+    return Solution(state, covariance, errors(state, views, target), spread)

@@ -1,0 +1,143 @@
+"""Corners of a calibration target in an image, by their ids.
+
+OpenCV finds and reads the markers; which corner is which, and how an AprilGrid's are refined, is written down
+in docs/calibration-boards.md. Partial views are well: every corner that is seen counts on its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from share.geometry.target import AprilGrid, CharucoBoard, Target
+from share.types import F64, I64, U8
+
+_OURS = [1, 0, 3, 2]  # OpenCV's corners of a tag in the order of ours
+_WINDOW = 0.4  # of the gap: half the window in which a corner is refined; more of it sees the next corner
+_TO_TELL = 6  # tags; four make a homography, and one of them may be wrong
+_NEIGHBOURS, _LEAST_NEIGHBOURS = 12, 6
+_LEAST_PX = 2  # half a window below this refines nothing
+_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """ids (N,): rows of `target.corners`, rising, each once; px (N, 2): where they are, of centres at
+    integers."""
+
+    ids: I64
+    px: F64
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+def detector(target: Target) -> Callable[[U8], Detection]:
+    """What finds this target's corners in a gray image (H, W); none found is an empty Detection."""
+    return _april(target) if isinstance(target, AprilGrid) else _charuco(target)
+
+
+def _april(grid: AprilGrid) -> Callable[[U8], Detection]:
+    options = cv2.aruco.DetectorParameters()
+    options.markerBorderBits = 2
+    options.errorCorrectionRate = 1.0  # 5 bits: any two tags of the family differ in 11
+    options.perspectiveRemovePixelPerCell = 8  # these three find a sixth more of the tags on EuRoC's boards
+    options.perspectiveRemoveIgnoredMarginPerCell = 0.3
+    options.minMarkerDistanceRate = 0.01
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    reader = cv2.aruco.ArucoDetector(family, options)
+
+    def find(image: U8) -> Detection:
+        quads, tags, _ = reader.detectMarkers(image)
+        if tags is None or len(tags) == 0:
+            return _nothing()
+        found = np.asarray(tags).reshape(-1)
+        px = np.asarray(quads, np.float32).reshape(-1, 4, 2)[:, _OURS]
+        names, counts = np.unique(found, return_counts=True)
+        keep = np.isin(found, names[(counts == 1) & (names < grid.rows * grid.cols)])
+        found, px = found[keep], px[keep]
+        there = _in_place(grid.tags[found], px)
+        return _corners(image, grid, 4 * found[there, None] + np.arange(4), px[there])
+
+    return find
+
+
+def _in_place(tags: F64, px: np.ndarray) -> np.ndarray:
+    """Which tags (N, 2) m, seen with corners (N, 4, 2) px, lie where the others say: within half a tag of a
+    homography. Lenses bend by less; a tag read wrongly lies elsewhere. Too few to tell by are believed."""
+    if len(tags) < _TO_TELL:
+        return np.ones(len(tags), bool)
+    half = np.median(np.linalg.norm(px - np.roll(px, 1, axis=1), axis=2)) / 2
+    _, fits = cv2.findHomography(tags, px.mean(axis=1).astype(float), cv2.RANSAC, float(half))
+    return np.ones(len(tags), bool) if fits is None else np.asarray(fits).reshape(-1) > 0
+
+
+def _corners(image: U8, grid: AprilGrid, ids: I64, px: np.ndarray) -> Detection:
+    """Tags (N, 4) of corners (N, 4, 2), where their edges meet.
+
+    A quad often reaches into the black square at its corner, by more than a window. So each corner is looked
+    for a second time, from where its neighbours say it is.
+    """
+    shortest = np.linalg.norm(px - np.roll(px, 1, axis=1), axis=2).min(axis=1, initial=np.inf)
+    halves = np.repeat(np.round(_WINDOW * grid.tag_spacing * shortest).astype(int), 4)
+    names = ids.reshape(-1)
+    first = _refined(image, px.reshape(-1, 2), halves)
+    second = _refined(image, _by_neighbours(grid.corners[names, :2], first), halves)
+    seen = np.isfinite(second).all(axis=1)
+    return _detection(names[seen], second[seen])
+
+
+def _by_neighbours(board: F64, px: F64) -> F64:
+    """Where each corner (N, 2) m is by a homography of the nearest others that were found; NaN if too few."""
+    known = np.flatnonzero(np.isfinite(px).all(axis=1))
+    out = np.full(px.shape, np.nan)
+    for k, corner in enumerate(board):
+        others = known[known != k]
+        near = others[np.argsort(((board[others] - corner) ** 2).sum(axis=1), kind="stable")[:_NEIGHBOURS]]
+        if len(near) >= _LEAST_NEIGHBOURS:
+            H, _ = cv2.findHomography(board[near], px[near], cv2.LMEDS)
+            if H is not None:
+                out[k] = cv2.perspectiveTransform(corner[None, None], H)[0, 0]
+    return out
+
+
+def _refined(image: U8, px: np.ndarray, halves: I64) -> F64:
+    """Corners (N, 2) moved to the saddle in a window of 2 half + 1; NaN where it leaves its window or the
+    image, or is too small."""
+    room = np.array(image.shape[::-1]) - 1 - halves[:, None]
+    fit = ((px >= halves[:, None]) & (px <= room)).all(axis=1) & (halves >= _LEAST_PX)
+    out = np.full((len(px), 2), np.nan)
+    for half in np.unique(halves[fit]).tolist():
+        here = fit & (halves == half)
+        start = np.ascontiguousarray(px[here], np.float32)
+        moved = cv2.cornerSubPix(image, start.copy(), (half, half), (-1, -1), _STOP).reshape(-1, 2)
+        step = np.linalg.norm(moved - start, axis=1)
+        good = (step > 0) & (step < half)  # OpenCV gives the start itself where it would go too far
+        out[here] = np.where(good[:, None], moved, np.nan)
+    return out
+
+
+def _charuco(board: CharucoBoard) -> Callable[[U8], Detection]:
+    family = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    size = (board.squares_x, board.squares_y)
+    reader = cv2.aruco.CharucoDetector(cv2.aruco.CharucoBoard(size, board.square, board.marker, family))
+
+    def find(image: U8) -> Detection:
+        px, ids, _, _ = reader.detectBoard(image)
+        if ids is None or len(ids) == 0:
+            return _nothing()
+        return _detection(np.asarray(ids).reshape(-1), np.asarray(px).reshape(-1, 2))
+
+    return find
+
+
+def _detection(ids: np.ndarray, px: np.ndarray) -> Detection:
+    order = np.argsort(ids)
+    return Detection(np.asarray(ids, np.int64)[order], np.asarray(px, float)[order])
+
+
+def _nothing() -> Detection:
+    return Detection(np.empty(0, np.int64), np.empty((0, 2)))

@@ -1,0 +1,59 @@
+"""Where the calibration begins: Zhang's closed form on homographies, without distortion.
+
+Each view of a flat target gives a homography H = K [r1 r2 t]; that r1 and r2 are orthonormal makes two
+equations linear in 1/fx^2 and 1/fy^2 when the principal point is taken at the image's middle (Zhang, A
+flexible new technique for camera calibration, PAMI 2000; the fixed middle as in Bouguet's toolbox). OpenCV
+only fits the homographies: normalised least squares, which there is no reason to write again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from share.geometry import se3
+from share.geometry.camera import Camera
+from share.types import F64
+
+LEAST_CORNERS = 6
+
+
+def first_camera(boards: Sequence[F64], pixels: Sequence[F64], size: tuple[int, int]) -> Camera:
+    """A camera without distortion from views of corners (N, 2) m and (N, 2) px. Raises ValueError where the
+    views do not tell its focal lengths."""
+    middle = (np.array(size) - 1) / 2
+    rows = [_equations(homography(xy, px - middle)) for xy, px in zip(boards, pixels, strict=True)]
+    A, b = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    inverse_squares = np.linalg.lstsq(A, b, rcond=None)[0]
+    if not (np.isfinite(inverse_squares).all() and (inverse_squares > 0).all()):
+        raise ValueError("the views do not tell the focal length: tilt the board against the camera")
+    fx, fy = inverse_squares**-0.5
+    return Camera(*size, float(fx), float(fy), float(middle[0]), float(middle[1]), (0.0,) * 4)
+
+
+def pose(camera: Camera, board: F64, px: F64) -> F64:
+    """T_cam_target (4, 4) of one view, closed form: [r1 r2 t] of the homography of normalised corners."""
+    H = homography(board, camera.normalise(px))
+    H = H / np.linalg.norm(H[:, :2], axis=0).mean() * np.sign(H[2, 2])
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])])
+    T[:3, 3] = H[:, 2]
+    return se3.orthonormal(T)
+
+
+def homography(board: F64, image: F64) -> F64:
+    """(3, 3) from (N, 2) on the board to (N, 2) in the image, to scale, by least squares."""
+    H, _ = cv2.findHomography(np.ascontiguousarray(board), np.ascontiguousarray(image))
+    if H is None:
+        raise ValueError("the corners of a view lie on one line")
+    return np.asarray(H, float)
+
+
+def _equations(H: F64) -> tuple[F64, F64]:
+    """A (2, 2), b (2,) of A (1/fx^2, 1/fy^2) = b: r1 . r2 = 0 and |r1| = |r2|, of one length."""
+    H = H / np.linalg.norm(H[:, 0])
+    (a, b), (c, d), (e, f) = H[:, :2]
+    A = np.array([[a * b, c * d], [a * a - b * b, c * c - d * d]])
+    return A, -np.array([e * f, e * e - f * f])

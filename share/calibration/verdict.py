@@ -1,0 +1,102 @@
+"""Whether a calibration may be believed, and why not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.calibration.bundle import LEAST_VIEWS, Solution
+from share.calibration.coverage import Coverage
+from share.calibration.projection import INTRINSICS, intrinsics
+from share.types import F64
+
+_KEPT = 5.0  # sigmas beyond which a corner counts as found wrongly
+_WRONG_SHARE = 0.05
+_OUTLYING = 5.0  # times the spread of the views' RMS
+_MAD = 1.4826
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What passes. rms_px: of the corners that are kept; focal: sigma over focal length; covered: of the
+    image's cells; views: at least."""
+
+    rms_px: float = 0.5
+    focal: float = 1e-3
+    covered: float = 0.6
+    views: int = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """reasons: what fails, none where it passes; rms_px: of each camera, of the corners kept; wrong: how
+    many were not; view_rms (V, cameras) px, NaN where a camera saw nothing; outliers: rows of views."""
+
+    reasons: tuple[str, ...]
+    rms_px: tuple[float, ...]
+    wrong: tuple[int, ...]
+    view_rms: F64
+    outliers: tuple[int, ...]
+
+    @property
+    def passed(self) -> bool:
+        return not self.reasons
+
+
+def judge(solution: Solution, covers: Sequence[Coverage], limits: Limits = Limits()) -> Verdict:
+    """Of a solution and what each camera's views cover."""
+    eyes = range(len(solution.state.cameras))
+    view_rms = np.array([[_rms(view[eye]) for eye in eyes] for view in solution.residuals])
+    kept = [_kept(solution, eye) for eye in eyes]
+    rms = tuple(_rms(inside) for inside, _ in kept)
+    wrong = tuple(count for _, count in kept)
+    reasons = [reason for eye in eyes for reason in _reasons(solution, eye, rms[eye], wrong[eye], limits)]
+    for eye, cover in enumerate(covers):
+        if cover.share < limits.covered:
+            reasons.append(
+                f"cam{eye}: corners in {cover.share:.0%} of the image, {limits.covered:.0%} needed; "
+                + "; ".join(cover.missing)
+            )
+    return Verdict(tuple(reasons), rms, wrong, view_rms, _outliers(view_rms))
+
+
+def _reasons(solution: Solution, eye: int, rms: float, wrong: int, limits: Limits) -> list[str]:
+    views = sum(len(view[eye]) > 0 for view in solution.residuals)
+    corners = sum(len(view[eye]) for view in solution.residuals)
+    part = slice(INTRINSICS * eye, INTRINSICS * eye + 2)
+    loose = float((solution.sigmas[part] / intrinsics(solution.state.cameras[eye])[:2]).max())
+    out = []
+    if views < max(limits.views, LEAST_VIEWS):
+        out.append(f"cam{eye}: {views} views, {limits.views} needed")
+    if not rms <= limits.rms_px:
+        out.append(
+            f"cam{eye}: {rms:.2f} px RMS, at most {limits.rms_px:g}: blur, a bent board or a wrong --target"
+        )
+    if wrong > _WRONG_SHARE * corners:
+        out.append(f"cam{eye}: {wrong} of {corners} corners do not fit, at most {_WRONG_SHARE:.0%}")
+    if not loose <= limits.focal:
+        out.append(
+            f"cam{eye}: focal length known to {loose:.2%}, {limits.focal:.2%} needed: tilt the board more"
+        )
+    return out
+
+
+def _kept(solution: Solution, eye: int) -> tuple[F64, int]:
+    r = np.concatenate([view[eye] for view in solution.residuals])
+    inside = np.linalg.norm(r, axis=1) <= _KEPT * solution.sigma_px
+    return r[inside], int((~inside).sum())
+
+
+def _rms(residuals: F64) -> float:
+    """Of the distances, px."""
+    return float(np.sqrt((residuals**2).sum(axis=1).mean())) if len(residuals) else float("nan")
+
+
+def _outliers(view_rms: F64) -> tuple[int, ...]:
+    """Views whose RMS is beyond median + 5 MAD of a camera."""
+    middle = np.nanmedian(view_rms, axis=0)
+    spread = _MAD * np.nanmedian(np.abs(view_rms - middle), axis=0)
+    far = (view_rms > middle + _OUTLYING * spread).any(axis=1)
+    return tuple(np.flatnonzero(far).tolist())

@@ -1,0 +1,149 @@
+"""`share calibrate camera`: intrinsics of one or two cameras, and how they sit to each other."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from share.cli import options
+from share.cli.progress import Stages
+from share.cli.table import aligned
+from share.errors import DataError, ShareError
+
+if TYPE_CHECKING:
+    from share.geometry.target import Target
+    from share.io.board_views import Pictures
+    from share.io.camera_report import Outcome
+
+
+@click.command(short_help="Intrinsics of one or two cameras from views of a board.")
+@click.argument("source")
+@click.option(
+    "--target", "target_name", required=True, metavar="T",
+    help="The board: aprilgrid or charuco of the usual sizes, or its YAML file.",
+)  # fmt: skip
+@click.option("--camera", type=click.Choice(["cam0", "both"]), default="both", show_default=True)
+@click.option(
+    "--every", type=click.IntRange(1), default=1, show_default=True, metavar="N",
+    help="Look at each N-th picture.",
+)  # fmt: skip
+@click.option(
+    "--views", "most", type=click.IntRange(4), default=60, show_default=True, metavar="N",
+    help="Use the N views that together tell most.",
+)  # fmt: skip
+@options.calib
+@click.option(
+    "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Where the files go."
+)
+@options.as_json
+def camera(
+    source: str,
+    target_name: str,
+    camera: str,
+    every: int,
+    most: int,
+    calib: str | None,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Find focal lengths, principal point and distortion of a camera or a stereo pair, and how the pair sits,
+    from a recording of a calibration board or a folder with cam0/*.png and cam1/*.png.
+
+    Exit code 1 where the result is not to be believed; the files are written all the same.
+
+    \b
+    Example:  share calibrate camera board.mcap --target aprilgrid --out calib/mine
+              share calibrate camera pictures --target board.yaml --camera cam0 --out calib/mine
+    """
+    from share.io import camera_report
+    from share.io.board_views import open_pictures
+    from share.io.files import atomic_write, writable_dir
+    from share.io.json_file import known
+
+    target = _target(target_name)
+    pictures = open_pictures(source, ("cam0", "cam1") if camera == "both" else ("cam0",), calib)
+    writable_dir(out)
+    outcome = _calibrated(source, pictures, target, every, most)
+    text = json.dumps(known(camera_report.to_json(outcome)), indent=1)
+    atomic_write(out / "kalibr_imucam_chain.yaml", camera_report.kalibr_text(outcome, source))
+    atomic_write(out / "camera-report.json", text + "\n")
+    atomic_write(out / "camera-report.png", camera_report.picture(outcome, source))
+    click.echo(text if as_json else _summary(outcome, out))
+    if not outcome.verdict.passed:
+        raise ShareError(
+            f"{source}: not to be believed ({out} is written): " + "; ".join(outcome.verdict.reasons)
+        )
+
+
+def _target(name: str) -> Target:
+    from share.geometry.target import AprilGrid, CharucoBoard
+    from share.io.target import read_target
+
+    usual = {"aprilgrid": AprilGrid, "charuco": CharucoBoard}
+    return usual[name]() if name in usual else read_target(Path(name))
+
+
+def _calibrated(source: str, pictures: Pictures, target: Target, every: int, most: int) -> Outcome:
+    from share.calibration.bundle import calibrate
+    from share.calibration.coverage import choose, coverage
+    from share.calibration.start import LEAST_CORNERS
+    from share.calibration.verdict import judge
+    from share.io.board_views import find_views
+    from share.io.camera_report import Outcome
+
+    with Stages() as stages:
+        done = 0
+
+        def told(more: int) -> None:
+            nonlocal done
+            done += more
+            stages("looking for the board", done, pictures.count)
+
+        views, sizes = find_views(pictures, target, every, told)
+        if len(set(sizes)) > 1:
+            raise DataError(
+                f"{source}: pictures of {sizes[0]} and {sizes[1]}; calibrate one with --camera cam0"
+            )
+        seen = [view for view in views if any(len(one) >= LEAST_CORNERS for one in view.seen)]
+        if not seen:
+            raise DataError(
+                f"{source}: no board in {len(views)} pictures; is --target the board that was shown?"
+            )
+        used = [seen[k] for k in choose(seen, target, sizes[0], most)]
+        stages("calibrating", 0, 1)
+        try:
+            solution = calibrate(used, target, sizes[0])
+        except ValueError as error:
+            raise DataError(f"{source}: {error}") from None
+        stages("calibrating", 1, 1)
+    state = solution.state
+    covers = tuple(
+        coverage([view.seen[eye].px for view in used], T, target, sizes[0])
+        for eye, T in enumerate((state.T_cam0_target, state.T_cam1_cam0 @ state.T_cam0_target)[: len(sizes)])
+    )
+    return Outcome(used, solution, covers, judge(solution, covers), pictures.rig, len(seen))
+
+
+def _summary(outcome: Outcome, out: Path) -> str:
+    from share.io.camera_report import table
+
+    verdict = outcome.verdict
+    lines = [
+        f"{len(outcome.views)} views of {outcome.seen} that show the board",
+        "",
+        aligned(table(outcome)),
+        "",
+    ]
+    for eye, cover in enumerate(outcome.covers):
+        lines.append(
+            f"cam{eye}: {verdict.rms_px[eye]:.3f} px RMS, {verdict.wrong[eye]} corners left out, "
+            f"corners in {cover.share:.0%} of the image"
+        )
+        lines += [f"  {what}" for what in cover.missing]
+    if verdict.outliers:
+        names = ", ".join(outcome.views[k].name for k in verdict.outliers[:6])
+        lines.append(f"{len(verdict.outliers)} views fit worse than the rest: {names}")
+    return "\n".join([*lines, f"{out}: kalibr_imucam_chain.yaml, camera-report.json, camera-report.png"])

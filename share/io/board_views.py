@@ -1,0 +1,91 @@
+"""Pictures of a calibration target, from a recording or from a folder of images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from share.calibration.bundle import View
+from share.calibration.detect import detector
+from share.core.measurement import CAM0, CAM1
+from share.errors import DataError, UsageError
+from share.geometry.camera import Rig
+from share.geometry.target import Target
+from share.io.calibration import read_calibration
+from share.io.images import decode_gray
+from share.io.source import open_source
+from share.types import U8
+
+_PICTURES = (".png", ".jpg", ".jpeg")
+_TOGETHER_NS = 2_000_000  # stamps of two pictures taken at once
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """count: of cam0's; rig: the calibration so far, if the source has one; read: name and images of each."""
+
+    count: int
+    rig: Rig | None
+    read: Callable[[], Iterator[tuple[str, tuple[U8, ...]]]]
+
+
+def open_pictures(source: str, eyes: Sequence[str], calib: str | None = None) -> Pictures:
+    """A recording, or a folder with cam0/*.png and, for stereo, cam1/*.png of the same names (.jpg too).
+
+    eyes: which cameras. Raises UsageError, ConfigError or DataError.
+    """
+    folder = Path(source)
+    if any((folder / CAM0).glob("*")) and not (folder / CAM0 / "data.csv").exists():
+        return _folder(folder, eyes, read_calibration(Path(calib)).rig if calib else None)
+    opened = open_source(source, calib)
+    if CAM1 in eyes and opened.rig.cam1 is None:
+        raise UsageError(f"{source}: has no cam1; give --camera cam0")
+
+    def read() -> Iterator[tuple[str, tuple[U8, ...]]]:
+        waiting: dict[str, tuple[int, object]] = {}
+        for m in opened.measurements():
+            if m.stream not in eyes:
+                continue
+            waiting[m.stream] = (m.stamp_ns, m.payload)
+            stamps = [stamp for stamp, _ in waiting.values()]
+            if len(waiting) == len(eyes) and max(stamps) - min(stamps) <= _TOGETHER_NS:
+                pair = tuple(waiting.pop(eye)[1].load() for eye in eyes)  # type: ignore[attr-defined]
+                yield str(stamps[0]), pair
+
+    return Pictures(opened.images_count, opened.rig, read)
+
+
+def _folder(folder: Path, eyes: Sequence[str], rig: Rig | None) -> Pictures:
+    found = [
+        {p.stem: p for p in sorted((folder / eye).glob("*")) if p.suffix.lower() in _PICTURES} for eye in eyes
+    ]
+    names = [name for name in found[0] if all(name in others for others in found)]
+    if not names:
+        raise DataError(f"{folder}: has no pictures of the same name in {' and '.join(eyes)}")
+
+    def read() -> Iterator[tuple[str, tuple[U8, ...]]]:
+        for name in names:
+            yield name, tuple(decode_gray(one[name].read_bytes(), str(one[name])) for one in found)
+
+    return Pictures(len(names), rig, read)
+
+
+def find_views(
+    pictures: Pictures, target: Target, every: int, told: Callable[[int], None]
+) -> tuple[list[View], list[tuple[int, int]]]:
+    """Views of every `every`-th picture, also empty ones, and each camera's size. Raises DataError where
+    pictures of a camera differ in size."""
+    find = detector(target)
+    views: list[View] = []
+    sizes: list[tuple[int, int]] = []
+    for k, (name, images) in enumerate(pictures.read()):
+        told(1)
+        if k % every:
+            continue
+        here = [(image.shape[1], image.shape[0]) for image in images]
+        sizes = sizes or here
+        if here != sizes:
+            raise DataError(f"picture {name}: is {here}, the first was {sizes}; give pictures of one size")
+        views.append(View(name, tuple(find(image) for image in images)))
+    return views, sizes

@@ -1,0 +1,180 @@
+"""What `share calibrate camera` leaves behind: Kalibr's chain, a report, a picture."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import yaml
+
+from share.calibration.bundle import Solution, View
+from share.calibration.coverage import Coverage
+from share.calibration.projection import INTRINSICS, intrinsics
+from share.calibration.verdict import Verdict
+from share.geometry import se3
+from share.geometry.camera import Rig
+from share.io.kalibr import to_kalibr
+
+NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """All that is told of one calibration. before: the calibration that the source came with; seen: views
+    with the target among all pictures looked at."""
+
+    views: Sequence[View]
+    solution: Solution
+    covers: tuple[Coverage, ...]
+    verdict: Verdict
+    before: Rig | None
+    seen: int
+
+    @property
+    def rig(self) -> Rig:
+        """The new cameras; where the body's IMU sits on cam0 is kept from before."""
+        state = self.solution.state
+        two = len(state.cameras) == 2
+        rig = self.before or Rig(cam0=state.cameras[0], T_body_cam0=np.eye(4))
+        return replace(
+            rig,
+            cam0=state.cameras[0],
+            cam1=state.cameras[1] if two else None,
+            T_cam1_cam0=state.T_cam1_cam0 if two else None,
+        )
+
+
+def kalibr_text(outcome: Outcome, source: str) -> str:
+    """The camchain. The IMU's own noise is of another file, `share calibrate imu` writes it."""
+    chain = {key: value for key, value in to_kalibr(outcome.rig).items() if key != "imu0"}
+    verdict = "passed" if outcome.verdict.passed else "FAILED, see camera-report.json"
+    return f"# share calibrate camera {source}: {verdict}\n" + yaml.safe_dump(
+        chain, sort_keys=False, default_flow_style=None
+    )
+
+
+def to_json(outcome: Outcome) -> dict[str, Any]:
+    """Plain data: verdict, each camera, the mounting, each view."""
+    verdict = outcome.verdict
+    out: dict[str, Any] = {
+        "passed": verdict.passed,
+        "reasons": list(verdict.reasons),
+        "views": len(outcome.views),
+        "views_with_target": outcome.seen,
+        "corner_sigma_px": outcome.solution.sigma_px,
+        "cameras": [_camera(outcome, eye) for eye in range(len(outcome.covers))],
+        "outlier_views": [outcome.views[k].name for k in verdict.outliers],
+        "per_view": [
+            {"name": view.name, "rms_px": rms.tolist(), "corners": [len(seen) for seen in view.seen]}
+            for view, rms in zip(outcome.views, verdict.view_rms, strict=True)
+        ],
+    }
+    if len(outcome.covers) == 2:
+        state, sigmas = outcome.solution.state, outcome.solution.sigmas[-6:]
+        out["T_cam1_cam0"] = state.T_cam1_cam0.tolist()
+        out["baseline_m"] = float(np.linalg.norm(state.T_cam1_cam0[:3, 3]))
+        out["T_cam1_cam0_sigmas"] = {"rad": sigmas[:3].tolist(), "m": sigmas[3:].tolist()}
+    return out
+
+
+def _camera(outcome: Outcome, eye: int) -> dict[str, Any]:
+    cover, values = outcome.covers[eye], intrinsics(outcome.solution.state.cameras[eye])
+    sigmas = outcome.solution.sigmas[INTRINSICS * eye : INTRINSICS * (eye + 1)]
+    return {
+        "parameters": dict(zip(NAMES, values.tolist(), strict=True)),
+        "sigmas": dict(zip(NAMES, sigmas.tolist(), strict=True)),
+        "rms_px": outcome.verdict.rms_px[eye],
+        "corners_left_out": outcome.verdict.wrong[eye],
+        "covered": cover.share,
+        "missing": list(cover.missing),
+    }
+
+
+def table(outcome: Outcome) -> list[list[str]]:
+    """Rows for a terminal: each parameter with its sigma, beside what was before."""
+    state, before = outcome.solution.state, outcome.before
+    rows = [["", "", "found", "sigma", *(["before", "change"] if before else [])]]
+    olds = (before.cam0, before.cam1) if before else (None, None)
+    for eye, camera in enumerate(state.cameras):
+        old = olds[eye]
+        for k, (name, value) in enumerate(zip(NAMES, intrinsics(camera).tolist(), strict=True)):
+            sigma = outcome.solution.sigmas[INTRINSICS * eye + k]
+            digits = 3 if k < 4 else 5
+            row = [f"cam{eye}", name, f"{value:.{digits}f}", f"{sigma:.{digits}f}"]
+            if before:
+                was = float(intrinsics(old)[k]) if old else float("nan")
+                row += [f"{was:.{digits}f}", f"{value - was:+.{digits}f}"]
+            rows.append(row)
+    if len(state.cameras) == 2:
+        rows.append(_baseline(outcome))
+    return rows
+
+
+def _baseline(outcome: Outcome) -> list[str]:
+    T, before = outcome.solution.state.T_cam1_cam0, outcome.before
+    sigma = float(np.linalg.norm(outcome.solution.sigmas[-3:]))
+    row = ["both", "base mm", f"{1e3 * np.linalg.norm(T[:3, 3]):.3f}", f"{1e3 * sigma:.3f}"]
+    if before and before.T_cam1_cam0 is not None:
+        turn = np.degrees(se3.angle(se3.inverse(before.T_cam1_cam0) @ T))
+        way = 1e3 * float(np.linalg.norm(T[:3, 3] - before.T_cam1_cam0[:3, 3]))
+        row += [f"{1e3 * before.baseline:.3f}", f"{way:.3f} and {turn:.3f} deg"]
+    elif before:
+        row += ["", ""]
+    return row
+
+
+def picture(outcome: Outcome, title: str) -> bytes:
+    """PNG: of each camera where corners were seen and which way they miss (times 100), how the residuals
+    scatter, and the RMS of each view."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    eyes = len(outcome.covers)
+    figure, panels = pyplot.subplots(
+        eyes, 3, figsize=(14, 4 * eyes), layout="constrained", squeeze=False, width_ratios=(1.6, 1, 1.6)
+    )
+    for eye, (where, scatter, bars) in enumerate(panels):
+        _draw_where(where, outcome, eye)
+        _draw_scatter(scatter, outcome, eye)
+        _draw_views(bars, outcome, eye)
+    figure.suptitle(f"{title}: {'passed' if outcome.verdict.passed else 'FAILED'}")
+    out = io.BytesIO()
+    figure.savefig(out, dpi=75, format="png")
+    pyplot.close(figure)
+    return out.getvalue()
+
+
+def _draw_where(panel: Any, outcome: Outcome, eye: int) -> None:
+    camera, cover = outcome.solution.state.cameras[eye], outcome.covers[eye]
+    extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
+    panel.imshow(np.minimum(cover.cells, 40), cmap="YlGn", extent=extent, vmin=0, vmax=80, aspect="equal")
+    px = np.concatenate([view.seen[eye].px for view in outcome.views])
+    r = np.concatenate([one[eye] for one in outcome.solution.residuals])
+    kept = np.linalg.norm(r, axis=1) <= 5 * outcome.solution.sigma_px
+    panel.quiver(*px[kept].T, *r[kept].T, angles="xy", scale_units="xy", scale=0.01, width=0.0015)
+    panel.plot(*px[~kept].T, "x", color="#d1495b", markersize=4)
+    panel.set(title=f"cam{eye}: {cover.share:.0%} of the image; residuals × 100, × left out")
+
+
+def _draw_scatter(panel: Any, outcome: Outcome, eye: int) -> None:
+    r = np.concatenate([one[eye] for one in outcome.solution.residuals])
+    limit = 6 * outcome.solution.sigma_px
+    panel.plot(*r.T, ".", markersize=2, color="#00798c", alpha=0.4)
+    panel.set(
+        xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", xlabel="px",
+        title=f"{outcome.verdict.rms_px[eye]:.3f} px RMS, {outcome.verdict.wrong[eye]} left out",
+    )  # fmt: skip
+    panel.grid(alpha=0.3)
+
+
+def _draw_views(panel: Any, outcome: Outcome, eye: int) -> None:
+    rms = outcome.verdict.view_rms[:, eye]
+    colours = ["#d1495b" if k in outcome.verdict.outliers else "#00798c" for k in range(len(rms))]
+    panel.bar(np.arange(len(rms)), np.nan_to_num(rms), color=colours)
+    panel.set(title="each view's RMS, outliers red", xlabel="view", ylabel="px")
+    panel.set_ylim(0, 1.2 * float(np.nanpercentile(rms, 95)) + 0.05)

@@ -1,0 +1,133 @@
+"""Calibration of cameras: derivatives, recovery of what is known, and honest sigmas."""
+
+import numpy as np
+import pytest
+
+from share.calibration.bundle import View, calibrate
+from share.calibration.coverage import choose, coverage
+from share.calibration.detect import Detection
+from share.calibration.projection import camera_of, intrinsics, moved, project
+from share.geometry import se3
+from share.geometry.camera import Camera
+from share.geometry.target import AprilGrid
+from share.types import F64
+
+SIZE = (752, 480)
+LEFT = Camera(*SIZE, 458.6, 457.3, 367.2, 248.4, (-0.283, 0.074, 2e-4, 2e-5))
+RIGHT = Camera(*SIZE, 457.6, 456.1, 379.9, 255.2, (-0.284, 0.075, -1e-4, -4e-5))
+GRID = AprilGrid()
+
+
+def _mount() -> F64:
+    return se3.exp(np.array([0.002, 0.014, -0.001, -0.11, 0.0004, -0.0008]))
+
+
+def _poses(rng: np.random.Generator, count: int) -> F64:
+    """T_cam0_target of boards that face the camera, lean by up to 35 degrees and go all over the image."""
+    facing = se3.exp(np.array([np.pi, 0, 0, 0, 0, 0]))
+    lean = np.concatenate([rng.uniform(-0.6, 0.6, (count, 3)), np.zeros((count, 3))], axis=1)
+    middle = np.append(GRID.extent.mean(axis=0), 0)
+    T = facing @ se3.exp(lean)
+    depth = rng.uniform(0.6, 1.3, count)
+    at = np.column_stack(
+        [rng.uniform(-0.5, 0.5, count) * depth, rng.uniform(-0.3, 0.3, count) * depth, depth]
+    )
+    T[:, :3, 3] = at - T[:, :3, :3] @ middle
+    return T
+
+
+def _views(rng: np.random.Generator, noise_px: float, count: int = 25, wrong: float = 0.0) -> list[View]:
+    out = []
+    for k, T in enumerate(_poses(rng, count)):
+        seen = []
+        for camera, pose in ((LEFT, T), (RIGHT, _mount() @ T)):
+            px = camera.project(se3.transform(pose, GRID.corners))
+            ids = np.flatnonzero(camera.inside(px, 3.0))
+            noisy = px[ids] + rng.normal(0, noise_px, (len(ids), 2))
+            spoilt = rng.random(len(ids)) < wrong
+            noisy[spoilt] += rng.uniform(-8, 8, (int(spoilt.sum()), 2))
+            seen.append(Detection(ids, noisy))
+        out.append(View(str(k), tuple(seen)))
+    return out
+
+
+def test_the_derivatives_of_a_projection_are_those_by_differences(rng: np.random.Generator) -> None:
+    T = se3.exp(np.array([3.0, 0.1, 0.2, -0.2, 0.3, 0.9]))
+    points = GRID.corners[::7]
+    at, by_pose = moved(T, points)
+    _, by_intrinsics, by_points = project(LEFT, at)
+    h = 1e-6
+    for k in range(8):
+        step = np.eye(8)[k] * h
+        high, low = (camera_of(intrinsics(LEFT) + s * step, SIZE).project(at) for s in (1, -1))
+        np.testing.assert_allclose(by_intrinsics[:, :, k], (high - low) / (2 * h), rtol=1e-5, atol=1e-5)
+    for k in range(6):
+        xi = np.eye(6)[k] * h
+        high, low = (LEFT.project(se3.transform(T @ se3.exp(s * xi), points)) for s in (1, -1))
+        predicted = (by_points @ by_pose)[:, :, k]
+        np.testing.assert_allclose(predicted, (high - low) / (2 * h), rtol=1e-5, atol=1e-4)
+
+
+def test_without_noise_a_stereo_pair_is_found_exactly(rng: np.random.Generator) -> None:
+    solution = calibrate(_views(rng, 0.0), GRID, SIZE)
+    for found, truth in zip(solution.state.cameras, (LEFT, RIGHT), strict=True):
+        np.testing.assert_allclose(intrinsics(found), intrinsics(truth), rtol=1e-6, atol=1e-6)
+    assert np.linalg.norm(se3.log(se3.inverse(_mount()) @ solution.state.T_cam1_cam0)) < 1e-7
+
+
+def test_its_sigmas_are_honest() -> None:
+    nees = []
+    for seed in range(12):
+        solution = calibrate(_views(np.random.default_rng(seed), 0.2, count=15), GRID, SIZE)
+        error = np.concatenate(
+            [
+                intrinsics(f) - intrinsics(t)
+                for f, t in zip(solution.state.cameras, (LEFT, RIGHT), strict=True)
+            ]
+        )
+        nees.append(error @ np.linalg.solve(solution.covariance[:16, :16], error))
+        assert solution.sigma_px == pytest.approx(0.2, rel=0.05)
+    assert 110 < sum(nees) < 280  # chi-square of 12 x 16 = 192: its 1e-5 quantiles are about 117 and 285
+
+
+def test_corners_that_were_found_wrongly_do_little_harm(rng: np.random.Generator) -> None:
+    solution = calibrate(_views(rng, 0.1, wrong=0.03), GRID, SIZE)
+    assert solution.state.cameras[0].fx == pytest.approx(LEFT.fx, rel=1e-3)
+    assert solution.state.cameras[1].cx == pytest.approx(RIGHT.cx, abs=0.5)
+
+
+def test_a_board_that_never_leans_is_refused(rng: np.random.Generator) -> None:
+    facing = se3.exp(np.array([np.pi, 0, 0, 0, 0, 0]))
+    views = []
+    for k in range(15):
+        T = facing.copy()
+        T[:3, 3] = (-0.35, 0.3, 0.9 + 0.001 * k)
+        px = LEFT.project(se3.transform(T, GRID.corners)) + rng.normal(0, 0.1, (144, 2))
+        views.append(View(str(k), (Detection(np.arange(144), px),)))
+    with pytest.raises(ValueError, match="tilt the board"):
+        calibrate(views, GRID, SIZE)
+
+
+def test_too_few_views_are_refused(rng: np.random.Generator) -> None:
+    with pytest.raises(ValueError, match="3 views of the target; 4 are needed"):
+        calibrate(_views(rng, 0.1, count=3), GRID, SIZE)
+
+
+def test_the_views_that_are_chosen_reach_more_of_the_image_than_the_first(rng: np.random.Generator) -> None:
+    views = _views(rng, 0.1, count=60)
+    one = [View(v.name, v.seen[:1]) for v in views]
+    chosen = choose(one, GRID, SIZE, 8)
+    assert len(chosen) == 8
+
+    def reached(numbers: list[int]) -> float:
+        poses = np.stack([np.eye(4)] * len(numbers))
+        return coverage([one[k].seen[0].px for k in numbers], poses, GRID, SIZE).share
+
+    assert reached(chosen) >= reached(list(range(8)))
+
+
+def test_what_is_missing_is_said_in_words() -> None:
+    facing = se3.exp(np.array([[np.pi, 0, 0, 0, 0, 0.8]]))
+    said = coverage([np.array([[300.0, 200.0]])], facing, GRID, SIZE).missing
+    assert "no view reaches the image's upper right corner" in said
+    assert "all views are from one distance: go nearer and farther" in said

@@ -1,0 +1,49 @@
+"""Corners in exact pictures of boards lie where the target says, by its ids."""
+
+import numpy as np
+import pytest
+
+from share.calibration.detect import detector
+from share.geometry.target import AprilGrid, CharucoBoard, Target
+from share.types import F64, U8
+from share.vision.target_picture import darkness, ink
+
+_TEXEL = 0.002  # m: tags of 44 px
+_MARGIN = 0.04
+
+
+def _picture(target: Target) -> tuple[U8, F64]:
+    """A picture of the board as it is, and where its corners are in it (N, 2) px."""
+    low, high = target.extent[0] - _MARGIN, target.extent[1] + _MARGIN
+    columns, rows = np.round((high - low) / _TEXEL).astype(int)
+    xs = low[0] + _TEXEL * np.arange(columns + 1)
+    ys = high[1] - _TEXEL * np.arange(rows + 1)
+    image = np.round(220 - 190 * darkness(ink(target), xs, ys)).astype(np.uint8)
+    px = (target.corners[:, :2] - (low[0], high[1])) / (_TEXEL, -_TEXEL) - 0.5
+    return image, px
+
+
+@pytest.mark.parametrize("target", [AprilGrid(4, 5), CharucoBoard()])
+def test_every_corner_is_found_where_it_is_printed(target: Target) -> None:
+    image, truth = _picture(target)
+    found = detector(target)(image)
+    np.testing.assert_array_equal(found.ids, np.arange(len(truth)))
+    assert np.abs(found.px - truth).max() < 0.15
+
+
+@pytest.mark.parametrize("target", [AprilGrid(4, 5), CharucoBoard()])
+def test_of_half_a_board_the_corners_that_are_seen_keep_their_ids(target: Target) -> None:
+    image, truth = _picture(target)
+    half = image.shape[1] // 2
+    found = detector(target)(np.ascontiguousarray(image[:, :half]))
+    assert 0.3 * len(truth) < len(found) < 0.6 * len(truth)
+    assert np.abs(found.px - truth[found.ids]).max() < 0.15
+
+
+def test_tags_that_the_board_has_not_are_left_out() -> None:
+    image, _ = _picture(AprilGrid(4, 5))
+    assert detector(AprilGrid(2, 5))(image).ids.max() < 40
+
+
+def test_in_a_picture_without_a_board_there_is_nothing(rng: np.random.Generator) -> None:
+    assert len(detector(AprilGrid())(rng.integers(0, 255, (200, 300), np.uint8))) == 0
