@@ -62,7 +62,7 @@ class Solution:
 
 
 def calibrate(views: Sequence[View], target: Target, size: tuple[int, int]) -> Solution:
-    """From views in which each camera sees `LEAST_CORNERS` or nothing. size: (width, height) of an image.
+    """From views each of which `start.enough` corners of one camera tell. size: (width, height) of an image.
 
     Raises ValueError where the views are too few, or do not tell what is sought.
     """
@@ -91,13 +91,18 @@ def refit(state: State, views: Sequence[View], target: Target) -> State:
     return _solve(views, target, replace(state, T_cam0_target=poses), cameras_fixed=True).state
 
 
+def _board(view: View, eye: int, target: Target) -> F64:
+    """Corners (N, 2) m on the target that a camera sees."""
+    return target.corners[view.seen[eye].ids, :2]
+
+
 def _alone(views: Sequence[View], target: Target, size: tuple[int, int], eye: int) -> tuple[State, list[int]]:
     """One camera by itself, and which views it has."""
-    at = [k for k, view in enumerate(views) if len(view.seen[eye]) >= start.LEAST_CORNERS]
+    at = [k for k, view in enumerate(views) if start.enough(_board(view, eye, target))]
     if len(at) < LEAST_VIEWS:
         raise ValueError(f"cam{eye}: {len(at)} views of the target; {LEAST_VIEWS} are needed at least")
     mine = [View(views[k].name, (views[k].seen[eye],)) for k in at]
-    boards = [target.corners[view.seen[0].ids, :2] for view in mine]
+    boards = [_board(view, 0, target) for view in mine]
     camera = start.first_camera(boards, [view.seen[0].px for view in mine], size)
     poses = [start.pose(camera, xy, view.seen[0].px) for xy, view in zip(boards, mine, strict=True)]
     return _solve(mine, target, State((camera,), np.eye(4), np.stack(poses))).state, at

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.calibration.bundle import View
-from share.calibration.start import LEAST_CORNERS, homography
+from share.calibration.start import enough, homography
 from share.geometry.target import Target
 from share.types import F64, I64
 
@@ -28,8 +28,8 @@ _SHAPE_WEIGHT = 3.0  # of how a board lies, in cells
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Of one camera. cells: corners in each cell of `GRID`; leans (V, 2): the board's lean about the image's
-    y and x, rad; distances (V,): m."""
+    """Of one camera and the V views that it sees. cells: corners in each cell of `GRID`; leans (V, 2): the
+    board's lean about the image's y and x, rad; distances (V,): m."""
 
     cells: I64
     leans: F64
@@ -60,7 +60,8 @@ class Coverage:
 
 
 def coverage(pixels: Sequence[F64], T_cam_target: F64, target: Target, size: tuple[int, int]) -> Coverage:
-    """Of the corners (N, 2) px of each view, and its pose (V, 4, 4)."""
+    """Of the corners (N, 2) px of each view, and its pose (V, 4, 4); what it does not see does not count."""
+    T_cam_target = T_cam_target[[len(px) > 0 for px in pixels]]
     middle = np.append(target.extent.mean(axis=0), 0)
     at = T_cam_target[:, :3, :3] @ middle + T_cam_target[:, :3, 3]
     normal = -T_cam_target[:, :3, 2]  # away from who looks
@@ -95,11 +96,12 @@ def _told(view: View, target: Target, size: tuple[int, int]) -> dict[object, flo
     """What a view has to say, with weights: cells, and classes of lean and size by its homography."""
     out: dict[object, float] = {}
     for eye, seen in enumerate(view.seen):
-        if len(seen) < LEAST_CORNERS:
+        board = target.corners[seen.ids, :2]
+        if not enough(board):
             continue
         for cell in np.unique(cells_of(seen.px, size)).tolist():
             out[eye, "cell", cell] = 1.0
-        H = homography(target.corners[seen.ids, :2], (seen.px - np.array(size) / 2) / max(size))
+        H = homography(board, (seen.px - np.array(size) / 2) / max(size))
         H = H / H[2, 2]
         leant = np.clip(np.round(H[2, :2] / 0.25), -2, 2).astype(int)
         out[eye, "lean", *leant.tolist()] = _SHAPE_WEIGHT

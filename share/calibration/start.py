@@ -18,6 +18,7 @@ from share.geometry.camera import Camera
 from share.types import F64
 
 LEAST_CORNERS = 6
+_RANK = 1e-3  # of the largest singular value
 
 
 def first_camera(boards: Sequence[F64], pixels: Sequence[F64], size: tuple[int, int]) -> Camera:
@@ -41,6 +42,18 @@ def pose(camera: Camera, board: F64, px: F64) -> F64:
     T[:3, :3] = np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])])
     T[:3, 3] = H[:, 2]
     return se3.orthonormal(T)
+
+
+def enough(board: F64) -> bool:
+    """Whether corners (N, 2) m tell a homography: `LEAST_CORNERS` of them, and neither all nor all but one on
+    one line. By the rank of the direct linear transform from the board to itself."""
+    if len(board) < LEAST_CORNERS:
+        return False
+    points = np.column_stack([(board - board.mean(axis=0)) / board.std(), np.ones(len(board))])
+    x, y, none = points[:, :1], points[:, 1:2], np.zeros_like(points)
+    A = np.vstack([np.hstack([-points, none, x * points]), np.hstack([none, -points, y * points])])
+    strength = np.linalg.svd(A, compute_uv=False)
+    return bool(strength[7] > _RANK * strength[0])
 
 
 def homography(board: F64, image: F64) -> F64:

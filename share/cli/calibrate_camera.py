@@ -89,7 +89,7 @@ def _target(name: str) -> Target:
 def _calibrated(source: str, pictures: Pictures, target: Target, every: int, most: int) -> Outcome:
     from share.calibration.bundle import calibrate
     from share.calibration.coverage import choose, coverage
-    from share.calibration.start import LEAST_CORNERS
+    from share.calibration.start import enough
     from share.calibration.verdict import judge
     from share.io.board_views import find_views
     from share.io.camera_report import Outcome
@@ -107,7 +107,7 @@ def _calibrated(source: str, pictures: Pictures, target: Target, every: int, mos
             raise DataError(
                 f"{source}: pictures of {sizes[0]} and {sizes[1]}; calibrate one with --camera cam0"
             )
-        seen = [view for view in views if any(len(one) >= LEAST_CORNERS for one in view.seen)]
+        seen = [view for view in views if any(enough(target.corners[one.ids, :2]) for one in view.seen)]
         if not seen:
             raise DataError(
                 f"{source}: no board in {len(views)} pictures; is --target the board that was shown?"

@@ -1,15 +1,18 @@
 """Calibration of cameras: derivatives, recovery of what is known, and honest sigmas."""
 
+import cv2
 import numpy as np
 import pytest
 
+from share.calibration import bundle
 from share.calibration.bundle import View, calibrate
 from share.calibration.coverage import choose, coverage
 from share.calibration.detect import Detection
 from share.calibration.projection import camera_of, intrinsics, moved, project
+from share.calibration.start import enough
 from share.geometry import se3
 from share.geometry.camera import Camera
-from share.geometry.target import AprilGrid
+from share.geometry.target import AprilGrid, CharucoBoard
 from share.types import F64
 
 SIZE = (752, 480)
@@ -75,6 +78,22 @@ def test_without_noise_a_stereo_pair_is_found_exactly(rng: np.random.Generator) 
     assert np.linalg.norm(se3.log(se3.inverse(_mount()) @ solution.state.T_cam1_cam0)) < 1e-7
 
 
+def test_with_corners_of_one_weight_it_is_opencvs_solution(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bundle, "_HUBER", 1e6)  # OpenCV doubts no corner
+    views = [View(v.name, v.seen[:1]) for v in _views(rng, 0.2)]
+    solution = calibrate(views, GRID, SIZE)
+    boards = [GRID.corners[v.seen[0].ids].astype(np.float32) for v in views]
+    pixels = [v.seen[0].px.astype(np.float32) for v in views]
+    _, K, bent, _, _ = cv2.calibrateCamera(
+        boards, pixels, SIZE, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3, criteria=(3, 200, 1e-12)
+    )
+    theirs = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.ravel(bent)[:4]]
+    difference = intrinsics(solution.state.cameras[0]) - theirs
+    assert np.abs(difference / solution.sigmas).max() < 0.01
+
+
 def test_its_sigmas_are_honest() -> None:
     nees = []
     for seed in range(12):
@@ -131,3 +150,28 @@ def test_what_is_missing_is_said_in_words() -> None:
     said = coverage([np.array([[300.0, 200.0]])], facing, GRID, SIZE).missing
     assert "no view reaches the image's upper right corner" in said
     assert "all views are from one distance: go nearer and farther" in said
+
+
+@pytest.mark.parametrize(("ids", "told"), [(range(8), False), (range(9), False), (range(10), True)])
+def test_corners_on_a_line_tell_no_homography(ids: range, told: bool) -> None:
+    board = CharucoBoard().corners[list(ids), :2]  # 8 corners a row
+    assert enough(board) == told
+
+
+def test_views_of_one_row_of_corners_are_passed_over(rng: np.random.Generator) -> None:
+    board, views = CharucoBoard(), []
+    for k, T in enumerate(_poses(rng, 12)):
+        px = LEFT.project(se3.transform(T, board.corners))
+        ids = np.arange(8) if k == 5 else np.flatnonzero(LEFT.inside(px, 3.0))
+        views.append(View(str(k), (Detection(ids, px[ids]),)))
+    assert 5 not in choose(views, board, SIZE, 12)
+    told = [view for view in views if view.name != "5"]
+    solution = calibrate(told, board, SIZE)
+    np.testing.assert_allclose(intrinsics(solution.state.cameras[0]), intrinsics(LEFT), rtol=1e-5, atol=1e-5)
+
+
+def test_a_view_that_a_camera_does_not_see_covers_nothing() -> None:
+    poses = se3.exp(np.array([[np.pi, 0, 0, 0, 0, 0.8], [np.pi, 0.9, 0, 0, 0, 1.6]]))
+    covered = coverage([np.array([[300.0, 200.0]]), np.empty((0, 2))], poses, GRID, SIZE)
+    assert len(covered.distances) == len(covered.leans) == 1
+    assert "all views are from one distance: go nearer and farther" in covered.missing

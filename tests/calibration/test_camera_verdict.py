@@ -1,0 +1,63 @@
+"""The verdict: what passes, and each reason why not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from share.calibration.bundle import Solution, State
+from share.calibration.coverage import GRID, Coverage
+from share.calibration.verdict import judge
+from share.geometry.camera import Camera
+from share.types import F64
+
+CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, (0.0,) * 4)
+ALL = Coverage(np.full(GRID, 5), np.zeros((20, 2)), np.linspace(0.5, 1.0, 20))
+
+
+def _solution(residuals: list[F64], focal_sigma: float = 0.1) -> Solution:
+    state = State((CAMERA,), np.eye(4), np.stack([np.eye(4)] * len(residuals)))
+    covariance = np.diag([focal_sigma**2] * 2 + [0.01] * 6)
+    return Solution(state, covariance, tuple((r,) for r in residuals), 0.2)
+
+
+def _views(rng: np.random.Generator, count: int = 20) -> list[F64]:
+    return [rng.normal(0, 0.2, (50, 2)) for _ in range(count)]
+
+
+def test_good_views_pass_and_their_rms_is_that_of_the_distances(rng: np.random.Generator) -> None:
+    verdict = judge(_solution(_views(rng)), [ALL])
+    assert verdict.passed
+    assert verdict.rms_px[0] == pytest.approx(0.2 * np.sqrt(2), rel=0.05)
+
+
+def test_a_view_that_fits_worse_than_the_rest_is_named(rng: np.random.Generator) -> None:
+    views = _views(rng)
+    views[7] = 3 * views[7]
+    assert judge(_solution(views), [ALL]).outliers == (7,)
+
+
+def test_corners_far_away_are_counted_and_kept_out_of_the_rms(rng: np.random.Generator) -> None:
+    views = _views(rng)
+    views[3][:4] = 30.0
+    verdict = judge(_solution(views), [ALL])
+    assert verdict.wrong == (4,)
+    assert verdict.rms_px[0] < 0.35
+
+
+def test_each_reason_is_given(rng: np.random.Generator) -> None:
+    half = replace(ALL, cells=np.repeat([[5] * 4 + [0] * 4], GRID[0], axis=0))
+    spoilt = _views(rng)
+    for view in spoilt:
+        view[:5] = 30.0
+    blurred = replace(_solution([4 * view for view in _views(rng)]), sigma_px=0.8)
+    for solution, cover, reason in (
+        (_solution(_views(rng, 11)), ALL, "11 views, 12 needed"),
+        (_solution(_views(rng), focal_sigma=1.0), ALL, "focal length known to 0.20%"),
+        (_solution(_views(rng)), half, "corners in 50% of the image"),
+        (_solution(spoilt), ALL, "100 of 1000 corners do not fit"),
+        (blurred, ALL, "px RMS, at most 0.5"),
+    ):
+        reasons = judge(solution, [cover]).reasons
+        assert len(reasons) == 1
+        assert reason in reasons[0]
