@@ -32,7 +32,7 @@ from tool_main import exit_code, line  # noqa: E402
 from share.config import Config, PlaceConfig  # noqa: E402
 from share.core.sequencer import SequencerCounters  # noqa: E402
 from share.errors import UsageError  # noqa: E402
-from share.evaluator.features import PICTURE_PX, SHAPES  # noqa: E402
+from share.evaluator.features import SHAPES, picture  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.io.network import SHIPPED, open_network  # noqa: E402
 from share.io.session import read_session  # noqa: E402
@@ -42,7 +42,7 @@ from share.metrics.association import interpolate  # noqa: E402
 from share.place.index import PlaceIndex  # noqa: E402
 from share.place.verify import Sight, Verified, verify  # noqa: E402
 from share.run.pipeline import frames_of  # noqa: E402
-from share.types import F64, U8, Frame  # noqa: E402
+from share.types import F64, U8  # noqa: E402
 from share.vision.view import make_view  # noqa: E402
 
 EVERY = Spacing(0.3, 0.35)
@@ -112,13 +112,7 @@ def keyframes(folder: Path, agent: str) -> Iterator[Seen]:
     for frame in frames_of(source, Config(), SequencerCounters()):
         if (pose := wanted.get(frame.stamp_ns)) is not None:
             sight = Sight(make_view(frame, rig), rig.cam0.focal, rig.T_body_cam0, pose[2, :3])
-            yield Seen(agent, pose, sight, picture(frame))
-
-
-def picture(frame: Frame) -> U8:
-    """As `share.evaluator.features` has it."""
-    small = cv2.resize(frame.image0, (320, 240), interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.resize(small, (PICTURE_PX, PICTURE_PX), interpolation=cv2.INTER_AREA), np.uint8)
+            yield Seen(agent, pose, sight, picture(frame.image0))
 
 
 def truths(seen: list[Seen]) -> np.ndarray:

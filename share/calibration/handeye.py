@@ -13,6 +13,7 @@ import numpy as np
 
 from share.errors import DataError
 from share.geometry import se3
+from share.geometry.align import rotation
 from share.types import F64
 
 LEAST_TURN = np.radians(5.0)  # rms about the second axis; below, one direction is guessed
@@ -61,10 +62,9 @@ def _rotation(alpha: F64, beta: F64) -> F64:
     """(3, 3) that takes beta to alpha, both (N, 3)."""
     weight = np.ones(len(alpha))
     for _ in range(_ROUNDS):
-        U, _, Vt = np.linalg.svd((alpha * weight[:, None]).T @ beta)
-        R = U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+        R = rotation((alpha * weight[:, None]).T @ beta)
         weight = _weights(np.linalg.norm(alpha - beta @ R.T, axis=1))
-    return np.asarray(R, np.float64)
+    return R
 
 
 def _translation(A: F64, B: F64, R: F64) -> F64:

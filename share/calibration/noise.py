@@ -44,6 +44,11 @@ class Figure(NamedTuple):
         """The value, or the bound where that is all."""
         return self.value if self.told else self.bound
 
+    @property
+    def text(self) -> str:
+        """For a person."""
+        return f"{self.value:.3g} ± {self.sigma:.1g}" if self.told else f"< {self.bound:.2g}"
+
 
 @dataclass(frozen=True, eq=False)
 class AxisNoise:

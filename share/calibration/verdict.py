@@ -49,9 +49,9 @@ def judge(solution: Solution, covers: Sequence[Coverage], limits: Limits = Limit
     """Of a solution and what each camera's views cover."""
     eyes = range(len(solution.state.cameras))
     view_rms = np.array([[_rms(view[eye]) for eye in eyes] for view in solution.residuals])
-    kept = [_kept(solution, eye) for eye in eyes]
-    rms = tuple(_rms(inside) for inside, _ in kept)
-    wrong = tuple(count for _, count in kept)
+    told = [(residuals(solution, eye), kept(solution, eye)) for eye in eyes]
+    rms = tuple(_rms(r[inside]) for r, inside in told)
+    wrong = tuple(int((~inside).sum()) for _, inside in told)
     reasons = [reason for eye in eyes for reason in _reasons(solution, eye, rms[eye], wrong[eye], limits)]
     for eye, cover in enumerate(covers):
         if cover.share < limits.covered:
@@ -83,10 +83,14 @@ def _reasons(solution: Solution, eye: int, rms: float, wrong: int, limits: Limit
     return out
 
 
-def _kept(solution: Solution, eye: int) -> tuple[F64, int]:
-    r = np.concatenate([view[eye] for view in solution.residuals])
-    inside = np.linalg.norm(r, axis=1) <= _KEPT * solution.sigma_px
-    return r[inside], int((~inside).sum())
+def residuals(solution: Solution, eye: int) -> F64:
+    """(N, 2) px of a camera, over all views."""
+    return np.concatenate([view[eye] for view in solution.residuals])
+
+
+def kept(solution: Solution, eye: int) -> np.ndarray:
+    """Which of these residuals (N,) are of corners that were not found wrongly."""
+    return np.asarray(np.linalg.norm(residuals(solution, eye), axis=1) <= _KEPT * solution.sigma_px)
 
 
 def _rms(residuals: F64) -> float:

@@ -180,8 +180,7 @@ class _LiveLine(LiveLine):
         )
 
     def say(self, text: str) -> None:
-        self.end()
-        click.echo(f"share agent: {text}", err=True)
+        super().say(f"share agent: {text}")
 
 
 def _summary(run: AgentRun) -> str:

@@ -35,9 +35,7 @@ if TYPE_CHECKING:
     help="Use the N views that together tell most.",
 )  # fmt: skip
 @options.calib
-@click.option(
-    "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Where the files go."
-)
+@options.out_folder
 @options.as_json
 def camera(
     source: str,

@@ -14,7 +14,6 @@ from share.cli.table import aligned
 
 if TYPE_CHECKING:
     from share.calibration.imu import ImuNature
-    from share.calibration.noise import Figure
     from share.io.imu_report import Row
 
 _FAR = 2.0  # times the profile's figure, or part of it: worth a word
@@ -31,9 +30,7 @@ _LETTERS = {"density": "N", "instability": "B", "walk": "K"}
     show_default=True,
     help="Times the measured noise that is written for a filter to believe.",
 )
-@click.option(
-    "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Where the files go."
-)
+@options.out_folder
 @options.as_json
 def imu(source: str, profile_name: str | None, inflate: float, out: Path, as_json: bool) -> None:
     """Measure white noise, bias instability and bias random walk of an IMU (Allan deviation) from a recording
@@ -98,11 +95,7 @@ def _name(row: Row) -> str:
 def _cells(row: Row) -> list[str]:
     stated = "" if row.stated is None else f"{row.stated:.3g}"
     ratio = "" if row.ratio is None else f"{row.ratio:.2f}"
-    return [*map(_figure, row.axes), _figure(row.together), stated, ratio]
-
-
-def _figure(figure: Figure) -> str:
-    return f"{figure.value:.3g} ± {figure.sigma:.1g}" if figure.told else f"< {figure.bound:.2g}"
+    return [*(figure.text for figure in (*row.axes, row.together)), stated, ratio]
 
 
 def _warnings(nature: ImuNature, rows: list[Row]) -> list[str]:

@@ -53,9 +53,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Noise of the motion capture.",
 )
-@click.option(
-    "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Where the files go."
-)
+@options.out_folder
 @options.as_json
 def mocap(
     source: str,

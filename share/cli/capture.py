@@ -61,11 +61,6 @@ def capture(
         raise UsageError("--depth, --imu-only: give one of them")
     wanted = Wanted(profile(profile_name, mode), images=not imu_only, depth=depth)
     line = LiveLine()
-
-    def say(text: str) -> None:
-        line.end()
-        click.echo(f"share: {text}", err=True)
-
     run = Capture(
         lambda serial, epoch: RealSense(wanted, serial, epoch=epoch),
         serial_of(source),
@@ -73,7 +68,7 @@ def capture(
         out,
         SequencerConfig().max_jump_s,
         min_free_gb,
-        say,
+        lambda text: line.say(f"share: {text}"),
         lambda status: line.write(_live(status)),
     )
     with on_stop(run.stop):

@@ -102,8 +102,7 @@ def _run(
         try:
             found += rows(name, recordings[name], contender, out, show)
         except DataError as error:
-            live.end()
-            click.echo(f"share: {name}: {contender.title}: {error}", err=True)
+            live.say(f"share: {name}: {contender.title}: {error}")
             failed += 1
     live.end()
     return found, failed

@@ -25,6 +25,9 @@ verbose = click.option("-v", "--verbose", is_flag=True, help="Say more.")
 keys = click.option(
     "--keys", metavar="DIR", help="Folder of this machine's keys (default: ~/.config/share/keys)."
 )
+out_folder = click.option(
+    "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Where the files go."
+)
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
 
 

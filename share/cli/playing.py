@@ -51,8 +51,7 @@ def played(
 
     for one, came in go_through(runs, show, workers):
         if isinstance(came, ShareError):
-            live.end()
-            click.echo(f"share: {one.out.name}: {came}", err=True)
+            live.say(f"share: {one.out.name}: {came}")
         else:
             done[one.out] = came
     live.end()

@@ -36,6 +36,11 @@ class LiveLine:
             click.echo("", err=True)
         self._shown = False
 
+    def say(self, text: str) -> None:
+        """A line of its own on stderr, terminal or not."""
+        self.end()
+        click.echo(text, err=True)
+
 
 class Stages:
     """A bar for each stage of a longer task, one after the other. Call it with (stage, done, total)

@@ -62,14 +62,10 @@ def server(bind: str, stratum: int) -> None:
 
     host = parse_host(bind, PORT, bind=True)
     live = LiveLine()
-
-    def say(text: str) -> None:
-        live.end()
-        click.echo(f"share sync: {text}", err=True)
-
     with closing(StampedSocket.bound(host)) as link:
         times = TimeServer(stratum, clock_precision())
-        run = TimeServerRun(link, times, say, lambda: live.write(_counts(times)))
+        say, show = (lambda text: live.say(f"share sync: {text}")), (lambda: live.write(_counts(times)))
+        run = TimeServerRun(link, times, say, show)
         with on_stop(run.stop):
             _introduce(Host(host.name, link.port), stratum, link.by_kernel)
             run.go()

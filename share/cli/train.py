@@ -187,8 +187,7 @@ def compare(labels: Path, fitted: Path, base: Path | None, as_json: bool) -> Non
     made = assemble(fitted, labels, _base(base))
     seed, scores = made.fitted.about["options"]["seed"], []
     for score in of_rivals(made.collection, made.deep, seed, live.write):
-        live.end()
-        click.echo(f"{score.name}: RMSE {score.rmse_cm:.2f} cm", err=True)
+        live.say(f"{score.name}: RMSE {score.rmse_cm:.2f} cm")
         scores.append(score)
     live.write("ours, keyframe by keyframe")
     scores.append(of_network("ours", made.network, made.test))

@@ -51,8 +51,16 @@ def features(image: U8, footing: Footing, lately: Lately) -> Features:
     """Of a keyframe: its image of cam0 (H, W), what its pose stands on, and how its tracker fared of late."""
     small = _scaled(image, _SMALL)
     spread = psd(small, footing, (image.shape[1], image.shape[0]))
-    picture = _scaled(small, SHAPES["picture"])
-    return Features(picture, spread, scalars(small, footing, lately.sigma_cm), recent(lately))
+    return Features(_picture(small), spread, scalars(small, footing, lately.sigma_cm), recent(lately))
+
+
+def picture(image: U8) -> U8:
+    """That of `Features`, by itself, of an image (H, W)."""
+    return _picture(_scaled(image, _SMALL))
+
+
+def _picture(small: U8) -> U8:
+    return _scaled(small, SHAPES["picture"])
 
 
 def _scaled(image: U8, size: tuple[int, ...]) -> U8:

@@ -17,7 +17,12 @@ def umeyama(source: F64, target: F64) -> F64:
     if source.shape != target.shape or len(source) == 0:
         raise ValueError(f"umeyama: shapes {source.shape} and {target.shape} must agree and not be empty")
     ms, mt = source.mean(0), target.mean(0)
-    U, _, Vt = np.linalg.svd((target - mt).T @ (source - ms))
-    S = np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))])
-    R = U @ S @ Vt
+    R = rotation((target - mt).T @ (source - ms))
     return compose(R, mt - R @ ms)
+
+
+def rotation(M: F64) -> F64:
+    """The rotation R (3, 3) that maximises trace(R' M): of M = sum target source', what turns sources best to
+    targets. Source: Umeyama, eq. 40 and 43."""
+    U, _, Vt = np.linalg.svd(M)
+    return np.asarray(U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt)

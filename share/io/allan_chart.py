@@ -67,6 +67,5 @@ def _figures(sensor: SensorNoise, units: dict[str, str]) -> str:
     lines = []
     for letter, (name, unit) in zip("NBK", units.items(), strict=True):
         found = sensor.typical(name)
-        value = f"= {found.value:.3g} ± {found.sigma:.1g}" if found.told else f"< {found.bound:.2g}"
-        lines.append(f"{letter} {value} {unit}")
+        lines.append(f"{letter} {'= ' if found.told else ''}{found.text} {unit}")
     return "\n".join(lines)

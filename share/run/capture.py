@@ -44,7 +44,7 @@ class Device(Protocol):
     def reset(self) -> None: ...
 
 
-Connect = Callable[[str | None, int], Device]  # serial number (None: any), how often it was opened before
+Connect = Callable[[str | None, int], Device]  # serial number (None: any), how often it was tried before
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Capture:
         self._stop = threading.Event()
         self._device: Device | None = None
         self._heard: dict[str, int] = {}
-        self._epoch = self._connections = 0
+        self._reconnections = self._attempts = 0
         self._error: BaseException | None = None
         self._shown: tuple[float, int, dict[str, int]] = (time.monotonic(), 0, {})
         self.ended = "stopped"
@@ -158,7 +158,7 @@ class Capture:
             "streams": streams,
             "imu": self._intake.join.joined,
             "stretches": self._intake.stretches,
-            "reconnections": self._epoch,
+            "reconnections": self._reconnections,
             "resets": self._watchdog.resets,
             "health": self._watchdog.health.value,
             **self._intake.counts(),
@@ -224,14 +224,14 @@ class Capture:
             self._say(f"no more samples come; looks for camera {self._serial} until it is back")
             self._device.stop()
             self._device = None
-        self._connections += 1
+        self._attempts += 1
         try:
-            device = self._connect(self._serial, self._connections)
+            device = self._connect(self._serial, self._attempts)
             device.start(self._take)
         except ShareError:
             self._watchdog.lost(time.monotonic_ns())
             return
-        self._epoch += 1
+        self._reconnections += 1
         self._device = device
         self._watchdog.connected(time.monotonic_ns())
         self._say(f"camera {self._serial} is connected again; a new stretch begins")

@@ -9,13 +9,14 @@ from pathlib import Path
 from share.core.checkup import Finding, camera, fail, host, ok, skipped
 from share.core.checkup.calibration import calibration
 from share.errors import ShareError
-from share.io import chrony, realsense_devices
 from share.io import host as facts
 from share.io.calibration import read_calibration
 from share.io.keys import AgentKeys, agent_keys, default_folder, has_pair, load
 from share.io.profile import HostProfile
 from share.io.profile_types import Profile
+from share.io.realsense import asked
 from share.io.transport import parse_address
+from share.run.clocks import of_chrony
 from share.run.edge_probe import probe
 
 _REALSENSE = "RealSense"
@@ -39,7 +40,7 @@ def of_camera(profile: HostProfile) -> list[Finding]:
     if profile.sensor is None or _REALSENSE not in profile.sensor.device.model:
         return [skipped("camera", f"profile '{profile.name}' has none that can be asked")]
     device, wanted = profile.sensor.device, profile.host
-    found, sdk = facts.cameras(), realsense_devices.ask()
+    found, sdk = facts.cameras(), asked.ask()
     return [
         camera.link(found),
         camera.sdk(sdk),
@@ -92,14 +93,14 @@ def _keys(folder: Path, server_key: str | None) -> tuple[Finding, AgentKeys | No
 
 def _clock() -> Finding:
     try:
-        found = chrony.tracking()
+        found = of_chrony(host.CLOCK_LIMIT_MS)
     except ShareError as error:
         return host.clock(None, str(error))
     if found is None:
         return host.clock(None, None)
-    if not found.synchronised or found.local:
-        return host.clock(None, "chronyd follows no other clock")
-    return host.clock((found.offset_s * 1e3, found.uncertainty_s * 1e3), None)
+    if found.offset_ms is None or found.uncertainty_ms is None:
+        return host.clock(None, f"chronyd {found.wrong}")
+    return host.clock((found.offset_ms, found.uncertainty_ms), None)
 
 
 def _bytes_s(sensor: Profile) -> float:

@@ -12,8 +12,8 @@ import pytest
 from children import Child, start_edge
 from shell import Done
 
-from share.io import realsense_devices
 from share.io.host import governors, throttles, usb_memory_mb
+from share.io.realsense import asked
 from share.run import edge_probe
 
 Share = Callable[..., Done]
@@ -100,12 +100,12 @@ def test_the_key_of_another_edge_is_found_out(share: Share, guarded: Guarded) ->
 
 
 def test_librealsense_that_hangs_or_crashes_does_not_take_us_along(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(realsense_devices, "_query", lambda: time.sleep(60))
+    monkeypatch.setattr(asked, "_query", lambda: time.sleep(60))
     began = time.monotonic()
-    assert "said nothing for 0.2 s" in str(realsense_devices.ask(0.2).trouble)
+    assert "said nothing for 0.2 s" in str(asked.ask(0.2).trouble)
     assert time.monotonic() - began < 10
-    monkeypatch.setattr(realsense_devices, "_query", lambda: os._exit(3))
-    assert "crashed" in str(realsense_devices.ask().trouble)
+    monkeypatch.setattr(asked, "_query", lambda: os._exit(3))
+    assert "crashed" in str(asked.ask().trouble)
 
 
 def test_what_the_computer_says_of_itself_is_read(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from share.core.checkup import Finding, fail, ok, warn
 from share.geometry.camera import Rig
-from share.geometry.se3 import inverse
+from share.geometry.se3 import angle, inverse
 from share.types import F64
 
 _OLD_DAYS = 365.0
@@ -44,15 +44,10 @@ def _elsewhere(found: F64, expected: F64) -> Finding:
         mend = "swap the names T_cam_imu and T_imu_cam in the file, or invert the matrix"
         return fail("calibration", "the extrinsics to the IMU are inverted", mend)
     away = 1e3 * float(np.linalg.norm(found[:3, 3] - expected[:3, 3]))
-    turned = np.rad2deg(_angle(found, expected))
+    turned = np.rad2deg(angle(inverse(found) @ expected))
     what = f"cam0 is {away:.0f} mm and {turned:.0f}° from where such devices have it, by the IMU"
     return warn("calibration", what, _CALIBRATE)
 
 
 def _near(a: F64, b: F64) -> bool:
-    return bool(np.linalg.norm(a[:3, 3] - b[:3, 3]) <= _NEAR_M and _angle(a, b) <= _NEAR_RAD)
-
-
-def _angle(a: F64, b: F64) -> float:
-    """Between two rotations, rad."""
-    return float(np.arccos(np.clip((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2, -1, 1)))
+    return bool(np.linalg.norm(a[:3, 3] - b[:3, 3]) <= _NEAR_M and angle(inverse(a) @ b) <= _NEAR_RAD)

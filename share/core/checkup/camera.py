@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -69,8 +70,8 @@ def sdk(found: Sdk) -> Finding:
 
 
 def version(text: str) -> tuple[int, ...]:
-    """Dotted numbers; trailing zeros do not count. Raises ValueError."""
-    numbers = [int(part) for part in text.strip().split(".")]
+    """Of the dotted numbers in it; zeros at the end do not count."""
+    numbers = [int(part) for part in re.findall(r"\d+", text)]
     while numbers and not numbers[-1]:
         numbers.pop()
     return tuple(numbers)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from share.core.checkup import Finding, fail, ok, skipped, warn
 
 _LEAST_MINUTES, _ENOUGH_MINUTES = 5.0, 60.0
-_CLOCK_LIMIT_MS = 1.0  # as `share sync check`
+CLOCK_LIMIT_MS = 1.0  # as `share sync check`
 
 
 def governor(found: Sequence[str], wanted: str) -> Finding:
@@ -70,10 +70,10 @@ def clock(known: tuple[float, float] | None, trouble: str | None) -> Finding:
         return warn("clock", "no chronyd runs here: nothing keeps this clock with the others'", mend)
     offset_ms, uncertainty_ms = known
     what = f"{offset_ms:+.3f} ± {uncertainty_ms:.3f} ms"
-    if abs(offset_ms) + uncertainty_ms <= _CLOCK_LIMIT_MS:
+    if abs(offset_ms) + uncertainty_ms <= CLOCK_LIMIT_MS:
         return ok("clock", what)
     return warn(
-        "clock", f"{what}, should be within {_CLOCK_LIMIT_MS:g} ms", "chronyc sources; share sync check"
+        "clock", f"{what}, should be within {CLOCK_LIMIT_MS:g} ms", "chronyc sources; share sync check"
     )
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import Any
 
+from share.core.checkup.camera import version
 from share.errors import UsageError
 from share.io.profile_types import DeviceFacts
 
@@ -55,13 +55,9 @@ def _usable(device: Attached, facts: DeviceFacts) -> Attached:
             f"{who}: is on USB {device.usb}, too slow for it; use a USB 3 port and a USB 3 cable"
         )
     oldest = facts.firmware_oldest
-    if oldest and device.firmware and _numbers(device.firmware) < _numbers(oldest):
+    if oldest and device.firmware and version(device.firmware) < version(oldest):
         raise UsageError(
             f"{who}: its firmware {device.firmware} is older than {oldest}; update it with rs-fw-update "
             f"(known to be good: {', '.join(facts.firmware)})"
         )
     return device
-
-
-def _numbers(version: str) -> tuple[int, ...]:
-    return tuple(int(part) for part in re.findall(r"\d+", version))

@@ -9,8 +9,9 @@ import numpy as np
 from share.core.intake import GYRO
 from share.core.measurement import CAM0, CAM1, DEPTH
 from share.errors import DataError
+from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.types import F64
+from share.types import F64, checked_pose
 
 
 def factory_rig(rs: Any, profiles: dict[str, Any], noise: ImuNoise | None) -> Rig:
@@ -39,11 +40,7 @@ def transform(source: Any, target: Any) -> F64:
     T = np.eye(4)
     T[:3, :3] = np.reshape(told.rotation, (3, 3), order="F")
     T[:3, 3] = told.translation
-    u, _, vt = np.linalg.svd(T[:3, :3])  # single precision on the device: a rotation to 1e-7 only
-    if np.abs(u @ vt - T[:3, :3]).max() > 1e-3 or np.linalg.det(u @ vt) < 0:
-        raise ValueError("extrinsics are not a rotation")
-    T[:3, :3] = u @ vt
-    return T
+    return se3.orthonormal(checked_pose("extrinsics", T))  # single precision there: rigid to 1e-7 only
 
 
 def camera(rs: Any, profile: Any) -> Camera:

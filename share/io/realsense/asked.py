@@ -6,6 +6,9 @@ import multiprocessing
 from multiprocessing.connection import Connection
 
 from share.core.checkup.camera import Sdk
+from share.errors import ShareError
+from share.io.realsense.devices import attached
+from share.io.realsense.sdk import load_sdk
 
 _PATIENCE_S = 10.0
 
@@ -38,9 +41,7 @@ def _tell(to: Connection) -> None:
 
 def _query() -> Sdk:
     try:
-        import pyrealsense2 as rs
-
-        devices = rs.context().query_devices()
-        return Sdk(firmware=tuple(d.get_info(rs.camera_info.firmware_version) for d in devices))
-    except (ImportError, RuntimeError) as error:
+        rs = load_sdk()
+        return Sdk(firmware=tuple(device.firmware for device in attached(rs, rs.context())))
+    except (ShareError, RuntimeError) as error:
         return Sdk(str(error).splitlines()[0])
