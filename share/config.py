@@ -150,7 +150,7 @@ class AgentConfig:
     blend_jump_rad: float = 0.02  # is blended in
     blend_s: float = 0.5  # over this time
     finish_s: float = 5.0  # how long the end of a run waits for acknowledgements
-    error_model: str = "shipped"  # says how wrong the tracker is; or a file by `share train export`; "": odometry's sigma
+    error_model: str = "shipped"  # how wrong the tracker is: this, a file, or "" for odometry's sigma
 
     def __post_init__(self) -> None:
         _require_positive(self, "keep_keyframes", "blend_s")
