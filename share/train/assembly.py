@@ -11,7 +11,7 @@ from share.errors import UsageError
 from share.evaluator.model import Network
 from share.io.network import deep_of, open_network
 from share.train.fitted import Fitted, read_fitted
-from share.train.graph import backbone_id, with_head
+from share.train.graph import backbone_id, with_heads
 from share.train.rivals import Rows
 from share.train.table import Collection, collect
 from share.types import F32
@@ -42,7 +42,7 @@ def assemble(fit: Path, labels: Path, base: Path) -> Assembly:
     given = base.read_bytes()
     if backbone_id(given) != fitted.about["backbone"]:
         raise UsageError(f"{base}: has another backbone than the one that {fit} was taught for")
-    model = with_head(given, fitted)
+    model = with_heads(given, fitted)
     network = open_network(model)
     return Assembly(fitted, collection, model, network, deep_of(network, collection.table.picture))
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from share.io.files import atomic_write
-from share.train.network import Head, loss
+from share.train.network import Heads, loss
 from share.types import F32
 
 Show = Callable[[int, float, float], None]  # epoch, loss where it learns, loss where it stops
@@ -23,7 +23,7 @@ Show = Callable[[int, float, float], None]  # epoch, loss where it learns, loss 
 @dataclass(frozen=True)
 class FitOptions:
     """epochs at most; patience: without a gain, after which it ends. dropout: of what the backbone
-    says, since rooms are few, and many pictures are of the same one."""
+    says, since rooms are few, and many pictures are of the same one. heads: whose mean is told."""
 
     epochs: int = 200
     patience: int = 25
@@ -31,6 +31,7 @@ class FitOptions:
     rate: float = 1e-3
     decay: float = 0.05
     dropout: float = 0.9
+    heads: int = 4
     seed: int = 0
 
 
@@ -64,69 +65,70 @@ class _Progress:
     best_epoch: int = 0
 
 
-def fit(learn: Inputs, stop: Inputs, options: FitOptions, checkpoint: Path | None, show: Show) -> Head:
-    """The head that does best on `stop`. checkpoint: a file to go on from, if it is of the same keyframes and
+def fit(learn: Inputs, stop: Inputs, options: FitOptions, checkpoint: Path | None, show: Show) -> Heads:
+    """The heads that do best on `stop`. checkpoint: a file to go on from, if it is of the same keyframes and
     options, and to keep what has been learnt in, each epoch. On a GPU where there is one."""
     torch.manual_seed(options.seed)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    head = Head(options.dropout)
-    head.to(device)
-    optimiser = torch.optim.AdamW(head.parameters(), options.rate, weight_decay=options.decay)
-    at, best = _Progress(), _copy(head)
+    heads = Heads(options.heads, options.dropout)
+    heads.to(device)
+    optimiser = torch.optim.AdamW(heads.parameters(), options.rate, weight_decay=options.decay)
+    at, best = _Progress(), _copy(heads)
     what = {**dataclasses.asdict(options), "learn": learn.crc, "stop": stop.crc}
     if checkpoint is not None and checkpoint.is_file():
         kept = torch.load(checkpoint, map_location=device, weights_only=True)
         if kept["what"] == what:
-            head.load_state_dict(kept["head"])
+            heads.load_state_dict(kept["heads"])
             optimiser.load_state_dict(kept["optimiser"])
             at, best = _Progress(**kept["at"]), kept["best"]
     rows, checked = learn.tensors(device), stop.tensors(device)
     while at.epoch < options.epochs and at.epoch - at.best_epoch < options.patience:
-        learnt = _epoch(head, optimiser, rows, options, at.epoch)
-        stopped = _evaluated(head, checked)
+        learnt = _epoch(heads, optimiser, rows, options, at.epoch)
+        stopped = _evaluated(heads, checked)
         at.epoch += 1
         if stopped < at.best:
-            at.best, at.best_epoch, best = stopped, at.epoch, _copy(head)
+            at.best, at.best_epoch, best = stopped, at.epoch, _copy(heads)
         show(at.epoch, learnt, stopped)
         if checkpoint is not None:
-            _keep(checkpoint, what, head, optimiser, at, best)
-    head.load_state_dict(best)
-    head.cpu().eval()
-    return head
+            _keep(checkpoint, what, heads, optimiser, at, best)
+    heads.load_state_dict(best)
+    heads.cpu().eval()
+    return heads
 
 
 def _epoch(
-    head: Head, optimiser: torch.optim.Optimizer, rows: list[torch.Tensor], options: FitOptions, epoch: int
+    heads: Heads, optimiser: torch.optim.Optimizer, rows: list[torch.Tensor], options: FitOptions, epoch: int
 ) -> float:
     """In an order that the seed and the epoch decide, so that a run that goes on goes on as it would have."""
-    head.train()
+    heads.train()
     torch.manual_seed(options.seed * 100_003 + epoch)
     order, total = torch.randperm(len(rows[0])), 0.0
     for which in order.split(options.batch):
         *inputs, log_error = (column[which.to(column.device)] for column in rows)
         optimiser.zero_grad()
-        value = loss(head(*inputs), log_error)
-        value.backward()
-        torch.nn.utils.clip_grad_norm_(head.parameters(), 1.0)
+        value = loss(heads(*inputs), log_error)
+        (options.heads * value).backward()  # each learns as it would alone
+        for head in heads.each:
+            torch.nn.utils.clip_grad_norm_(head.parameters(), 1.0)
         optimiser.step()
         total += value.item() * len(which)
     return total / len(order)
 
 
-def _evaluated(head: Head, rows: list[torch.Tensor]) -> float:
-    head.eval()
+def _evaluated(heads: Heads, rows: list[torch.Tensor]) -> float:
+    heads.eval()
     with torch.no_grad():
-        return float(loss(head(*rows[:-1]), rows[-1]))
+        return float(loss(heads(*rows[:-1]).mean(dim=0), rows[-1]))
 
 
-def _copy(head: Head) -> dict[str, torch.Tensor]:
-    return {name: value.detach().cpu().clone() for name, value in head.state_dict().items()}
+def _copy(heads: Heads) -> dict[str, torch.Tensor]:
+    return {name: value.detach().cpu().clone() for name, value in heads.state_dict().items()}
 
 
 def _keep(
     path: Path,
     what: dict[str, Any],
-    head: Head,
+    heads: Heads,
     optimiser: torch.optim.Optimizer,
     at: _Progress,
     best: dict[str, torch.Tensor],
@@ -135,7 +137,7 @@ def _keep(
     torch.save(
         {
             "what": what,
-            "head": head.state_dict(),
+            "heads": heads.state_dict(),
             "optimiser": optimiser.state_dict(),
             "at": dataclasses.asdict(at),
             "best": best,

@@ -1,10 +1,11 @@
-"""What has been taught, as arrays: the head's weights, how wide its intervals are, what it knows."""
+"""What has been taught, as arrays: weights of the heads, how wide their intervals are, what they know."""
 
 from __future__ import annotations
 
 import io
 import json
 import math
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,11 +23,11 @@ _RIDGE = 1e-3  # of a variance, added
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """weights: of `share.train.network.Head`, for inputs as they come (`folded`). margin: by which low and
-    high go further out, in logarithms. mean (96,), whitening (96, 96): a joined vector x is as far from what
-    has been learnt as |(x - mean) whitening|, 1 where that ends. about: plain data."""
+    """heads: weights of each `share.train.network.Head`, for inputs as they come (`folded`). margin: by which
+    low and high go further out, in logarithms. mean (96,), whitening (96, 96): a vector x that the first head
+    joined is as far from what was learnt as |(x - mean) whitening|, 1 where that ends. about: plain data."""
 
-    weights: dict[str, F32]
+    heads: list[dict[str, F32]]
     margin: float
     mean: F32
     whitening: F32
@@ -64,7 +65,8 @@ def known(joined: F32, calibrated: F32) -> tuple[F32, F32]:
 def write_fitted(path: Path, fitted: Fitted) -> None:
     """Whole or not at all."""
     data = io.BytesIO()
-    arrays: dict[str, Any] = {f"weights/{name}": value for name, value in fitted.weights.items()}
+    numbered = enumerate(fitted.heads)
+    arrays: dict[str, Any] = {f"{k}/{name}": value for k, head in numbered for name, value in head.items()}
     arrays |= {"mean": fitted.mean, "whitening": fitted.whitening, "margin": np.array(fitted.margin)}
     np.savez_compressed(data, about=np.array(json.dumps(fitted.about)), **arrays)
     atomic_write(path, data.getvalue())
@@ -74,8 +76,12 @@ def read_fitted(path: Path) -> Fitted:
     """Raises DataError that names it."""
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as found:
-            weights = {n.removeprefix("weights/"): found[n] for n in found if n.startswith("weights/")}
+            heads: defaultdict[str, dict[str, F32]] = defaultdict(dict)
+            for number, _, name in (key.partition("/") for key in found if "/" in key):
+                heads[number][name] = found[f"{number}/{name}"]
             about = json.loads(str(found["about"]))
-            return Fitted(weights, float(found["margin"]), found["mean"], found["whitening"], about)
+            return Fitted(
+                list(heads.values()), float(found["margin"]), found["mean"], found["whitening"], about
+            )
     except Exception as error:  # numpy, zip and json each have their own
         raise DataError(f"{path}: is not by `share train fit`, or damaged: {error}") from None

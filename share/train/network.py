@@ -55,13 +55,31 @@ class Head(nn.Module):  # type: ignore[misc]
         return torch.stack([expected, low, high], dim=1)
 
 
+class Heads(nn.Module):  # type: ignore[misc]
+    """Several heads that began differently. What rooms have taught all of them is what they agree on, so
+    their mean is less wrong than each (deep ensembles, Lakshminarayanan et al. 2017)."""
+
+    def __init__(self, count: int, dropout: float = 0.0) -> None:
+        super().__init__()
+        self.each = nn.ModuleList(Head(dropout) for _ in range(count))
+
+    def join(self, deep: Tensor, psd: Tensor, numbers: Tensor) -> Tensor:
+        """(N, 96), the first one's."""
+        joined: Tensor = self.each[0].join(deep, psd, numbers)
+        return joined
+
+    def forward(self, deep: Tensor, psd: Tensor, numbers: Tensor) -> Tensor:
+        """(H, N, 3), each one's."""
+        return torch.stack([head(deep, psd, numbers) for head in self.each])
+
+
 def loss(told: Tensor, log_error: Tensor) -> Tensor:
-    """told (N, 3) by `Head`, log_error (N,) of cm.
+    """told (..., N, 3) by `Head`, log_error (N,) of cm.
 
     What is expected is learnt by the Poisson deviance, whose least is the mean, and which minds large errors
     more than a logarithm and less than a square would; the interval by the pinball loss of its quantiles.
     """
-    expected, low, high = told.unbind(dim=1)
+    expected, low, high = told.unbind(dim=-1)
     deviance = torch.exp(expected) - torch.exp(log_error) * expected
     return deviance.mean() + _pinball(log_error - low, LOW) + _pinball(log_error - high, HIGH)
 

@@ -1,4 +1,4 @@
-"""From labels to a head: inputs are standardised, the head is fitted and calibrated, and knows how far its
+"""From labels to heads: inputs are standardised, heads are fitted and calibrated, and know how far their
 knowledge goes."""
 
 from __future__ import annotations
@@ -26,14 +26,10 @@ def teach(
     called `backbone` (`graph.backbone_id`)."""
     scale = _Scale(deep, collection)
     parts = {name: scale.inputs(name) for name in collection.parts}
-    head = fit(parts["learn"], parts["stop"], options, checkpoint, show)
+    heads = fit(parts["learn"], parts["stop"], options, checkpoint, show)
     with torch.no_grad():
-        joined = {name: head.join(*_tensors(parts[name])).numpy() for name in ("learn", "calibrate")}
-        told = head(*_tensors(parts["calibrate"])).numpy()
-    weights = {name: value.numpy() for name, value in head.state_dict().items()}
-    weights = folded(weights, "visual.0", *scale.deep)
-    for layer in ("numbers.0", "straight"):
-        weights = folded(weights, layer, *scale.numbers)
+        joined = {name: heads.join(*_tensors(parts[name])).numpy() for name in ("learn", "calibrate")}
+        told = heads(*_tensors(parts["calibrate"])).mean(dim=0).numpy()
     about = {
         "version": __version__,
         "window_s": WINDOW_S,
@@ -43,11 +39,20 @@ def teach(
         "keyframes": {name: len(part.log_error) for name, part in parts.items()},
     }
     return Fitted(
-        weights,
+        [_folded(head, scale) for head in heads.each],
         margin(told, parts["calibrate"].log_error),
         *known(joined["learn"], joined["calibrate"]),
         about,
     )
+
+
+def _folded(head: torch.nn.Module, scale: _Scale) -> dict[str, F32]:
+    """Its weights, for inputs as they come."""
+    weights = {name: value.numpy() for name, value in head.state_dict().items()}
+    weights = folded(weights, "visual.0", *scale.deep)
+    for layer in ("numbers.0", "straight"):
+        weights = folded(weights, layer, *scale.numbers)
+    return weights
 
 
 class _Scale:

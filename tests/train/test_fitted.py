@@ -45,12 +45,15 @@ def test_what_is_like_what_was_learnt_is_near(rng):
 
 def test_what_is_kept_is_read(tmp_path, rng):
     weights = {"a.weight": rng.standard_normal((2, 3)).astype(np.float32)}
-    whole = Fitted(weights, 0.25, np.zeros(96, np.float32), np.eye(96, dtype=np.float32), {"version": "1"})
+    heads = [weights, {"a.weight": 2 * weights["a.weight"]}]
+    whole = Fitted(heads, 0.25, np.zeros(96, np.float32), np.eye(96, dtype=np.float32), {"version": "1"})
     write_fitted(tmp_path / "fit.npz", whole)
     found = read_fitted(tmp_path / "fit.npz")
     assert found.margin == 0.25
     assert found.about == {"version": "1"}
-    assert (found.weights["a.weight"] == weights["a.weight"]).all()
+    assert [list(one) for one in found.heads] == [["a.weight"], ["a.weight"]]
+    assert (found.heads[0]["a.weight"] == weights["a.weight"]).all()
+    assert (found.heads[1]["a.weight"] == 2 * weights["a.weight"]).all()
     (tmp_path / "fit.npz").write_bytes(b"no")
     with pytest.raises(DataError, match=r"fit\.npz: is not by `share train fit`, or damaged"):
         read_fitted(tmp_path / "fit.npz")

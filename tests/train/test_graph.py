@@ -17,18 +17,18 @@ from share.evaluator.features import Features  # noqa: E402
 from share.evaluator.model import estimate  # noqa: E402
 from share.io.network import deep_of, open_network  # noqa: E402
 from share.train.fitted import Fitted  # noqa: E402
-from share.train.graph import backbone_id, with_head  # noqa: E402
-from share.train.network import Head, loss  # noqa: E402
+from share.train.graph import backbone_id, with_heads  # noqa: E402
+from share.train.network import Heads, loss  # noqa: E402
 
 
 @pytest.fixture
-def head() -> Head:
+def heads() -> Heads:
     torch.manual_seed(3)
-    return Head().eval()
+    return Heads(3).eval()
 
 
-def fitted(head: Head, margin: float = 0.2, reach: float = 4.0) -> Fitted:
-    weights = {name: value.numpy() for name, value in head.state_dict().items()}
+def fitted(heads: Heads, margin: float = 0.2, reach: float = 4.0) -> Fitted:
+    weights = [{name: value.numpy() for name, value in one.state_dict().items()} for one in heads.each]
     return Fitted(
         weights, margin, np.zeros(96, np.float32), np.eye(96, dtype=np.float32) / reach, {"version": "x"}
     )
@@ -38,15 +38,15 @@ def keyframes(rng, n: int = 7) -> list[Features]:
     return [made_features(rng) for _ in range(n)]
 
 
-def test_the_file_says_what_the_network_does(head, rng):
-    network = open_network(with_head(tiny_backbone(), fitted(head)))
+def test_the_file_says_what_the_heads_say_on_average(heads, rng):
+    network = open_network(with_heads(tiny_backbone(), fitted(heads)))
     for one in keyframes(rng):
         deep = torch.from_numpy(deep_of(network, one.picture[None]))
         numbers = np.concatenate([one.scalars, one.recent])
         with torch.no_grad():
             inputs = deep, torch.from_numpy(one.psd[None].copy()), torch.from_numpy(numbers[None])
-            expected, low, high = head(*inputs)[0].tolist()
-            joined = head.join(*inputs)[0].numpy()
+            expected, low, high = heads(*inputs).mean(dim=0)[0].tolist()
+            joined = heads.join(*inputs)[0].numpy()
         told = estimate(network, one)
         assert math.log(told.error_cm) == pytest.approx(expected, abs=1e-4)
         assert told.embedding == pytest.approx(joined[:64], abs=1e-4)
@@ -57,20 +57,20 @@ def test_the_file_says_what_the_network_does(head, rng):
         assert math.log(told.high_cm) == pytest.approx(expected + wider * (high - expected + 0.2), abs=1e-4)
 
 
-def test_another_head_takes_the_place_of_the_first(head, rng):
-    first = with_head(tiny_backbone(), fitted(head))
+def test_other_heads_take_the_place_of_the_first(heads, rng):
+    first = with_heads(tiny_backbone(), fitted(heads))
     torch.manual_seed(4)
-    other = fitted(Head().eval())
-    again = with_head(first, other)
-    assert again == with_head(tiny_backbone(), other)
+    other = fitted(Heads(1).eval())
+    again = with_heads(first, other)
+    assert again == with_heads(tiny_backbone(), other)
     assert backbone_id(first) == backbone_id(again) == backbone_id(tiny_backbone())
     (one,) = keyframes(rng, 1)
     told = [estimate(open_network(model), one).error_cm for model in (first, again)]
     assert told[0] != told[1]
 
 
-def test_an_interval_that_is_too_wide_shrinks_no_further_than_to_nothing(head, rng):
-    network = open_network(with_head(tiny_backbone(), fitted(head, margin=-50.0, reach=1e6)))
+def test_an_interval_that_is_too_wide_shrinks_no_further_than_to_nothing(heads, rng):
+    network = open_network(with_heads(tiny_backbone(), fitted(heads, margin=-50.0, reach=1e6)))
     (one,) = keyframes(rng, 1)
     told = estimate(network, one)
     assert told.low_cm == pytest.approx(told.error_cm) == told.high_cm
