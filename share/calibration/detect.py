@@ -56,13 +56,25 @@ def _april(grid: AprilGrid) -> Callable[[U8], Detection]:
             return _nothing()
         found = np.asarray(tags).reshape(-1)
         px = np.asarray(quads, np.float32).reshape(-1, 4, 2)[:, _OURS]
-        names, counts = np.unique(found, return_counts=True)
-        keep = np.isin(found, names[(counts == 1) & (names < grid.rows * grid.cols)])
-        found, px = found[keep], px[keep]
+        found, px = _once(found, px, grid.rows * grid.cols)
         there = _in_place(grid.tags[found], px)
         return _corners(image, grid, 4 * found[there, None] + np.arange(4), px[there])
 
     return find
+
+
+def _once(found: np.ndarray, px: np.ndarray, tags: int) -> tuple[np.ndarray, np.ndarray]:
+    """Tags (N,) and their corners (N, 4, 2) px, each once. One that is large is found at several thresholds:
+    its largest outline is its border. One in two places is not believed."""
+    middle = px.mean(axis=1)
+    sides = np.linalg.norm(px - np.roll(px, 1, axis=1), axis=2).mean(axis=1)
+    keep = []
+    for tag in np.unique(found[found < tags]):
+        same = np.flatnonzero(found == tag)
+        largest = same[np.argmax(sides[same])]
+        if (np.linalg.norm(middle[same] - middle[largest], axis=1) < sides[largest] / 2).all():
+            keep.append(largest)
+    return found[keep], px[keep]
 
 
 def _in_place(tags: F64, px: np.ndarray) -> np.ndarray:

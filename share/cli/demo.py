@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,11 +81,15 @@ def demo(
     with Stages() as stages:
         session = read_session(cached_session(recipe(_drawable(scene), seconds, seed), progress=stages))
     live = LiveLine()
-    terms = Terms(policy, link, seed, true_error, config=config_file)
+    terms = Terms(policy, link, seed, true_error, config=config_file, agents_first=True)
     folders = play(session, seconds, terms, folder, lambda now: live.write(str(now)))
     live.end()
     result = score(session, folders)
     click.echo(_table(result, policy == STREAMED))
+    cores = len(os.sched_getaffinity(0))
+    if cores <= len(folders):
+        late = f"{len(folders)} agents and the edge shared {cores} cores, so frames waited for one another"
+        click.echo(f"{late}; on machines of their own they do not")
     if result.joint is not None:
         from share.io.picture import draw_trajectories
 

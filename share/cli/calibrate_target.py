@@ -1,0 +1,60 @@
+"""`share calibrate target`: a board to print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from share.errors import UsageError
+
+
+@click.command(short_help="A board to print, and its YAML file.")
+@click.option("--kind", type=click.Choice(["aprilgrid", "charuco"]), default="aprilgrid", show_default=True)
+@click.option(
+    "--paper", metavar="P", default="A4", show_default=True,
+    help="A4 to A0, letter, tabloid, or WIDTHxHEIGHT in mm.",
+)  # fmt: skip
+@click.option("--columns", type=click.IntRange(1), metavar="N", help="Of tags or squares.  [default: 6, 9]")
+@click.option("--rows", type=click.IntRange(1), metavar="N", help="The same.  [default: 6, 7]")
+@click.option(
+    "--size", type=click.FloatRange(0, min_open=True), metavar="MM",
+    help="Of a tag's or square's edge.  [default: what fits, in whole mm]",
+)  # fmt: skip
+@click.option(
+    "--out", required=True, metavar="B.pdf", type=click.Path(path_type=Path, dir_okay=False),
+    help="The sheet; B.yaml comes beside it.",
+)  # fmt: skip
+def target(
+    kind: str, paper: str, columns: int | None, rows: int | None, size: float | None, out: Path
+) -> None:
+    """Write a calibration board as a PDF, true to scale, and the YAML file by which other commands know it.
+
+    Print at 100 % ("actual size"), glue it to something flat and stiff, and measure: where a tag's or
+    square's edge is not what the sheet says, write into the YAML file what it is.
+
+    \b
+    Example:  share calibrate target --paper A3 --out board.pdf
+              share calibrate camera board.mcap --target board.yaml --out calib/mine
+    """
+    import yaml
+
+    from share.calibration.sheet import USUAL, sheet
+    from share.io.files import atomic_write, check_writable
+    from share.io.target import to_plain
+    from share.io.target_sheet import pdf, words
+
+    if out.suffix.lower() != ".pdf":
+        raise UsageError(f"--out {out}: expected a name that ends in .pdf")
+    usual = USUAL[kind]
+    try:
+        made = sheet(kind, columns or usual[0], rows or usual[1], paper, size)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    known_as = out.with_suffix(".yaml")
+    for path in (out, known_as):
+        check_writable(path)
+    atomic_write(out, pdf(made))
+    atomic_write(known_as, yaml.safe_dump(to_plain(made.target), sort_keys=False))
+    click.echo(f"{words(made)}, on {paper} ({made.width:g} x {made.height:g} mm)")
+    click.echo(f"print: {out}   for --target: {known_as}")

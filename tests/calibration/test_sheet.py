@@ -1,0 +1,54 @@
+"""How large a target may be on a paper, and where it lies."""
+
+import pytest
+
+from share.calibration.sheet import FOOT_MM, MARGIN_MM, sheet
+
+
+def ends(made):
+    """Left, low, right, high of what is black, mm."""
+    low, high = 1000 * made.target.extent
+    wide, tall = high - low
+    return made.left, made.low, made.left + wide, made.low + tall
+
+
+@pytest.mark.parametrize("kind", ["aprilgrid", "charuco"])
+@pytest.mark.parametrize("paper", ["A4", "A0", "letter", "600x300"])
+def test_it_lies_within_the_margins_and_a_millimetre_more_would_not(kind, paper):
+    made = sheet(kind, 6, 5, paper)
+    left, low, right, high = ends(made)
+    assert left == pytest.approx(made.width - right)
+    assert min(left, made.height - high) >= MARGIN_MM - 1e-9
+    assert low >= MARGIN_MM + FOOT_MM - 1e-9
+    edge = round(1000 * (made.target.tag_size if kind == "aprilgrid" else made.target.square))
+    with pytest.raises(ValueError, match="is the most there"):
+        sheet(kind, 6, 5, paper, edge + 1)
+
+
+def test_the_paper_is_turned_for_a_wide_board():
+    assert sheet("charuco", 9, 6, "A4").width == 297
+    assert sheet("charuco", 6, 9, "A4").width == 210
+
+
+def test_a_size_is_taken_as_it_is():
+    made = sheet("aprilgrid", 4, 5, "A3", 30.5)
+    assert (made.target.cols, made.target.rows, made.target.tag_size) == (4, 5, pytest.approx(0.0305))
+
+
+@pytest.mark.parametrize(
+    ("columns", "paper", "edge", "said"),
+    [
+        (6, "A4", 30, r"6 x 6 of 30 mm do not fit on A4: 23.4 mm is the most there"),
+        (6, "30x30", None, r"30x30 is too small for 6 x 6"),
+        (6, "B9", None, r"'B9' is no paper; known: A4, A3"),
+        (200, "A0", None, r"the family 36h11 has 587"),
+    ],
+)
+def test_what_cannot_be_is_said(columns, paper, edge, said):
+    with pytest.raises(ValueError, match=said):
+        sheet("aprilgrid", columns, 6, paper, edge)
+
+
+def test_many_squares_get_a_dictionary_that_has_as_many_markers():
+    assert sheet("charuco", 9, 7, "A3").target.dictionary == "DICT_5X5_100"
+    assert sheet("charuco", 20, 15, "A0").target.dictionary == "DICT_5X5_1000"

@@ -1,0 +1,28 @@
+"""`share calibrate target`: a sheet, and the file by which other commands know it."""
+
+from pathlib import Path
+
+from share.geometry.target import AprilGrid
+from share.io.target import read_target
+
+
+def test_the_yaml_file_is_of_what_is_printed(share, tmp_path):
+    done = share("calibrate", "target", "--paper", "A3", "--size", 30, "--out", tmp_path / "b.pdf")
+    assert done.code == 0, done.err
+    assert read_target(tmp_path / "b.yaml") == AprilGrid(6, 6, 0.03, 0.3)
+    assert (tmp_path / "b.pdf").read_bytes().startswith(b"%PDF")
+    assert "aprilgrid, 6 x 6 tags of 30 mm, 9 mm apart, on A3" in done.out
+
+
+def test_what_does_not_fit_is_said_and_nothing_written(share, tmp_path):
+    done = share("calibrate", "target", "--size", 40, "--out", tmp_path / "b.pdf")
+    assert done.code == 2
+    assert "23.4 mm is the most there" in done.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_another_ending_is_refused(share, tmp_path):
+    done = share("calibrate", "target", "--out", tmp_path / "b.png")
+    assert done.code == 2
+    assert "ends in .pdf" in done.err
+    assert not Path(tmp_path / "b.png").exists()
