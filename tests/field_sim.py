@@ -53,12 +53,13 @@ def reclocked(source: Path, out: Path, clock_ns: int) -> Path:
 
 def seen(path: Motion, watched: Watched, sigma: tuple[float, float], seed: int) -> F64:
     """T_mocap_body (N, 4, 4), a pose a frame, NaN where it is hidden. sigma: m, rad."""
-    true_ns = np.arange(path.start_ns, path.end_ns, round(1e9 / RATE_HZ))
-    true_ns = path.start_ns + np.round(np.arange(len(true_ns)) * 1e9 / RATE_HZ).astype(np.int64)
-    true_ns = true_ns[true_ns <= path.end_ns]
+    frames = np.arange((path.end_ns - path.start_ns) * RATE_HZ // 10**9)
+    true_ns = path.start_ns + np.round(frames * 1e9 / RATE_HZ).astype(np.int64)
     rng, n = np.random.default_rng((seed, 3)), len(true_ns)
     T = TILT @ path.poses(true_ns) @ watched.T_body_mocap
-    T = T @ se3.exp(np.concatenate([rng.normal(0, sigma[1], (n, 3)), rng.normal(0, sigma[0], (n, 3))], axis=1))
+    T = T @ se3.exp(
+        np.concatenate([rng.normal(0, sigma[1], (n, 3)), rng.normal(0, sigma[0], (n, 3))], axis=1)
+    )
     t = (true_ns - path.start_ns) * 1e-9
     for start, end in watched.hidden:
         T[(t > start) & (t < end)] = np.nan

@@ -44,8 +44,11 @@ def draw_alignment(path: Path, devices: Mapping[str, tuple[Aligned, Trajectory]]
 
 def _broken(truth: Trajectory) -> F64:
     """Positions (N, 3), with NaN where the truth has a gap."""
-    after = np.flatnonzero(np.diff(truth.stamps_ns) > _HOLE_NS) + 1
-    return np.insert(truth.T[:, :3, 3], after, np.nan, axis=0)
+    return np.insert(truth.T[:, :3, 3], _after_holes(truth.stamps_ns), np.nan, axis=0)
+
+
+def _after_holes(stamps_ns: I64) -> I64:
+    return np.flatnonzero(np.diff(stamps_ns) > _HOLE_NS) + 1
 
 
 def _turning(axes: Any, name: str, aligned: Aligned, colour: str) -> None:
@@ -59,11 +62,13 @@ def _turning(axes: Any, name: str, aligned: Aligned, colour: str) -> None:
         (times, seen, {"color": "black", "linewidth": 0.8, "label": "motion capture"}),
     ):
         keep = (stamps >= start) & (stamps <= start + _SHOWN_NS)
-        axes.plot(stamps[keep] * 1e-9, rate[keep], **look)
+        holes = _after_holes(stamps[keep])
+        axes.plot(np.insert(stamps[keep] * 1e-9, holes, np.nan), np.insert(rate[keep], holes, np.nan), **look)
     axes.set(title=name, ylabel="turning [rad/s]", xlabel="motion capture's clock [s]")
     axes.ticklabel_format(useOffset=False)
     axes.grid(alpha=0.3)
-    axes.legend(loc="upper right")
+    axes.set_ylim(0, 1.35 * axes.get_ylim()[1])  # room for the legend
+    axes.legend(loc="upper right", ncols=2, frameon=False)
 
 
 def _rate(stamps: I64, turned: F64) -> tuple[I64, F64]:

@@ -1,0 +1,175 @@
+"""`share dataset align` over an emulated room: clocks that know nothing of each other, bodies that sit askew,
+holes, noise, another frame and rate; against what the emulator knows. And over real recordings."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from field_sim import Watched, export, offset_of, paths, reclocked, seen
+from small_session import small_profile, small_recipe
+
+from share.emulate.session import make_session
+from share.geometry import se3
+from share.io.json_file import read_json
+from share.io.mocap_report import read_mounting
+from share.io.session import read_session
+from share.io.source import open_source
+from share.io.trajectory import read_tum
+from share.metrics.ate import ate, joint_ate
+
+SECONDS = 14.0
+WATCHED = {
+    "ann": Watched(se3.exp(np.array([0.3, -2.1, 0.7, 0.04, -0.09, 0.06])), 0, ((5.0, 5.3), (8.0, 9.5))),
+    "bob": Watched(se3.exp(np.array([1.2, 0.4, -0.3, -0.08, 0.02, 0.1])), -123_456_789_012_345),
+}
+NOISE = (0.001, np.radians(0.2))
+
+
+class Room:
+    """The emulated session, its recordings by clocks of their own, and the motion capture's export."""
+
+    def __init__(self, folder: Path) -> None:
+        recipe = small_recipe(
+            small_profile(folder), *(f"{name}=walk:" for name in WATCHED), seconds=SECONDS, seed=5
+        )
+        self.folder, self.session = folder, make_session(recipe, folder / "session", workers=1)
+        self.paths = paths(recipe, folder / "room")
+        for name, watched in WATCHED.items():
+            reclocked(self.session / name, folder / f"{name}.mcap", watched.clock_ns)
+        T = {name: seen(self.paths[name], w, NOISE, k) for k, (name, w) in enumerate(WATCHED.items())}
+        export(folder / "vicon.csv", {"Headset1": T["ann"], "BOB": T["bob"]})
+
+    @property
+    def recordings(self) -> list[str]:
+        return [f"{name}={self.folder / name}.mcap" for name in WATCHED]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Room:
+    return Room(tmp_path_factory.mktemp("field"))
+
+
+@pytest.fixture
+def made(share, room) -> Path:
+    """Aligned once."""
+    out = room.folder / "room1"
+    if not out.exists():
+        told = ("--body", "ann=Headset1", "--kind", "bob=robot", "--json")
+        done = share(
+            "dataset", "align", *room.recordings, "--mocap", room.folder / "vicon.csv", *told, "--out", out
+        )
+        assert (done.code, done.err) == (0, "")
+        assert json.loads(done.out) == read_json(out / "align.json")
+    return out
+
+
+def test_offset_and_mounting_are_found(room, made):
+    found = read_json(made / "align.json")
+    for name, watched in WATCHED.items():
+        assert abs(found[name]["offset_ns"] - offset_of(room.paths[name], watched)) < 300_000
+        error = se3.log(se3.inverse(watched.T_body_mocap) @ found[name]["T_body_mocap"])
+        assert np.degrees(np.linalg.norm(error[:3])) < 0.15 and np.linalg.norm(error[3:]) < 0.004
+        assert found[name]["tilt_deg"] == pytest.approx(np.hypot(0.3, 0.5), abs=0.03)
+        assert found[name]["next_correlation"] < 0.7 < 0.95 < found[name]["correlation"]
+    assert [len(found[name]["gaps_s"]) for name in WATCHED] == [1, 0]
+    ((start, end),) = found["ann"]["gaps_s"]
+    assert end - start == pytest.approx(1.5, abs=0.1)
+    assert found["ann"]["truth_s"] == pytest.approx(SECONDS - 1.5, abs=0.3)
+
+
+def test_the_truth_is_the_emulators_in_one_world(room, made):
+    """Millimetres, with one turn and shift for both devices, and no pose in the gap."""
+    pairs = {}
+    for name, watched in WATCHED.items():
+        own = read_tum(made / "truth" / f"{name}.tum")
+        path = room.paths[name]
+        real = own._replace(
+            T=path.poses(np.clip(own.stamps_ns - watched.clock_ns, path.start_ns, path.end_ns))
+        )
+        assert ate(own, real).rmse < 0.002
+        pairs[name] = (own, real)
+        t = (own.stamps_ns - watched.clock_ns - path.start_ns) * 1e-9
+        assert not any(((t > a + 0.05) & (t < b - 0.05)).any() for a, b in watched.hidden if b - a > 1)
+    assert joint_ate(pairs).rmse < 0.003
+
+
+def test_the_session_is_as_others_are(room, made):
+    agents = read_session(made).agents
+    assert {name: str(agent.kind) for name, agent in agents.items()} == {"ann": "ar", "bob": "robot"}
+    assert sorted(os.listdir(made)) == [
+        "align.json",
+        "align.png",
+        "ann.mcap",
+        "bob.mcap",
+        "session.yaml",
+        "truth",
+    ]
+    for name in agents:
+        assert os.path.samefile(made / f"{name}.mcap", room.folder / f"{name}.mcap")  # no copy
+        source, was = open_source(str(made / name)), open_source(str(room.session / name))
+        assert source.truth() is not None and len(source.stamps()["imu"]) == len(was.stamps()["imu"])
+        np.testing.assert_allclose(source.rig.T_body_cam0, was.rig.T_body_cam0, atol=1e-9)
+
+
+def test_it_is_played_and_scored_as_with_the_real_truth(share, room, made, tmp_path):
+    """The same frames of the same session: the errors differ by what the truths differ."""
+    ran = {}
+    for name, session in (("real", room.session), ("made", made)):
+        run = tmp_path / name
+        assert share("evaluate", "run", session, "--virtual", "--out", run).code == 0
+        done = share("evaluate", "score", run, "--json")
+        assert done.code == 0
+        ran[name] = json.loads(done.out)["runs"][0]["agents"]
+    for real, field in zip(ran["real"], ran["made"], strict=True):
+        assert real["name"] == field["name"]
+        assert field["odometry_cm"] == pytest.approx(real["odometry_cm"], abs=0.3)
+
+
+def test_with_a_calibration_the_recording_is_written_anew(share, room, tmp_path):
+    told = ("--mocap", room.folder / "vicon.csv", "--calib", room.session / "session.yaml")
+    done = share("dataset", "align", room.recordings[1], *told, "--out", tmp_path / "x")
+    assert done.code != 0 and not (tmp_path / "x").exists()  # that is no calibration
+
+
+def test_wrong_use_is_one_line_and_leaves_nothing(share, room, tmp_path):
+    def refused(code: int, *arguments: object) -> str:
+        out = tmp_path / "out"
+        done = share("dataset", "align", *arguments, "--out", out)
+        assert done.code == code and done.err.count("\n") == 1, done.err
+        assert os.listdir(tmp_path) == []
+        return done.err
+
+    ann, bob = room.recordings
+    csv = ("--mocap", room.folder / "vicon.csv")
+    assert "give NAME=RECORDING" in refused(2, room.folder / "ann.mcap", *csv)
+    assert "no body for 'ann' (give --body ann=BODY); it has Headset1, BOB" in refused(2, ann, *csv)
+    assert "no body 'Hat'" in refused(2, ann, *csv, "--body", "ann=Hat")
+    assert "there is no device 'eve'" in refused(2, bob, *csv, "--body", "eve=BOB")
+    assert "--kind cat" in refused(2, bob, *csv, "--kind", "cat")
+    assert "has no motion capture" in refused(2, bob, "--mocap", f"bob={room.folder / 'no.csv'}", "ann=x")
+    assert "no such file of motion capture" in refused(2, bob, "--mocap", room.folder / "no.csv")
+    assert "`share calibrate mocap` makes one" in refused(2, bob, *csv, "--mounting", tmp_path)
+    assert "is given twice" in refused(2, bob, bob, *csv)
+    assert "name of a folder" in refused(2, f"truth={room.folder / 'bob.mcap'}", *csv)
+    assert "bob: mocap and IMU" in refused(1, bob, *csv, "--body", "bob=Headset1")
+
+
+def test_nothing_is_written_over(share, room, made):
+    before = (made / "session.yaml").read_bytes()
+    done = share("dataset", "align", room.recordings[1], "--mocap", room.folder / "vicon.csv", "--out", made)
+    assert done.code == 2 and "is not an empty folder" in done.err
+    assert (made / "session.yaml").read_bytes() == before
+
+
+def test_a_mounting_is_read_back(tmp_path):
+    (tmp_path / "mocap.yaml").write_text(
+        "T_body_mocap: [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1]]\n"
+        "sigma: {rotation_deg: [0.01, 0.05, 0.02], position_m: [0.001, 0.0005, 0.002]}\n"
+    )
+    T, (turn, shift) = read_mounting(tmp_path)
+    assert T[:3, 3].tolist() == [0.1, 0, 0.2]
+    assert (np.degrees(turn), shift) == pytest.approx((0.1, 0.004))  # twice the worst axis
