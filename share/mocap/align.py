@@ -68,8 +68,8 @@ def align(imu: ImuBatch, noise: ImuNoise, mocap: Mocap, options: FitOptions) -> 
         raise MisfitError(
             "which time of the motion capture is which of the IMU is not clear: two offsets explain the "
             f"turning nearly alike (correlations {peak.correlation:.3f} and {peak.rival:.3f}, lead "
-            f"{peak.lead:.1f}, needed {LEAST_LEAD:.0f}); record longer, turn irregularly, or say how near "
-            "the clocks are"
+            f"{peak.lead:.1f}, needed {LEAST_LEAD:.0f}); is that this device's "
+            "body? Record longer, turn irregularly, or say how near the clocks are"
         )
     moved = mocap.shifted(peak.offset_ns)
     return Aligned(imu, mocap, peak, fit(imu, noise, moved, replace(options, within_s=0.0)))
