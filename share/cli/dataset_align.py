@@ -139,8 +139,8 @@ def align(
         found = write_session(work, devices, stages)
     click.echo(json.dumps(found) if as_json else _text(found))
     for name, one in found.items():
-        if one["unsure"]:
-            click.echo(f"share: {name}: {one['unsure']}", err=True)
+        for doubt in one["doubts"]:
+            click.echo(f"share: {name}: {doubt}", err=True)
     if not as_json:
         click.echo(f"{out}: ready; `share evaluate run {out} --virtual --out RUN` plays it")
 

@@ -27,7 +27,7 @@ from share.io.recording import Source
 from share.io.session import SCHEMA, SESSION
 from share.io.trajectory import Trajectory, format_tum
 from share.mocap.align import Aligned, level
-from share.mocap.verdict import sigmas, unsure
+from share.mocap.verdict import sigmas
 from share.types import AgentKind
 
 REPORT, PICTURE = "align.json", "align.png"
@@ -87,7 +87,7 @@ def found_of(device: Device) -> dict[str, Any]:
         "doubted": fit.residuals.doubted,
         "truth_s": aligned.seconds,
         "gaps_s": gaps.tolist(),
-        "unsure": unsure(fit),
+        "doubts": aligned.doubts,
     }
 
 

@@ -19,9 +19,11 @@ from share.mocap.mocap import Mocap
 from share.mocap.offset import Peak, find_offset
 from share.mocap.options import FitOptions
 from share.mocap.path import FittedPath
+from share.mocap.verdict import unsure
 from share.types import F64, I64, ImuBatch
 
 LEAST_LEAD = 10.0  # e^10 to one; recordings that do not belong together come to 0.4, 10 s that do to 15
+_MOST_MOVED_NS = 4_000_000  # turning alone is right to 0.5 ms for people, 2.3 ms for robots
 _STEP_NS = 10_000_000  # of the truth: straight lines between are off by 0.1 mm at 8 m/s^2
 
 
@@ -53,6 +55,19 @@ class Aligned:
     def seconds(self) -> float:
         """For how long the path is vouched for."""
         return len(self.stamps_ns) * _STEP_NS * 1e-9
+
+    @property
+    def doubts(self) -> list[str]:
+        """What is not as it should be, each in a line."""
+        moved, out = self.fit.offset_ns, []
+        if (told := unsure(self.fit)) is not None:
+            out.append(told)
+        if abs(moved) > _MOST_MOVED_NS:
+            out.append(
+                f"the fit puts the clocks {moved * 1e-6:+.1f} ms from where the turning alone does, and may "
+                "be wrong by that; are the motion capture's poses raw, neither smoothed nor an estimate?"
+            )
+        return out
 
     def truth(self, R_mocap_world: F64) -> F64:
         """T_world_body (N, 4, 4) at `stamps_ns`, in the world that R_mocap_world (3, 3) levels."""

@@ -192,3 +192,22 @@ def test_a_mounting_is_read_back(tmp_path):
     T, (turn, shift) = read_mounting(tmp_path)
     assert T[:3, 3].tolist() == [0.1, 0, 0.2]
     assert (np.degrees(turn), shift) == pytest.approx((0.1, 0.004))  # twice the worst axis
+
+
+@pytest.mark.slow
+def test_a_real_recording_against_what_is_no_raw_motion_capture(share, shared_data, tmp_path):
+    """EuRoC's truth is an estimate by the same IMU: its body is found as the Vicon's is known to sit
+    (docs/mocap-fit.md), its clock to some ms, and that is said."""
+    folder = shared_data / "real" / "euroc_v1_01_keyframes"
+    lines = (folder / "mav0" / "state_groundtruth_estimate0" / "data.csv").read_text().splitlines()[1:]
+    rows = (line.split(",") for line in lines)
+    away = 1_403_715_000_000_000_000
+    told = (",".join([str(int(stamp) - away), *values[:7]]) for stamp, *values in rows)
+    (tmp_path / "seen.csv").write_text("\n".join(told) + "\n")
+    options = ("--mocap", tmp_path / "seen.csv", "--sigma-mm", "1.5", "--json", "--out", tmp_path / "made")
+    done = share("dataset", "align", f"ann={folder}", *options)
+    found = json.loads(done.out)["ann"]
+    assert done.code == 0 and "neither smoothed nor an estimate" in done.err
+    assert abs(found["offset_ns"] - away) < 10_000_000 and found["lead"] > 100
+    assert found["body_turned_deg"] == pytest.approx(0.28, abs=0.05) and found["left_mm"] < 1.5
+    assert share("dataset", "info", tmp_path / "made" / "ann").code == 0

@@ -9,7 +9,12 @@ from mocap_sim import BODY, NOISE, START_NS, TILT, Motion, record_imu, record_mo
 
 from share.errors import DataError, MisfitError
 from share.geometry import se3
+from share.io.calibration import imu_noise
+from share.io.imu_table import read_imu
+from share.io.mocap_file import read_mocap
+from share.io.section import read_yaml
 from share.mocap.align import LEAST_LEAD, align, level
+from share.mocap.mocap import Mocap
 from share.mocap.offset import find_offset
 from share.mocap.options import FitOptions
 from share.types import F64
@@ -107,3 +112,29 @@ def test_one_level_world_is_the_mean_by_what_each_fit_knows(done) -> None:
     a, b, c = tilted(0.010, 0.002, 1e-3), tilted(0.014, -0.002, 1e-3), tilted(0.5, 0.5, 1e3)
     np.testing.assert_allclose(se3.so3_log(level([a, b, c])), [0.012, 0.0, 0.0], atol=1e-6)
     assert np.linalg.norm(se3.so3_log(level([found.fit]))[:2] - TILT) < np.radians(0.05)
+
+
+def test_poses_that_lag_behind_their_turning_are_doubted() -> None:
+    """Positions 20 ms late against the rotations, as a filter makes them."""
+    motion = Motion(3)
+    mocap = record_mocap(motion, 20, AWAY_NS)
+    assert align(record_imu(motion, 20), NOISE, mocap, ANYWHERE).doubts == []
+    t = mocap.stamps_ns[100:-100]
+    T = mocap.at(t - 20_000_000)
+    T[:, :3, :3] = mocap.at(t)[:, :3, :3]
+    found = align(record_imu(motion, 20), NOISE, Mocap(t, T), ANYWHERE)
+    assert any("be wrong by that" in doubt for doubt in found.doubts)
+
+
+@pytest.mark.slow
+def test_three_rooms_of_one_device_agree_on_its_clock(shared_data) -> None:
+    """TUM-VI's clocks were one, nearly; here they are 44 years apart, and are found to be one again."""
+    tumvi, offsets = shared_data / "motion" / "tumvi", []
+    noise = imu_noise(read_yaml(tumvi / "calib" / "kalibr_imu_chain.yaml").section("imu0"), "update_rate")
+    for room in ("room1", "room2", "room3"):
+        mocap = read_mocap(tumvi / room / "groundtruth.csv").shifted(-1_403_636_000_123_456_789)
+        options = replace(ANYWHERE, sigma_position=0.0005)
+        found = align(read_imu(str(tumvi / room / "imu0.csv")).imu, noise, mocap, options)
+        assert found.peak.lead > 100 and found.doubts == []
+        offsets.append((found.offset_ns - 1_403_636_000_123_456_789) * 1e-6)
+    assert max(np.abs(offsets)) < 1.0 and max(offsets) - min(offsets) < 0.4
