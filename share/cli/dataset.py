@@ -1,4 +1,4 @@
-"""`share dataset`: look into, convert and recover recordings; look into and export maps."""
+"""`share dataset`: look into, convert, recover and align recordings; look into and export maps."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ from typing import Any
 
 import click
 
-from share.cli import dataset_map, options
+from share.cli import dataset_align, dataset_map, options
 from share.cli.progress import progress
 from share.errors import UsageError
 
 
 @click.group()
 def dataset() -> None:
-    """Look into, convert and recover recordings; look into and export maps.
+    """Look into, convert, recover and align recordings; look into and export maps.
 
     \b
     Example:  share dataset info rec/kitchen
     """
 
 
+dataset.add_command(dataset_align.align)
 dataset.add_command(dataset_map.export)
 
 

@@ -11,7 +11,6 @@ import click
 
 from share.cli import options
 from share.cli.progress import Stages
-from share.errors import UsageError
 
 _WORKERS = 2
 
@@ -120,8 +119,8 @@ def emulate(
         seconds=seconds,
         seed=seed,
         size=size,
-        sensors=_by_name("--sensors", sensors) or ({"": "stereo"} if euroc else {}),
-        profiles=_by_name("--profile", profiles),
+        sensors=options.by_name("--sensors", sensors) or ({"": "stereo"} if euroc else {}),
+        profiles=options.by_name("--profile", profiles),
         effects=parse(effects),
         images=images or ("png" if euroc else "jpeg"),
     )
@@ -129,17 +128,6 @@ def emulate(
         folder = make_session(recipe, Path(out), workers, stages, asl=euroc)
     made = _described(folder, euroc)
     click.echo(json.dumps(made) if as_json else _text(made))
-
-
-def _by_name(option: str, words: tuple[str, ...]) -> dict[str, str]:
-    """`NAME=VALUE` by its name, a bare VALUE, which is for everybody, by ""."""
-    out: dict[str, str] = {}
-    for word in words:
-        name, _, value = word.partition("=") if "=" in word else ("", "", word)
-        if name in out:
-            raise UsageError(f"{option} is given twice for {name or 'everybody'}; give one of them")
-        out[name] = value
-    return out
 
 
 def _described(folder: Path, euroc: bool) -> dict[str, Any]:

@@ -70,6 +70,17 @@ def agent_name(value: str) -> str:
     return value
 
 
+def by_name(option: str, words: tuple[str, ...]) -> dict[str, str]:
+    """`NAME=VALUE` by its name, a bare VALUE, which is for everybody, by ""."""
+    out: dict[str, str] = {}
+    for word in words:
+        name, _, value = word.partition("=") if "=" in word else ("", "", word)
+        if name in out:
+            raise UsageError(f"{option} is given twice for {name or 'everybody'}; give one of them")
+        out[name] = value
+    return out
+
+
 def say_notes(source: Source) -> None:
     """What a person should know of a recording, such as streams that are not used: a line each on stderr."""
     for note in source.notes:

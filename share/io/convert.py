@@ -27,6 +27,14 @@ def to_mcap(source: Source, out: Path, jpeg: int | None, progress: Progress) -> 
 
     jpeg: quality to compress gray images to, None to keep them. progress: told of each cam0 image.
     """
+    write_recording(source, out, jpeg, progress)
+    truth = source.truth()
+    if truth is not None:
+        atomic_write(out.with_name(out.stem + ".truth.tum"), format_tum(truth))
+
+
+def write_recording(source: Source, out: Path, jpeg: int | None, progress: Progress) -> None:
+    """`to_mcap` without the truth."""
     check_writable(out)
     try:
         with Recorder(out, source.rig, jpeg) as recorder:
@@ -35,9 +43,6 @@ def to_mcap(source: Source, out: Path, jpeg: int | None, progress: Progress) -> 
     except BaseException:  # also Ctrl-C
         out.with_name(out.name + ".part").unlink(missing_ok=True)
         raise
-    truth = source.truth()
-    if truth is not None:
-        atomic_write(out.with_name(out.stem + ".truth.tum"), format_tum(truth))
 
 
 def to_euroc(source: Source, out: Path, progress: Progress) -> None:

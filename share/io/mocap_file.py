@@ -1,4 +1,4 @@
-"""A motion capture's poses from a file: TUM, or CSV as EuRoC and TUM-VI have it."""
+"""A motion capture's poses from a file: TUM, CSV as EuRoC and TUM-VI have it, or Vicon's export."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from share.errors import DataError, UsageError
 from share.io import tables
 from share.io.trajectory import poses, read_tum
+from share.io.vicon import is_vicon, read_vicon
 from share.mocap.mocap import Mocap
 
 
@@ -26,3 +27,13 @@ def read_mocap(path: Path) -> Mocap:
         return Mocap(stamps, T)
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
+
+
+def read_bodies(path: Path, rotations: str = "helical") -> dict[str, Mocap]:
+    """All rigid bodies of a file by their names; "" in a file that tells of one without naming it.
+
+    rotations: as for `read_vicon`. Raises as `read_mocap`.
+    """
+    if path.is_file() and path.suffix.lower() == ".csv" and is_vicon(path):
+        return read_vicon(path, rotations)
+    return {"": read_mocap(path)}

@@ -1,15 +1,22 @@
-"""What `share calibrate mocap` leaves behind."""
+"""What `share calibrate mocap` leaves behind, and reading it back."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from share.calibration.mounting import Check
+from share.errors import UsageError
+from share.io.section import read_yaml
 from share.mocap.fit import Fit
 from share.mocap.verdict import sigmas, unsure
+from share.types import F64
+
+MOCAP = "mocap.yaml"
+_LEAST = 1e-4  # rad, m: no mounting is known better
 
 
 def mocap_text(fit: Fit, name: str, truth: str) -> str:
@@ -36,6 +43,18 @@ def mocap_text(fit: Fit, name: str, truth: str) -> str:
             "",
         ]
     )
+
+
+def read_mounting(path: Path) -> tuple[F64, tuple[float, float]]:
+    """T_body_mocap (4, 4) of a mocap.yaml, or of the folder that has one; and how far off it may be, rad and
+    m: twice the worst axis' sigma, as real recordings show. Raises UsageError, ConfigError."""
+    file = path / MOCAP if path.is_dir() else path
+    if not file.is_file():
+        raise UsageError(f"{file}: no such file; `share calibrate mocap` makes one")
+    top = read_yaml(file)
+    sigma = top.section("sigma")
+    turn, shift = (max(sigma.numbers(key, (3,))) for key in ("rotation_deg", "position_m"))
+    return top.pose("T_body_mocap"), (max(2 * float(np.radians(turn)), _LEAST), max(2 * shift, _LEAST))
 
 
 def mocap_json(fit: Fit, name: str, truth: str, checked: Check | None) -> dict[str, Any]:

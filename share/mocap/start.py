@@ -31,7 +31,7 @@ def hand_eye(imu: ImuBatch, mocap: Mocap) -> tuple[F64, F64]:
     if spread[1] < _LEAST_TURN * WINDOW_NS * 1e-9:
         raise DataError(
             "mocap and IMU: the body turned about one axis only, so how the mocap's body sits on it cannot "
-            "be found; turn it about two axes, or give T_body_mocap"
+            "be found; turn it about two axes, or give T_body_mocap (share dataset align: --mounting)"
         )
     like = np.abs(np.linalg.norm(seen, axis=1) - np.linalg.norm(felt, axis=1))
     like = like <= 3 * np.median(like)  # an outlier of the mocap turns by something else

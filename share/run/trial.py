@@ -15,12 +15,13 @@ from typing import Any
 
 from share import __version__
 from share.config import Config
+from share.core.measurement import CAM0
 from share.errors import DataError, UsageError
 from share.io.files import atomic_write, new_folder
 from share.io.json_file import read_json
 from share.io.machine import describe_machine
 from share.io.session import Session, read_session
-from share.io.trajectory import read_tum
+from share.io.source import open_source
 from share.run.play import Progress, Terms, play
 from share.run.virtual import play_virtually
 from share.strict import to_mapping
@@ -105,12 +106,13 @@ def settings_of(config: Config, seed: int) -> str:
 
 
 def _seconds(session: Session) -> float:
-    """Of the longest truth."""
-    spans = []
-    for name in session.agents:
+    """From the first image of all to the last, by the session's clock."""
+    first, last = [], []
+    for name, agent in session.agents.items():
         path = session.folder / "truth" / f"{name}.tum"
         if not path.is_file():
             raise UsageError(f"{path}: no such file; without the truth of all agents nothing can be scored")
-        stamps_ns = read_tum(path).stamps_ns
-        spans.append((int(stamps_ns[-1]) - int(stamps_ns[0])) / 1e9 if len(stamps_ns) else 0.0)
-    return max(spans)
+        stamps_ns = open_source(f"{session.folder}/{name}").stamps()[CAM0]
+        first.append(int(stamps_ns[0]) - agent.clock_offset_ns)
+        last.append(int(stamps_ns.max()) - agent.clock_offset_ns)
+    return (max(last) - min(first)) / 1e9

@@ -1,0 +1,270 @@
+"""`share dataset align`: recordings of several devices and a motion capture become one session."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from share.cli import options
+from share.cli.progress import Stages
+from share.cli.table import aligned
+from share.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from share.io.field_session import Device
+    from share.mocap.mocap import Mocap
+    from share.mocap.options import FitOptions
+
+_CLOCK = ("device", "offset s", "± ms", "drift ppm", "alike", "next")
+_MOUNTING = ("body deg", "±", "body mm", "±", "tilt deg")
+_LEFT = ("left mm", "left deg", "doubted %", "gaps", "truth s")
+
+
+@click.command(short_help="Make a session of field recordings and a motion capture.")
+@click.argument("recordings", nargs=-1, required=True, metavar="NAME=RECORDING...")
+@click.option(
+    "--mocap",
+    "mocaps",
+    multiple=True,
+    required=True,
+    metavar="[NAME=]FILE",
+    help="What the motion capture saw: Vicon's CSV, TUM, or CSV with t[ns], x y z, qw qx qy qz.",
+)
+@click.option(
+    "--body",
+    "bodies",
+    multiple=True,
+    metavar="NAME=BODY",
+    help="Which rigid body a device is.  [default: the one of its name, or the only one]",
+)
+@click.option(
+    "--kind", "kinds", multiple=True, metavar="[NAME=]ar|robot", help="What a device is.  [default: ar]"
+)
+@click.option(
+    "--calib",
+    "calibs",
+    multiple=True,
+    metavar="[NAME=]FILE",
+    help="As for share track, for a device or all; its recording is then written anew.",
+)
+@click.option(
+    "--mounting",
+    "mountings",
+    multiple=True,
+    metavar="NAME=DIR",
+    help="By share calibrate mocap: how a body sits on a device that turns about one axis only.",
+)
+@click.option(
+    "--rotations",
+    type=click.Choice(["helical", "xyz"]),
+    default="helical",
+    show_default=True,
+    help="What RX, RY, RZ of Vicon's CSV are, where there is no RW.",
+)
+@click.option(
+    "--within",
+    type=click.FloatRange(min=0.01),
+    metavar="S",
+    help="How far apart the clocks may be, s.  [default: as far as they like]",
+)
+@click.option(
+    "--sigma-mm",
+    type=click.FloatRange(min=0.01),
+    default=2.0,
+    show_default=True,
+    help="Noise of the motion capture.",
+)
+@click.option(
+    "--bridge",
+    type=click.FloatRange(0.1, 2),
+    default=0.5,
+    show_default=True,
+    metavar="S",
+    help="Holes of the motion capture up to this long are left to the IMU; longer ones stay holes.",
+)
+@click.option(
+    "--out", required=True, metavar="SESSION", type=click.Path(path_type=Path), help="A new folder."
+)
+@options.as_json
+def align(
+    recordings: tuple[str, ...],
+    mocaps: tuple[str, ...],
+    bodies: tuple[str, ...],
+    kinds: tuple[str, ...],
+    calibs: tuple[str, ...],
+    mountings: tuple[str, ...],
+    out: Path,
+    as_json: bool,
+    **fitting: Any,
+) -> None:
+    """Make one session, as `share evaluate` takes it, of recordings of several devices and what a motion
+    capture saw of them. No clocks need agree: the offset of each is found from how device and body turn,
+    and refused where that is not clear.
+
+    The truth of each is the path of its IMU that agrees with the motion capture and with the IMU; where the
+    motion capture was blind for longer than --bridge, there is none.
+
+    \b
+    Example:  share dataset align ann=ann.mcap bob=bob.mcap --mocap vicon.csv \\
+                  --body ann=Headset1 --kind bob=robot --mounting bob=calib/bob --out room1
+              share evaluate run room1 --virtual --out runs/room1
+    """
+    from share.io.field_session import write_session
+    from share.io.files import new_folder
+    from share.mocap.options import FitOptions
+
+    names = _devices(recordings)
+    told = {
+        option: _of(names, option, words)
+        for option, words in (
+            ("--mocap", mocaps),
+            ("--body", bodies),
+            ("--kind", kinds),
+            ("--calib", calibs),
+            ("--mounting", mountings),
+        )
+    }
+    chosen = FitOptions(
+        sigma_position=fitting["sigma_mm"] * 1e-3, within_s=fitting["within"], bridge_s=fitting["bridge"]
+    )
+    with new_folder(out) as work, Stages() as stages:
+        seen = _bodies(names, told["--mocap"], told["--body"], fitting["rotations"])
+        devices = {
+            name: _device(name, path, told, seen[name], chosen, stages) for name, path in names.items()
+        }
+        found = write_session(work, devices, stages)
+    click.echo(json.dumps(found) if as_json else _text(found))
+    for name, one in found.items():
+        for doubt in one["doubts"]:
+            click.echo(f"share: {name}: {doubt}", err=True)
+    if not as_json:
+        click.echo(f"{out}: ready; `share evaluate run {out} --virtual --out RUN` plays it")
+
+
+def _devices(recordings: tuple[str, ...]) -> dict[str, str]:
+    """The recording of each device, by its name."""
+    for text in recordings:
+        if "=" not in text:
+            raise UsageError(f"{text}: give NAME=RECORDING, such as ann={text}")
+    out = options.by_name("RECORDING", recordings)
+    for name in out:
+        options.agent_name(name)
+        if name == "truth":
+            raise UsageError("truth: is the name of a folder of the session; give the device another")
+    return out
+
+
+def _of(names: dict[str, str], option: str, words: tuple[str, ...]) -> dict[str, str]:
+    """What an option says of each device, by its name; of all others under ""."""
+    out = options.by_name(option, words)
+    for name in out:
+        if name and name not in names:
+            raise UsageError(f"{option} {name}=: there is no device '{name}'; there are {', '.join(names)}")
+    return out
+
+
+def _bodies(
+    names: dict[str, str], files: dict[str, str], bodies: dict[str, str], rotations: str
+) -> dict[str, tuple[str, Mocap]]:
+    """By device: file and body for a person, and what the motion capture saw of it."""
+    from share.io.mocap_file import read_bodies
+
+    read = {file: read_bodies(Path(file), rotations) for file in dict.fromkeys(files.values())}
+    out = {}
+    for name in names:
+        file = files.get(name, files.get("", ""))
+        if not file:
+            raise UsageError(f"{name}: has no motion capture; give --mocap {name}=FILE, or FILE for all")
+        body = _body(name, file, list(read[file]), bodies.get(name))
+        out[name] = (f"{file} {body}".strip(), read[file][body])
+    return out
+
+
+def _body(name: str, file: str, there: list[str], wanted: str | None) -> str:
+    alike = [body for body in there if body.lower() == (wanted or name).lower()]
+    if alike:
+        return alike[0]
+    if wanted is None and len(there) == 1:
+        return there[0]
+    listed = ", ".join(there) if any(there) else "one without a name"
+    what = f"body '{wanted}'" if wanted else f"body for '{name}' (give --body {name}=BODY)"
+    raise UsageError(f"{file}: has no {what}; it has {listed}")
+
+
+def _device(
+    name: str,
+    recording: str,
+    told: dict[str, dict[str, str]],
+    seen: tuple[str, Mocap],
+    chosen: FitOptions,
+    stages: Stages,
+) -> Device:
+    from share.io.field_session import Device
+    from share.io.imu_table import read_imu
+    from share.io.source import open_source
+    from share.mocap.align import align as run
+
+    def of(option: str) -> str | None:
+        return told[option].get(name, told[option].get(""))
+
+    kind, calib = _kind(of("--kind") or "ar"), of("--calib")
+    source = open_source(recording, calib)
+    if source.rig.imu is None:
+        raise UsageError(f"{recording}: has no IMU, or its calibration has none; align goes by the gyro")
+    options = _mounted(chosen, of("--mounting"))
+    imu = read_imu(recording, lambda done, total: stages(f"reading {name}", done, total)).imu
+    stages(f"fitting {name}", 0, 1)
+    try:
+        found = run(imu, source.rig.imu, seen[1], options)
+    except DataError as error:
+        raise type(error)(f"{name}: {error}") from None
+    stages(f"fitting {name}", 1, 1)
+    as_it_is = Path(recording) if recording.endswith(".mcap") and calib is None else None
+    return Device(kind, source, as_it_is, seen[0], found)
+
+
+def _kind(text: str) -> Any:
+    from share.types import AgentKind
+
+    if text not in list(AgentKind):
+        raise UsageError(f"--kind {text}: is not known; known: {', '.join(AgentKind)}")
+    return AgentKind(text)
+
+
+def _mounted(chosen: FitOptions, mounting: str | None) -> FitOptions:
+    from share.io.mocap_report import read_mounting
+
+    if mounting is None:
+        return chosen
+    T, sigma = read_mounting(Path(mounting))
+    return replace(chosen, T_body_mocap=T, guess_sigma=sigma)
+
+
+def _text(found: dict[str, Any]) -> str:
+    """A line a device."""
+    rows = [
+        [
+            name,
+            f"{one['offset_ns'] * 1e-9:+.6f}",
+            f"{one['offset_sigma_ms']:.2f}",
+            f"{one['drift_ppm']:+.1f}",
+            f"{one['correlation']:.3f}",
+            f"{one['next_correlation']:.3f}",
+            f"{one['body_turned_deg']:.2f}",
+            f"{one['body_turned_sigma_deg']:.2f}",
+            f"{one['body_shifted_mm']:.1f}",
+            f"{one['body_shifted_sigma_mm']:.1f}",
+            f"{one['tilt_deg']:.3f}",
+            f"{one['left_mm']:.1f}",
+            f"{one['left_deg']:.2f}",
+            f"{100 * one['doubted']:.1f}",
+            f"{len(one['gaps_s'])}",
+            f"{one['truth_s']:.1f}",
+        ]
+        for name, one in found.items()
+    ]
+    return aligned([(*_CLOCK, *_MOUNTING, *_LEFT), *rows])

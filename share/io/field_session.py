@@ -1,0 +1,138 @@
+"""A session out of what was recorded in the field: recordings, truths, what was found, a picture.
+
+A device's stamps stay as they are, in its recording and in its truth; `clock_offset_ns` says what they
+are by the motion capture's clock, which is the session's.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from share import __version__
+from share.geometry import se3
+from share.io.align_picture import draw_alignment
+from share.io.convert import write_recording
+from share.io.files import atomic_write
+from share.io.json_file import known
+from share.io.kalibr import to_kalibr
+from share.io.recording import Source
+from share.io.session import SCHEMA, SESSION
+from share.io.trajectory import Trajectory, format_tum
+from share.mocap.align import Aligned, level
+from share.mocap.verdict import sigmas
+from share.types import AgentKind
+
+REPORT, PICTURE = "align.json", "align.png"
+Told = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Device:
+    """One that was in the room. recording: the file that can be taken as it is; None: it is written anew.
+    seen_in: the motion capture's file, and the body in it, for a person."""
+
+    kind: AgentKind
+    source: Source
+    recording: Path | None
+    seen_in: str
+    aligned: Aligned
+
+
+def write_session(folder: Path, devices: Mapping[str, Device], told: Told) -> dict[str, Any]:
+    """Fills `folder`, which is there and empty. What was found, by device. Raises ShareError."""
+    R_mocap_world = level([device.aligned.fit for device in devices.values()])
+    truths = {name: _truth(device.aligned, R_mocap_world) for name, device in devices.items()}
+    (folder / "truth").mkdir()
+    for name, device in devices.items():
+        _record(device, folder / f"{name}.mcap", told)
+        atomic_write(folder / "truth" / f"{name}.tum", format_tum(truths[name]))
+    found = {name: found_of(device) for name, device in devices.items()}
+    draw_alignment(folder / PICTURE, {name: (d.aligned, truths[name]) for name, d in devices.items()})
+    atomic_write(folder / REPORT, json.dumps(known(found), indent=1) + "\n")
+    atomic_write(folder / SESSION, _description(devices, found))
+    return found
+
+
+def found_of(device: Device) -> dict[str, Any]:
+    """Of one device, as plain data."""
+    aligned, fit = device.aligned, device.aligned.fit
+    sigma, gaps = sigmas(fit), (fit.gaps - fit.stamps_ns[0]) * 1e-9
+    turn = se3.so3_log(fit.T_body_mocap[:3, :3])
+    return {
+        "kind": device.kind.value,
+        "source": device.source.name,
+        "mocap": device.seen_in,
+        "offset_ns": aligned.offset_ns,
+        "offset_sigma_ms": float(sigma[8] * 1e3),
+        "drift_ppm": fit.drift_ppm,
+        "correlation": aligned.peak.correlation,
+        "next_correlation": aligned.peak.rival,
+        "lead": aligned.peak.lead,
+        "T_body_mocap": fit.T_body_mocap.tolist(),
+        "body_turned_deg": float(np.degrees(np.linalg.norm(turn))),
+        "body_turned_sigma_deg": float(np.degrees(sigma[2:5].max())),
+        "body_shifted_mm": float(np.linalg.norm(fit.T_body_mocap[:3, 3]) * 1e3),
+        "body_shifted_sigma_mm": float(sigma[5:8].max() * 1e3),
+        "tilt_deg": fit.tilt_deg,
+        "left_mm": fit.residuals.position_mm,
+        "left_deg": fit.residuals.rotation_deg,
+        "doubted": fit.residuals.doubted,
+        "truth_s": aligned.seconds,
+        "gaps_s": gaps.tolist(),
+        "doubts": aligned.doubts,
+    }
+
+
+def _truth(aligned: Aligned, R_mocap_world: np.ndarray) -> Trajectory:
+    return Trajectory(aligned.stamps_ns, aligned.truth(R_mocap_world))
+
+
+def _record(device: Device, out: Path, told: Told) -> None:
+    """The recording under its new name: the same file where the disk allows it, else a copy."""
+    stage, total, done = f"writing {out.stem}", device.source.images_count, 0
+
+    def more(count: int) -> None:
+        nonlocal done
+        done += count
+        told(stage, done, total)
+
+    if device.recording is None:
+        write_recording(device.source, out, None, more)
+        return
+    told(stage, 0, 1)
+    try:
+        os.link(device.recording.resolve(), out)
+    except OSError:  # another disk, or somebody else's file
+        shutil.copyfile(device.recording, out)
+    told(stage, 1, 1)
+
+
+def _description(devices: Mapping[str, Device], found: dict[str, Any]) -> str:
+    """session.yaml."""
+    import yaml
+
+    agents = {
+        name: {
+            "kind": device.kind.value,
+            "sensors": device.source.rig.kind,
+            "rate_hz": device.source.rate_hz,
+            "clock_offset_ns": device.aligned.offset_ns,
+            "calibration": to_kalibr(device.source.rig),
+        }
+        for name, device in devices.items()
+    }
+    provenance = {
+        "generator": "share dataset align",
+        "share_version": __version__,
+        "devices": {name: {"recording": one["source"], "mocap": one["mocap"]} for name, one in found.items()},
+    }
+    data = {"schema": SCHEMA, "provenance": provenance, "agents": agents}
+    return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))

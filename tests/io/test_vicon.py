@@ -1,0 +1,98 @@
+"""Vicon's CSV, as Tracker and Nexus write it: what is read, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from share.errors import DataError
+from share.io.mocap_file import read_bodies
+from share.io.vicon import read_vicon
+
+HEAD = """Objects
+100
+,,Ann:Ann,,,,,,Global Angle Bob:Head,,,,,
+Frame,Sub Frame,RX,RY,RZ,TX,TY,TZ,RX,RY,RZ,TX,TY,TZ
+,,deg,deg,deg,mm,mm,mm,deg,deg,deg,mm,mm,mm
+"""
+ROWS = """101,0,10,20,-30,1000,2000,1500,0,0,90,1,2,3
+102,0,11,20,-30,1001,2000,1500,,,,,,
+103,0,,,,,,,0,0,91,1,2,4
+105,0,12,21,-31,1002,2000,1500,0,0,0,0,0,0
+106,0,13,21,-31,1003,2000,1500,0,0,92,1,2,5
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "vicon.csv"
+    path.write_text(text)
+    return path
+
+
+def test_each_body_has_its_poses_where_it_was_seen(tmp_path):
+    bodies = read_vicon(written(tmp_path, HEAD + ROWS))
+    assert list(bodies) == ["Ann", "Bob:Head"]
+    ann, bob = bodies.values()
+    assert ann.stamps_ns.tolist() == [k * 10_000_000 for k in (101, 102, 105, 106)]
+    assert bob.stamps_ns.tolist() == [k * 10_000_000 for k in (101, 103, 106)]  # zeros are nothing seen
+    np.testing.assert_allclose(ann.T[0, :3, 3], [1, 2, 1.5])
+    expected = Rotation.from_rotvec([10, 20, -30], degrees=True).as_matrix()
+    np.testing.assert_allclose(ann.T[0, :3, :3], expected, atol=1e-12)
+
+
+def test_angles_about_x_then_y_then_z_are_read_when_asked_for(tmp_path):
+    ann = read_vicon(written(tmp_path, HEAD + ROWS), "xyz")["Ann"]
+    expected = Rotation.from_euler("XYZ", [[10, 20, -30]], degrees=True).as_matrix()  # XYZ: intrinsic
+    np.testing.assert_allclose(ann.T[:1, :3, :3], expected, atol=1e-12)
+
+
+def test_quaternions_metres_and_other_blocks(tmp_path):
+    """Behind a block of markers and a byte-order mark, divided by semicolons, with trailing separators."""
+    q = Rotation.from_euler("xyz", [0.1, -0.4, 2.0]).as_quat()
+    row = ";".join(f"{x:.9f}" for x in (*q, 0.5, -0.25, 1.75))
+    path = written(
+        tmp_path,
+        "\ufeffTrajectories;;\n120;;\n;;1;;\nFrame;Sub Frame;X;Y;Z\n;;mm;mm;mm\n1;0;1;2;3\n;;;;\n"
+        "Segments;;\n120;;\n;;Ann:Ann;;;;;;\nFrame;Sub Frame;RX;RY;RZ;RW;TX;TY;TZ\n;;;;;;m;m;m\n"
+        f"12;0;{row}\n18;0;{row}\n\n",
+    )
+    ann = read_bodies(path)["Ann"]
+    assert ann.stamps_ns.tolist() == [100_000_000, 150_000_000]
+    np.testing.assert_allclose(ann.T[0, :3, :3], Rotation.from_quat(q).as_matrix(), atol=1e-8)
+    np.testing.assert_allclose(ann.T[0, :3, 3], [0.5, -0.25, 1.75])
+
+
+def test_a_file_that_names_nobody_is_one_body(tmp_path):
+    path = tmp_path / "seen.tum"
+    path.write_text("1.0 0 0 0 0 0 0 1\n1.1 0 0 0 0 0 0 1\n")
+    assert list(read_bodies(path)) == [""]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("102,0,11", "102,0,eleven", "line 7: 'eleven' is not a number"),
+        ("\n103,", "\n102,", "line 8: its frame does not follow"),
+        ("100\n", "\n", "line 2: expected the frames a second"),
+        ("mm,mm,mm,deg", "ft,ft,ft,deg", "line 5: unit 'ft' is not known; known: mm"),
+        ("RZ,TX,TY,TZ,RX", "RZ,TX,TY,XX,RX", "line 4: body 'Ann:Ann' has no column TZ"),
+        ("Objects", "Trajectories", "has no block Objects or Segments; export rigid bodies, not markers"),
+        (ROWS, "", "the file is cut short"),
+    ],
+)
+def test_what_is_wrong_is_said_with_its_line(old, new, said, tmp_path):
+    assert old in HEAD + ROWS
+    path = written(tmp_path, (HEAD + ROWS).replace(old, new, 1))
+    with pytest.raises(DataError, match="(?s)" + said) as error:
+        read_vicon(path)
+    assert str(path) in str(error.value) and "\n" not in str(error.value)
+
+
+def test_an_object_that_was_never_there_is_left_out(tmp_path):
+    hidden = "\n".join(f"{k},0,1,2,3,4,5,{k},,,,,," for k in range(1, 9))
+    assert list(read_vicon(written(tmp_path, HEAD + hidden))) == ["Ann"]
+    with pytest.raises(DataError, match="no body was ever seen"):
+        read_vicon(written(tmp_path, HEAD + "1,0,,,,,,,,,,,,\n2,0,,,,,,,,,,,,\n"))
