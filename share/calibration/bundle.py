@@ -47,18 +47,21 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """`state`, with the covariance (S, S) of 8 intrinsics a camera and, of two, xi of T_cam1_cam0 Exp(xi); of
-    each view and camera the residuals (N, 2) px, seen less predicted; sigma_px: noise of a coordinate."""
+    """`state`, with the covariance (S, S) of 8 intrinsics a camera and, of two, xi of T_cam1_cam0 Exp(xi), if
+    corners err independently; by_views (S,): one sigma of each as views contradict one another; of each view
+    and camera the residuals (N, 2) px, seen less predicted; sigma_px: noise of a coordinate."""
 
     state: State
     covariance: F64
+    by_views: F64
     residuals: tuple[tuple[F64, ...], ...]
     sigma_px: float
 
     @property
     def sigmas(self) -> F64:
-        """(S,): one sigma, as far as residuals are independent."""
-        return np.sqrt(np.diag(self.covariance))
+        """(S,): one sigma, the larger of both. Corners of a view err together: by a bent board, by blur, by
+        what a detector makes of a slant."""
+        return np.maximum(np.sqrt(np.diag(self.covariance)), self.by_views)
 
 
 def calibrate(views: Sequence[View], target: Target, size: tuple[int, int]) -> Solution:
@@ -238,9 +241,19 @@ def _moved(state: State, shared: F64, poses: F64) -> State | None:
 
 def _solution(views: Sequence[View], target: Target, state: State, limit: float) -> Solution:
     blocks = [_block(state, view, k, target) for k, view in enumerate(views)]
-    H = np.stack([_normal(block, limit)[0] for block in blocks])
+    H, g = (np.stack(parts) for parts in zip(*(_normal(b, limit) for b in blocks), strict=True))
     S = _shared(len(state.cameras))
-    inner = H[:, :S, S:] @ np.linalg.solve(H[:, S:, S:], H[:, S:, :S])
+    back = np.linalg.solve(H[:, S:, S:], np.concatenate([H[:, S:, :S], g[:, S:, None]], axis=2))
+    told = np.concatenate([H[:, :S, :S], g[:, :S, None]], axis=2) - H[:, :S, S:] @ back
     spread = _spread(np.concatenate([r for r, _ in blocks]))
-    covariance = spread**2 * np.linalg.inv(H[:, :S, :S].sum(axis=0) - inner.sum(axis=0))
-    return Solution(state, covariance, errors(state, views, target), spread)
+    covariance = spread**2 * np.linalg.inv(told[:, :, :S].sum(axis=0))
+    by_views = _jackknife(told[:, :, :S], told[:, :, S])
+    return Solution(state, covariance, by_views, errors(state, views, target), spread)
+
+
+def _jackknife(H: F64, g: F64) -> F64:
+    """One sigma (S,) of what V views tell together by H (V, S, S) and g (V, S) each, by how far it moves
+    without each of them (MacKinnon, Nielsen and Webb, *Cluster-robust inference*, 2023: CV3)."""
+    moved = np.linalg.solve(H.sum(axis=0) - H, g[..., None])[..., 0]
+    out: F64 = np.sqrt((1 - 1 / len(H)) * (moved**2).sum(axis=0))
+    return out

@@ -24,18 +24,20 @@ class Limits:
     image's cells; views: at least."""
 
     rms_px: float = 0.5
-    focal: float = 1e-3
+    focal: float = 2e-3
     covered: float = 0.6
     views: int = 12
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """reasons: what fails, none where it passes; rms_px: of each camera, of the corners kept; wrong: how
-    many were not; view_rms (V, cameras) px, NaN where a camera saw nothing; outliers: rows of views."""
+    """reasons: what fails, none where it passes; rms_px: of each camera, of the corners kept; rms_all_px: of
+    all; wrong: how many were not kept; view_rms (V, cameras) px, NaN where a camera saw nothing; outliers:
+    rows of views."""
 
     reasons: tuple[str, ...]
     rms_px: tuple[float, ...]
+    rms_all_px: tuple[float, ...]
     wrong: tuple[int, ...]
     view_rms: F64
     outliers: tuple[int, ...]
@@ -51,6 +53,7 @@ def judge(solution: Solution, covers: Sequence[Coverage], limits: Limits = Limit
     view_rms = np.array([[_rms(view[eye]) for eye in eyes] for view in solution.residuals])
     told = [(residuals(solution, eye), kept(solution, eye)) for eye in eyes]
     rms = tuple(_rms(r[inside]) for r, inside in told)
+    rms_all = tuple(_rms(r) for r, _ in told)
     wrong = tuple(int((~inside).sum()) for _, inside in told)
     reasons = [reason for eye in eyes for reason in _reasons(solution, eye, rms[eye], wrong[eye], limits)]
     for eye, cover in enumerate(covers):
@@ -59,7 +62,7 @@ def judge(solution: Solution, covers: Sequence[Coverage], limits: Limits = Limit
                 f"cam{eye}: corners in {cover.share:.0%} of the image, {limits.covered:.0%} needed; "
                 + "; ".join(cover.missing)
             )
-    return Verdict(tuple(reasons), rms, wrong, view_rms, _outliers(view_rms))
+    return Verdict(tuple(reasons), rms, rms_all, wrong, view_rms, _outliers(view_rms))
 
 
 def _reasons(solution: Solution, eye: int, rms: float, wrong: int, limits: Limits) -> list[str]:

@@ -137,7 +137,8 @@ def _summary(outcome: Outcome, out: Path) -> str:
     ]
     for eye, cover in enumerate(outcome.covers):
         lines.append(
-            f"cam{eye}: {verdict.rms_px[eye]:.3f} px RMS, {verdict.wrong[eye]} corners left out, "
+            f"cam{eye}: {verdict.rms_px[eye]:.3f} px RMS, {verdict.rms_all_px[eye]:.3f} with the "
+            f"{verdict.wrong[eye]} corners that are left out; "
             f"corners in {cover.share:.0%} of the image"
         )
         lines += [f"  {what}" for what in cover.missing]

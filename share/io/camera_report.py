@@ -87,6 +87,7 @@ def _camera(outcome: Outcome, eye: int) -> dict[str, Any]:
         "parameters": dict(zip(NAMES, values.tolist(), strict=True)),
         "sigmas": dict(zip(NAMES, sigmas.tolist(), strict=True)),
         "rms_px": outcome.verdict.rms_px[eye],
+        "rms_all_px": outcome.verdict.rms_all_px[eye],
         "corners_left_out": outcome.verdict.wrong[eye],
         "covered": cover.share,
         "missing": list(cover.missing),
@@ -161,13 +162,11 @@ def _draw_where(panel: Any, outcome: Outcome, eye: int) -> None:
 
 
 def _draw_scatter(panel: Any, outcome: Outcome, eye: int) -> None:
-    r = residuals(outcome.solution, eye)
+    r, told = residuals(outcome.solution, eye), outcome.verdict
     limit = 6 * outcome.solution.sigma_px
     panel.plot(*r.T, ".", markersize=2, color="#00798c", alpha=0.4)
-    panel.set(
-        xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", xlabel="px",
-        title=f"{outcome.verdict.rms_px[eye]:.3f} px RMS, {outcome.verdict.wrong[eye]} left out",
-    )  # fmt: skip
+    title = f"{told.rms_px[eye]:.3f} px RMS, {told.rms_all_px[eye]:.3f} with {told.wrong[eye]} left out"
+    panel.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", xlabel="px", title=title)
     panel.grid(alpha=0.3)
 
 

@@ -109,6 +109,28 @@ def test_its_sigmas_are_honest() -> None:
     assert 110 < sum(nees) < 280  # chi-square of 12 x 16 = 192: its 1e-5 quantiles are about 117 and 285
 
 
+def test_so_they_are_where_the_board_bends_anew_in_each_view() -> None:
+    """By a millimetre: corners err together, and not by what independent noise would do to them."""
+    low, high = GRID.extent
+    across, up = ((GRID.corners[:, :2] - low) / (high - low) * 2 - 1).T
+    z, naive = [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        views = []
+        for k, T in enumerate(_poses(rng, 15)):
+            bent = GRID.corners.copy()
+            bent[:, 2] = np.stack([across**2, up**2, across * up], axis=1) @ rng.normal(0, 1e-3, 3)
+            px = LEFT.project(se3.transform(T, bent))
+            ids = np.flatnonzero(LEFT.inside(px, 3.0))
+            views.append(View(str(k), (Detection(ids, px[ids] + rng.normal(0, 0.1, (len(ids), 2))),)))
+        solution = calibrate(views, GRID, SIZE)
+        error = intrinsics(solution.state.cameras[0]) - intrinsics(LEFT)
+        z.append(error / solution.sigmas)
+        naive.append(error / np.sqrt(np.diag(solution.covariance)))
+    assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.5
+    assert np.sqrt(np.mean(np.square(naive))) > 2.5
+
+
 def test_corners_that_were_found_wrongly_do_little_harm(rng: np.random.Generator) -> None:
     solution = calibrate(_views(rng, 0.1, wrong=0.03), GRID, SIZE)
     assert solution.state.cameras[0].fx == pytest.approx(LEFT.fx, rel=1e-3)
