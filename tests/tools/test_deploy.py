@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import platform
+import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from fake_device import TOOLS, FakeDevice, make_device
+from ssh_server import HOST, ssh_server
 
 from share.core.checkup.camera import RULE
+from share.errors import ShareError, UsageError
 
 
 @pytest.fixture(scope="module")
@@ -228,3 +234,68 @@ def test_systemd_understands_the_units(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     complaints = [line for line in done.stderr.splitlines() if "share" in line]
     assert (done.returncode, complaints) == (0, []), done.stderr
+
+
+def test_over_a_real_ssh(device, tmp_path):
+    program = device.program("1.0")
+    agent = ("agent", "--name", "ann", "--edge", "tcp://10.0.0.1:5555")
+    with ssh_server(tmp_path / "ssh", device.path) as ssh:
+        assert device.deploy(*agent, host=HOST, ssh=ssh, dist=program).code == 0
+        assert device.deploy(*agent, host=HOST, ssh=ssh, dist=device.program("1.1", "broken")).code == 1
+        assert (device.current, device.releases()) == ("1.0", {"1.0", "1.1"})
+        stranger = ssh.replace("ssh/client", "ssh/host")
+        refused = device.deploy(*agent, host=HOST, ssh=stranger, dist=program)
+    assert refused.code == 2
+    assert "cannot be reached" in refused.err
+    assert "Permission denied" in refused.err
+    gone = device.deploy(*agent, host=HOST, ssh=ssh, dist=program)
+    assert (gone.code, gone.err.count("\n")) == (2, 1)
+    assert "Connection refused" in gone.err
+
+
+@pytest.mark.parametrize(
+    ("told", "says"),
+    [
+        ({"machine": "aarch64"}, "is aarch64, the program was built for x86_64"),
+        ({"glibc": 31}, "has glibc 2.31, the program needs 2.36"),
+        ({"free": 100_000_000}, "100 MB free at /opt/share, 330 MB are needed"),
+        ({"systemd": False}, "has no systemd"),
+    ],
+)
+def test_a_device_that_cannot_run_it_is_told_before_anything_is_copied(monkeypatch, told, says):
+    monkeypatch.syspath_prepend(TOOLS)
+    tool = importlib.import_module("deploy_device")
+    release = importlib.import_module("deploy_release").Release(Path(), "1.0-abc", 300_000_000, "x86_64", 36)
+    fine = tool.Facts("x86_64", 36, 10**9, True, "", "", (), "")
+    tool.check("headset1", release, fine)
+    with pytest.raises(ShareError, match=f"^headset1: {says}"):
+        tool.check("headset1", release, replace(fine, **told))
+
+
+def test_what_a_program_needs_is_read_from_its_machine_code(monkeypatch, tmp_path, device):
+    """Python itself, against objdump."""
+    monkeypatch.syspath_prepend(TOOLS)
+    read_release = importlib.import_module("deploy_release").read_release
+    folder = device.program("1.0")
+    assert read_release(folder).machine == ""
+    library = Path(sys.executable).resolve()
+    shutil.copy(library, folder / "python")
+    told = subprocess.run(["objdump", "-T", library], capture_output=True, text=True, check=True).stdout
+    found = read_release(folder)
+    assert found.glibc == max(int(minor) for minor in re.findall(r"GLIBC_2\.(\d+)", told))
+    assert found.machine == platform.machine()
+    assert found.name == read_release(folder).name
+    (folder / "library.so.1").write_bytes(b"other code")
+    assert found.name != read_release(folder).name
+
+
+def test_nobody_who_becomes_root_is_one_line(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(TOOLS)
+    tool = importlib.import_module("deploy_device")
+    ssh = tmp_path / "ssh"
+    ssh.write_text(
+        '#!/bin/sh\ncase "$*" in *"sudo -n true"*) exit 1 ;; esac\nfor last; do :; done\nexec sh -c "$last"\n'
+    )
+    ssh.chmod(0o755)
+    with pytest.raises(UsageError, match="nobody can become root there without a password"):
+        tool.Device("pi@headset1", str(ssh)).probe("agent-ann")

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from shell import Done
 
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
+TOOLS = Path(__file__).resolve().parents[1] / "tools"
 
 # ssh OPTIONS HOST COMMAND, on this machine; nobody answers at "nowhere".
 _SSH = """#!/bin/sh
@@ -71,9 +71,12 @@ class FakeDevice:
             (folder / mark).touch()
         return folder
 
-    def deploy(self, *words: object, host: str = "pi@headset1", dist: Path | None = None) -> Done:
+    def deploy(
+        self, *words: object, host: str = "pi@headset1", dist: Path | None = None, ssh: str = ""
+    ) -> Done:
+        """tools/deploy WORDS. ssh: another than the one that is made up."""
         which = [] if dist is None else ["--dist", dist]
-        settings = ["--ssh", self.ssh, "--root", self.root, "--settle", "0.1", *which]
+        settings = ["--ssh", ssh or self.ssh, "--root", self.root, "--settle", "0.1", *which]
         command = [TOOLS / "deploy.py", words[0], host, *words[1:], *settings]
         done = subprocess.run(
             [sys.executable, *map(str, command)],
