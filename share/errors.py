@@ -45,5 +45,5 @@ def not_installed(packages: str, extra: str) -> str:
     """Who wants `packages` is told how to get them: with an extra of SHARE, and not in a frozen program."""
     how = f"pip install 'share-slam[{extra}]'"
     if getattr(sys, "frozen", False):
-        return f"{packages} is left out of this frozen program; use a computer with Python: {how}"
+        return f"this frozen program has no {packages}; use a computer with Python: {how}"
     return f"{packages} is not installed: {how}"

@@ -15,4 +15,4 @@ def test_what_is_missing_is_told_with_how_to_get_it():
 
 def test_nobody_is_told_to_pip_into_a_frozen_program(monkeypatch):
     monkeypatch.setattr(sys, "frozen", True, raising=False)
-    assert "computer with Python: pip install 'share-slam[train]'" in not_installed("torch", "train")
+    assert "use a computer with Python: pip install 'share-slam[train]'" in not_installed("torch", "train")
