@@ -81,9 +81,9 @@ def agent(name: str, edge: str | None, kind: str | None, source: str | None, **o
     if not re.fullmatch(r"[A-Za-z0-9_][\w.-]{0,63}", name, re.ASCII):
         raise UsageError(f"--name '{name}': use 1 to 64 letters, digits, '_', '-' or '.'")
     key = others.pop("server_key")
-    options = "--keys /etc/share/keys --server-key /etc/share/edge.public" if key else None
-    given = {"SOURCE": source, "KIND": kind, "EDGE": edge, "OPTIONS": options}
-    defaults = {"SOURCE": "realsense", "KIND": "ar", "OPTIONS": ""}
+    keys = "--keys /etc/share/keys --server-key /etc/share/edge.public" if key else None
+    given = {"SOURCE": source, "KIND": kind, "EDGE": edge, "KEYS": keys}
+    defaults = {"SOURCE": "realsense", "KIND": "ar", "KEYS": "", "OPTIONS": ""}
     more = {"edge.public": f"share-public-key edge {public_key(key)}\n"} if key else {}
     deploy(Service(f"share-agent@{name}", f"agent-{name}", given, defaults, more), **others)
 

@@ -18,6 +18,7 @@ from ssh_server import HOST, ssh_server
 
 from share.core.checkup.camera import RULE
 from share.errors import ShareError, UsageError
+from share.io.profile import shipped
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +44,7 @@ def test_a_first_agent_is_copied_set_up_and_started(device):
     assert (current / "library.so").readlink() == Path("library.so.1")
     assert os.access(current / "share", os.X_OK)
     settings = device.root / "etc/share/agent-ann.env"
-    assert settings.read_text() == "SOURCE=realsense\nKIND=ar\nOPTIONS=\nEDGE=tcp://10.0.0.1:5555\n"
+    assert settings.read_text() == "SOURCE=realsense\nKIND=ar\nKEYS=\nOPTIONS=\nEDGE=tcp://10.0.0.1:5555\n"
     assert (device.root / "etc/udev/rules.d/99-share-realsense.rules").read_text() == f"{RULE}\n"
     (secret,) = (device.root / "etc/share/keys").glob("*.secret")
     assert secret.stat().st_mode & 0o077 == 0
@@ -148,6 +149,20 @@ def test_back_by_hand_and_forth_again(device):
         assert f"{version}-" in done.out
 
 
+@pytest.mark.parametrize(
+    ("kind", "profile"), [("ar", "d435i-n100-headset"), ("robot", "d435i-turtlebot4"), (None, "laptop-edge")]
+)
+def test_the_doctor_looks_for_what_that_kind_of_computer_needs(device, kind, profile):
+    program = device.program("1.0")
+    if kind is None:
+        device.deploy("edge", dist=program)
+    else:
+        device.agent(program, "--kind", kind)
+        device.agent(device.program("1.1"))  # the kind is known by now
+    assert (device.root / "etc/share/profile").read_text() == f"{profile}\n"
+    assert profile in shipped()
+
+
 def test_back_without_a_release_before_is_one_line(device):
     device.agent(device.program("1.0"))
     done = device.deploy("agent", "--name", "ann", "--rollback")
@@ -186,7 +201,7 @@ def test_the_key_of_the_edge_is_put_where_the_service_looks(device):
     done = device.agent(device.program("1.0"), "--server-key", key)
     assert done.code == 0, done.err
     assert public_key(str(device.root / "etc/share/edge.public")) == key
-    line = "OPTIONS=--keys /etc/share/keys --server-key /etc/share/edge.public\n"
+    line = "KEYS=--keys /etc/share/keys --server-key /etc/share/edge.public\n"
     assert line in (device.root / "etc/share/agent-ann.env").read_text()
 
 
