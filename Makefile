@@ -32,4 +32,5 @@ vio-figures: install
 	$(BIN)/python tools/measure_vio.py
 freeze: install
 	$(PIP) -e '.[freeze]'
+	@$(PIP) -e '.[realsense]' || echo "make: no pyrealsense2 for this machine: the program will not capture"
 	$(BIN)/pyinstaller --noconfirm --log-level ERROR tools/share.spec

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 
 class ShareError(Exception):
     """A failure that can be said in one line: what is wrong and how to mend it. Exit code 1."""
@@ -37,3 +39,11 @@ class TransportError(ShareError):
 
 class StoreError(ShareError):
     """The file of a map cannot be opened, read or written."""
+
+
+def not_installed(packages: str, extra: str) -> str:
+    """Who wants `packages` is told how to get them: with an extra of SHARE, and not in a frozen program."""
+    how = f"pip install 'share-slam[{extra}]'"
+    if getattr(sys, "frozen", False):
+        return f"this frozen program has no {packages}; use a computer with Python: {how}"
+    return f"{packages} is not installed: {how}"

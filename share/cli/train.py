@@ -9,7 +9,7 @@ import click
 
 from share.cli import options
 from share.cli.progress import LiveLine
-from share.errors import UsageError
+from share.errors import UsageError, not_installed
 
 if TYPE_CHECKING:
     from share.types import F32
@@ -209,9 +209,9 @@ def _base(given: Path | None) -> Path:
 def _need_extra() -> None:
     import importlib.util
 
-    missing = [name for name in ("torch", "onnx", "sklearn") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise UsageError(f"{', '.join(missing)} is needed for this: pip install 'share-slam[train]'")
+    absent = [name for name in ("torch", "onnx", "sklearn") if importlib.util.find_spec(name) is None]
+    if absent:
+        raise UsageError(not_installed(", ".join(absent), "train"))
 
 
 def _summary(errors: list[F32]) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import TypeVar
 
-from share.errors import ShareError, UsageError
+from share.errors import ShareError, UsageError, not_installed
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -20,7 +20,7 @@ class Cluster:
 
     def __init__(self, address: str) -> None:
         if importlib.util.find_spec("distributed") is None:
-            raise UsageError("--scheduler: needs dask: pip install 'share-slam[cluster]'")
+            raise UsageError(f"--scheduler: {not_installed('distributed', 'cluster')}")
         from distributed import Client
 
         try:

@@ -7,6 +7,7 @@ import os
 from typing import Any
 
 from share.emulate.render.errors import RenderError
+from share.errors import not_installed
 
 _VERSION = 430  # of OpenGL: storage buffers
 _EGL, _GL = "libEGL.so.1", "libGL.so.1"  # by name: ctypes finds the unversioned ones by tools that may lack
@@ -30,7 +31,7 @@ def create() -> Any:
     try:
         import moderngl
     except ImportError:
-        raise RenderError("moderngl is not installed: pip install 'share-slam[emulate]'") from None
+        raise RenderError(not_installed("moderngl", "emulate")) from None
     try:
         options: dict[str, Any] = {"backend": "egl", "libegl": _EGL, "libgl": _GL}
         return moderngl.create_context(require=_VERSION, standalone=True, **options)

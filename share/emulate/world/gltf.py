@@ -21,7 +21,7 @@ from share.emulate.world.mesh import Shape, concat
 from share.emulate.world.noise import P
 from share.emulate.world.pictures import BRIGHTEST, DARKEST
 from share.emulate.world.rays import Scene
-from share.errors import DataError, UsageError
+from share.errors import DataError, UsageError, not_installed
 from share.types import F32, F64, U8
 
 MOST_TRIANGLES = 300_000
@@ -55,7 +55,7 @@ def _read(path: Path) -> Any:
     try:
         import trimesh
     except ImportError:
-        raise UsageError("a glTF room needs the package trimesh: pip install 'share-slam[emulate]'") from None
+        raise UsageError(f"a glTF room: {not_installed('trimesh', 'emulate')}") from None
     if path.suffix.lower() not in (".gltf", ".glb"):
         raise UsageError(f"{path}: expected a glTF file (.gltf or .glb)")
     try:

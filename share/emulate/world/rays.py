@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.emulate.types import I32
-from share.errors import UsageError
+from share.errors import UsageError, not_installed
 from share.types import F32
 
 
@@ -18,7 +18,7 @@ class Scene:
             from embreex.mesh_construction import TriangleMesh
             from embreex.rtcore_scene import EmbreeScene
         except ImportError:
-            raise UsageError("light needs the package embreex: pip install 'share-slam[emulate]'") from None
+            raise UsageError(f"light: {not_installed('embreex', 'emulate')}") from None
         corners = np.ascontiguousarray(triangles.reshape(-1, 3), np.float32)
         self.triangles = triangles
         self._scene = EmbreeScene()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from share.errors import UsageError
+from share.errors import UsageError, not_installed
 
 
 def load_sdk() -> Any:
@@ -12,9 +12,7 @@ def load_sdk() -> Any:
     try:
         import pyrealsense2
     except ModuleNotFoundError:
-        raise UsageError(
-            "a RealSense camera needs pyrealsense2: pip install 'share-slam[realsense]'"
-        ) from None
+        raise UsageError(f"a RealSense camera: {not_installed('pyrealsense2', 'realsense')}") from None
     except ImportError as error:
         hint = " (apt install libusb-1.0-0)" if "libusb" in str(error) else ""
         raise UsageError(f"pyrealsense2 cannot be loaded: {error}{hint}") from None

@@ -1,0 +1,18 @@
+"""How people are told to get what is missing."""
+
+from __future__ import annotations
+
+import sys
+
+from share.errors import not_installed
+
+
+def test_what_is_missing_is_told_with_how_to_get_it():
+    assert (
+        not_installed("moderngl", "emulate") == "moderngl is not installed: pip install 'share-slam[emulate]'"
+    )
+
+
+def test_nobody_is_told_to_pip_into_a_frozen_program(monkeypatch):
+    monkeypatch.setattr(sys, "frozen", True, raising=False)
+    assert "use a computer with Python: pip install 'share-slam[train]'" in not_installed("torch", "train")

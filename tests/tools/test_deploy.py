@@ -1,0 +1,316 @@
+"""`tools/deploy` against a device in a folder: copied, switched, taken back; one line for what is wrong."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from fake_device import TOOLS, FakeDevice, make_device
+from ssh_server import HOST, ssh_server
+
+from share.core.checkup.camera import RULE
+from share.errors import ShareError, UsageError
+from share.io.profile import shipped
+
+
+@pytest.fixture(scope="module")
+def doctor(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the real one says on this machine: it takes three seconds, and any device will do."""
+    command = [sys.executable, "-m", "share", "doctor", "--json"]
+    said = subprocess.run(command, capture_output=True, text=True, cwd=TOOLS.parent, timeout=60).stdout
+    path = tmp_path_factory.mktemp("doctor") / "said.json"
+    path.write_text(said)
+    return path
+
+
+@pytest.fixture
+def device(tmp_path: Path, doctor: Path) -> FakeDevice:
+    return make_device(tmp_path, os.environ["PATH"], doctor)
+
+
+def test_a_first_agent_is_copied_set_up_and_started(device):
+    done = device.agent(device.program("1.0"))
+    assert (done.code, done.err) == (0, "")
+    assert "share-public-key ann " in done.out  # to be authorized at the edge
+    current = device.root / "opt/share/current"
+    assert (current / "library.so").readlink() == Path("library.so.1")
+    assert os.access(current / "share", os.X_OK)
+    settings = device.root / "etc/share/agent-ann.env"
+    assert settings.read_text() == "SOURCE=realsense\nKIND=ar\nKEYS=\nOPTIONS=\nEDGE=tcp://10.0.0.1:5555\n"
+    assert (device.root / "etc/udev/rules.d/99-share-realsense.rules").read_text() == f"{RULE}\n"
+    (secret,) = (device.root / "etc/share/keys").glob("*.secret")
+    assert secret.stat().st_mode & 0o077 == 0
+    asked = device.asked()
+    assert [line for line in asked if "enable" in line or "restart" in line] == [
+        "systemctl enable share-agent@ann",
+        "systemctl restart share-agent@ann",
+    ]
+    assert asked.index("systemctl daemon-reload") < asked.index("systemctl restart share-agent@ann")
+
+
+def test_the_rule_that_is_installed_is_one_that_the_doctor_finds(device):
+    from share.io.host import camera_rules
+
+    assert device.agent(device.program("1.0")).code == 0
+    assert camera_rules(device.root) == ["/etc/udev/rules.d/99-share-realsense.rules"]
+
+
+def test_the_same_again_changes_nothing(device):
+    program = device.program("1.0")
+    first = device.agent(program)
+    device.asked()
+    again = device.agent(program)
+    assert (first.code, again.code) == (0, 0)
+    assert "runs already" in again.out
+    assert not [line for line in device.asked() if "restart" in line]
+
+
+def test_an_upgrade_keeps_settings_keys_and_the_release_before(device):
+    device.agent(device.program("1.0"))
+    settings = device.root / "etc/share/agent-ann.env"
+    settings.write_text(settings.read_text().replace("realsense", "realsense:123") + "# by hand\n")
+    (device.root / "etc/share/agent-ann.yaml").write_text("agent: {error_model: ''}\n")
+    key = next((device.root / "etc/share/keys").glob("*.secret")).read_text()
+    assert device.deploy("agent", "--name", "ann", dist=device.program("1.1")).code == 0
+    assert device.current == "1.1"
+    assert "SOURCE=realsense:123\n" in settings.read_text()
+    assert "# by hand\n" in settings.read_text()
+    assert (device.root / "etc/share/agent-ann.yaml").read_text() == "agent: {error_model: ''}\n"
+    assert next((device.root / "etc/share/keys").glob("*.secret")).read_text() == key
+    assert device.releases() == {"1.0", "1.1"}
+
+
+def test_another_edge_is_taken_and_the_service_started_anew(device):
+    program = device.program("1.0")
+    device.agent(program)
+    device.asked()
+    assert device.deploy("agent", "--name", "ann", "--edge", "tcp://10.0.0.2:5555", dist=program).code == 0
+    assert "EDGE=tcp://10.0.0.2:5555\n" in (device.root / "etc/share/agent-ann.env").read_text()
+    assert "systemctl restart share-agent@ann" in device.asked()
+
+
+@pytest.mark.parametrize("mark", ["broken", "flapping"])
+def test_a_release_that_does_not_stay_up_is_taken_back_with_its_settings(device, mark):
+    device.agent(device.program("1.0"))
+    kept = (device.root / "etc/share/agent-ann.env").read_text()
+    bad = device.program("1.1", mark)
+    done = device.deploy("agent", "--name", "ann", "--edge", "tcp://10.0.0.9:1", dist=bad)
+    assert done.code == 1
+    assert "did not stay up for 0.1 s" in done.err
+    assert done.err.splitlines()[-1].startswith("1.1-")
+    assert done.err.rstrip().endswith("is back and runs")
+    assert device.current == "1.0"
+    assert (device.root / "etc/share/agent-ann.env").read_text() == kept
+
+
+def test_a_release_whose_libraries_do_not_load_is_taken_back(device):
+    device.agent(device.program("1.0"))
+    bad = device.program("1.1")
+    bad.joinpath("share").write_text('#!/bin/sh\n[ "$1" != --version ] || echo "share, version 1.1"\n')
+    done = device.agent(bad)
+    assert done.code == 1
+    assert "its libraries do not load here" in done.err
+    assert device.current == "1.0"
+
+
+def test_a_first_release_that_does_not_run_is_stopped(device):
+    done = device.agent(device.program("1.0", "broken"))
+    assert done.code == 1
+    assert "no other release to go back to" in done.err
+    assert "systemctl disable --now share-agent@ann" in device.asked()
+
+
+def test_a_second_service_that_fails_leaves_the_first_one_running(device):
+    program = device.program("1.0")
+    assert device.deploy("edge", dist=program).code == 0
+    device.asked()
+    done = device.agent(device.program("1.1", "broken"))
+    assert (done.code, device.current) == (1, "1.0")
+    assert (device.root / "etc/share/services").read_text() == "share-edge\n"
+    asked = device.asked()
+    assert asked.index("systemctl disable --now share-agent@ann") < len(asked) - 1
+    assert [line for line in asked if "restart" in line][-1] == "systemctl restart share-edge"
+
+
+def test_back_by_hand_and_forth_again(device):
+    device.agent(device.program("1.0"))
+    device.agent(device.program("1.1"))
+    for version in ("1.0", "1.1"):
+        done = device.deploy("agent", "--name", "ann", "--rollback")
+        assert (done.code, device.current) == (0, version), done.err
+        assert f"{version}-" in done.out
+
+
+@pytest.mark.parametrize(
+    ("kind", "profile"), [("ar", "d435i-n100-headset"), ("robot", "d435i-turtlebot4"), (None, "laptop-edge")]
+)
+def test_the_doctor_looks_for_what_that_kind_of_computer_needs(device, kind, profile):
+    program = device.program("1.0")
+    if kind is None:
+        device.deploy("edge", dist=program)
+    else:
+        device.agent(program, "--kind", kind)
+        device.agent(device.program("1.1"))  # the kind is known by now
+    assert (device.root / "etc/share/profile").read_text() == f"{profile}\n"
+    assert profile in shipped()
+
+
+def test_back_without_a_release_before_is_one_line(device):
+    device.agent(device.program("1.0"))
+    done = device.deploy("agent", "--name", "ann", "--rollback")
+    assert (done.code, done.err) == (1, "deploy: there is no previous release to go back to\n")
+
+
+def test_only_the_newest_releases_stay(device):
+    for version in ("1.0", "1.1", "1.2", "1.3"):
+        assert device.agent(device.program(version), "--keep", 2).code == 0
+    assert device.releases() == {"1.2", "1.3"}
+
+
+def test_a_dry_run_says_all_and_changes_nothing(device):
+    done = device.agent(device.program("1.0"), "--dry-run")
+    assert done.code == 0
+    for text in ("/opt/share/releases/1.0-", "EDGE=tcp://10.0.0.1:5555", "none -> 1.0-", "share-agent@ann"):
+        assert text in done.out
+    assert list(device.root.iterdir()) == []
+    assert device.asked() == []
+
+
+def test_the_edge_and_the_time_server(device):
+    program = device.program("1.0")
+    assert device.deploy("edge", "--http", "8080", dist=program).code == 0
+    assert device.deploy("sync", dist=program).code == 0
+    settings = device.root / "etc/share/edge.env"
+    assert settings.read_text() == "BIND=tcp://0.0.0.0:5555\nHTTP=8080\nOPTIONS=\n"
+    assert (device.root / "etc/share/services").read_text() == "share-edge\nshare-sync\n"
+    assert not (device.root / "etc/share/sync.env").exists()
+
+
+def test_the_key_of_the_edge_is_put_where_the_service_looks(device):
+    from share.io.keys import public_key
+
+    key = "rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7"  # RFC 32's test vector is this long
+    done = device.agent(device.program("1.0"), "--server-key", key)
+    assert done.code == 0, done.err
+    assert public_key(str(device.root / "etc/share/edge.public")) == key
+    line = "KEYS=--keys /etc/share/keys --server-key /etc/share/edge.public\n"
+    assert line in (device.root / "etc/share/agent-ann.env").read_text()
+
+
+def test_what_is_wrong_is_said_in_one_line(device, tmp_path):
+    program = device.program("1.0")
+    cases = {
+        "no frozen program there; make one with `make freeze`": device.agent(tmp_path / "nothing"),
+        "cannot be reached: ssh: connect": device.deploy("edge", host="nowhere", dist=program),
+        "--edge: where does the edge listen": device.deploy("agent", "--name", "ann", dist=program),
+        "use 1 to 64 letters": device.deploy("agent", "--name", "a/b", dist=program),
+        "neither a file nor a public key": device.agent(program, "--server-key", "x"),
+        "cannot hold": device.agent(program, "--source", "a$b"),
+    }
+    for text, done in cases.items():
+        assert done.code in (1, 2)
+        assert text in done.err
+        assert len(done.err.splitlines()) == 1
+    assert list(device.root.iterdir()) == []
+
+
+def test_a_copy_that_breaks_off_leaves_no_release(device):
+    (Path(device.path.split(":")[0]) / "tar").write_text("#!/bin/sh\nhead -c 10 >/dev/null\nexit 2\n")
+    (Path(device.path.split(":")[0]) / "tar").chmod(0o755)
+    done = device.agent(device.program("1.0"))
+    assert (done.code, done.err) == (
+        1,
+        "deploy: pi@headset1: the program was not copied: the program could not be unpacked\n",
+    )
+    assert list((device.root / "opt/share/releases").iterdir()) == []
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
+def test_systemd_understands_the_units(tmp_path):
+    units = tmp_path / "etc/systemd/system"
+    units.mkdir(parents=True)
+    program = tmp_path / "opt/share/current/share"
+    program.parent.mkdir(parents=True)
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    names = [path.name.replace("@", "@ann") for path in (TOOLS / "device").glob("*.service")]
+    for path in (TOOLS / "device").glob("*.service"):
+        shutil.copy(path, units / path.name)
+    shutil.copytree("/lib/systemd/system", tmp_path / "lib/systemd/system", symlinks=True)
+    command = ["systemd-analyze", "verify", "--man=no", f"--root={tmp_path}", *names]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    complaints = [line for line in done.stderr.splitlines() if "share" in line]
+    assert (done.returncode, complaints) == (0, []), done.stderr
+
+
+def test_over_a_real_ssh(device, tmp_path):
+    program = device.program("1.0")
+    agent = ("agent", "--name", "ann", "--edge", "tcp://10.0.0.1:5555")
+    with ssh_server(tmp_path / "ssh", device.path) as ssh:
+        assert device.deploy(*agent, host=HOST, ssh=ssh, dist=program).code == 0
+        assert device.deploy(*agent, host=HOST, ssh=ssh, dist=device.program("1.1", "broken")).code == 1
+        assert (device.current, device.releases()) == ("1.0", {"1.0", "1.1"})
+        stranger = ssh.replace("ssh/client", "ssh/host")
+        refused = device.deploy(*agent, host=HOST, ssh=stranger, dist=program)
+    assert refused.code == 2
+    assert "cannot be reached" in refused.err
+    assert "Permission denied" in refused.err
+    gone = device.deploy(*agent, host=HOST, ssh=ssh, dist=program)
+    assert (gone.code, gone.err.count("\n")) == (2, 1)
+    assert "Connection refused" in gone.err
+
+
+@pytest.mark.parametrize(
+    ("told", "says"),
+    [
+        ({"machine": "aarch64"}, "is aarch64, the program was built for x86_64"),
+        ({"glibc": 31}, "has glibc 2.31, the program needs 2.36"),
+        ({"free": 100_000_000}, "100 MB free at /opt/share, 330 MB are needed"),
+        ({"systemd": False}, "has no systemd"),
+    ],
+)
+def test_a_device_that_cannot_run_it_is_told_before_anything_is_copied(monkeypatch, told, says):
+    monkeypatch.syspath_prepend(TOOLS)
+    tool = importlib.import_module("deploy_device")
+    release = importlib.import_module("deploy_release").Release(Path(), "1.0-abc", 300_000_000, "x86_64", 36)
+    fine = tool.Facts("x86_64", 36, 10**9, True, "", "", (), "")
+    tool.check("headset1", release, fine)
+    with pytest.raises(ShareError, match=f"^headset1: {says}"):
+        tool.check("headset1", release, replace(fine, **told))
+
+
+def test_what_a_program_needs_is_read_from_its_machine_code(monkeypatch, tmp_path, device):
+    """Python itself, against objdump."""
+    monkeypatch.syspath_prepend(TOOLS)
+    read_release = importlib.import_module("deploy_release").read_release
+    folder = device.program("1.0")
+    assert read_release(folder).machine == ""
+    library = Path(sys.executable).resolve()
+    shutil.copy(library, folder / "python")
+    told = subprocess.run(["objdump", "-T", library], capture_output=True, text=True, check=True).stdout
+    found = read_release(folder)
+    assert found.glibc == max(int(minor) for minor in re.findall(r"GLIBC_2\.(\d+)", told))
+    assert found.machine == platform.machine()
+    assert found.name == read_release(folder).name
+    (folder / "library.so.1").write_bytes(b"other code")
+    assert found.name != read_release(folder).name
+
+
+def test_nobody_who_becomes_root_is_one_line(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(TOOLS)
+    tool = importlib.import_module("deploy_device")
+    ssh = tmp_path / "ssh"
+    ssh.write_text(
+        '#!/bin/sh\ncase "$*" in *"sudo -n true"*) exit 1 ;; esac\nfor last; do :; done\nexec sh -c "$last"\n'
+    )
+    ssh.chmod(0o755)
+    with pytest.raises(UsageError, match="nobody can become root there without a password"):
+        tool.Device("pi@headset1", str(ssh)).probe("agent-ann")

@@ -1,0 +1,193 @@
+"""Puts the frozen program onto a device, as services that start on boot. See docs/deployment.md."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+from deploy_device import Device, Facts, check
+from deploy_release import Release, read_release, write_tar
+from deploy_settings import merged
+from tool_main import exit_code
+
+from share.cli.progress import progress
+from share.errors import UsageError
+from share.io.keys import public_key
+
+DIST = Path(__file__).resolve().parents[1] / "dist" / "share"
+PROFILES = {"ar": "d435i-n100-headset", "robot": "d435i-turtlebot4", "": "laptop-edge"}  # by KIND
+NO_SETTINGS = "# Settings of SHARE on this device: docs/configuration.md\n{}\n"
+
+
+@dataclass(frozen=True)
+class Service:
+    """unit: systemd's name. name: of its files in /etc/share. given: settings asked for on the command line,
+    None where nothing was said. defaults: empty for a service without settings. more: further files."""
+
+    unit: str
+    name: str
+    given: Mapping[str, str | None]
+    defaults: Mapping[str, str]
+    more: Mapping[str, str]
+
+
+_OPTIONS = (
+    click.argument("host", metavar="[USER@]HOST"),
+    click.option("--ssh", default="ssh", show_default=True, help='With options: "ssh -p 2222 -i key".'),
+    click.option("--dist", type=click.Path(path_type=Path), default=DIST, help="The frozen program."),
+    click.option("--root", default="", metavar="DIR", help="A folder there in place of /, to try it."),
+    click.option("--settle", default=10.0, show_default=True, help="Seconds that it must stay up."),
+    click.option("--keep", type=click.IntRange(2), default=3, show_default=True, help="Releases to keep."),
+    click.option("--rollback", is_flag=True, help="Go back to the release before; copy nothing."),
+    click.option("--dry-run", is_flag=True, help="Say what would be done; change nothing."),
+)
+
+
+def common(command: Callable[..., None]) -> Callable[..., None]:
+    for option in reversed(_OPTIONS):
+        command = option(command)
+    return command
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+def cli() -> None:
+    """Put SHARE onto a device, as a service that starts on boot: docs/deployment.md.
+
+    \b
+    Example:  tools/deploy edge me@laptop
+              tools/deploy agent pi@headset1 --name ann --edge tcp://192.168.1.10:5555
+    """
+
+
+@cli.command()
+@click.option("--name", required=True, help="What this agent is called.")
+@click.option("--edge", metavar="tcp://H:P", help="Where the edge listens; needed the first time.")
+@click.option("--kind", type=click.Choice(["ar", "robot"]), help="Who is served; at first ar.")
+@click.option("--source", help="As of `share agent`; at first realsense.")
+@click.option("--server-key", metavar="FILE|KEY", help="Public key of the edge.")
+@common
+def agent(name: str, edge: str | None, kind: str | None, source: str | None, **others: Any) -> None:
+    """An agent: the service share-agent@NAME.
+
+    \b
+    Example:  tools/deploy agent pi@headset1 --name ann --edge tcp://192.168.1.10:5555 --server-key e.public
+    """
+    if not re.fullmatch(r"[A-Za-z0-9_][\w.-]{0,63}", name, re.ASCII):
+        raise UsageError(f"--name '{name}': use 1 to 64 letters, digits, '_', '-' or '.'")
+    key = others.pop("server_key")
+    keys = "--keys /etc/share/keys --server-key /etc/share/edge.public" if key else None
+    given = {"SOURCE": source, "KIND": kind, "EDGE": edge, "KEYS": keys}
+    defaults = {"SOURCE": "realsense", "KIND": "ar", "KEYS": "", "OPTIONS": ""}
+    more = {"edge.public": f"share-public-key edge {public_key(key)}\n"} if key else {}
+    deploy(Service(f"share-agent@{name}", f"agent-{name}", given, defaults, more), **others)
+
+
+@cli.command()
+@click.option("--bind", metavar="tcp://H:P", help="At first tcp://0.0.0.0:5555.")
+@click.option("--http", metavar="[H:]P", help="At first 127.0.0.1:8080.")
+@common
+def edge(bind: str | None, http: str | None, **others: Any) -> None:
+    """An edge: the service share-edge.
+
+    \b
+    Example:  tools/deploy edge me@laptop
+    """
+    defaults = {"BIND": "tcp://0.0.0.0:5555", "HTTP": "127.0.0.1:8080", "OPTIONS": ""}
+    deploy(Service("share-edge", "edge", {"BIND": bind, "HTTP": http}, defaults, {}), **others)
+
+
+@cli.command()
+@common
+def sync(**others: Any) -> None:
+    """The time of a room: the service share-sync, on the edge's machine (docs/sync.md).
+
+    \b
+    Example:  tools/deploy sync me@laptop
+    """
+    deploy(Service("share-sync", "sync", {}, {}, {}), **others)
+
+
+def deploy(
+    service: Service,
+    host: str,
+    ssh: str,
+    dist: Path,
+    root: str,
+    settle: float,
+    keep: int,
+    rollback: bool,
+    dry_run: bool,
+) -> None:
+    """Raises ShareError in one line; what did not come up has been put back by the device itself."""
+    device = Device(host, ssh, root, settle, keep)
+    if rollback:
+        _roll_back(device, service, dry_run)
+        return
+    release = read_release(dist)
+    there = device.probe(service.name)
+    check(host, release, there)
+    files = settings_files(service, there)
+    if dry_run:
+        click.echo("\n".join(plan(device, release, there, service, files)))
+        return
+    if release.name not in there.releases:
+        with progress(release.size, f"copying {release.size / 1e6:.0f} MB") as done:
+            device.send(release, partial(write_tar, release, wrote=done))
+    for name, text in files.items():
+        device.do("settings", name, data=text.encode())
+    click.echo(device.do("activate", release.name, service.unit, profile(service, files)), nl=False)
+
+
+def settings_files(service: Service, there: Facts) -> dict[str, str]:
+    """Files for /etc/share: what was said now, and what people wrote there. Raises UsageError."""
+    if not service.defaults:
+        return {}
+    text = merged(there.settings, service.given, service.defaults)
+    if "EDGE" in service.given and not re.search(r"^EDGE=\S", text, re.MULTILINE):
+        raise UsageError("--edge: where does the edge listen? tcp://HOST:5555; needed the first time")
+    first = {} if there.settings else {f"{service.name}.yaml": NO_SETTINGS}
+    return {f"{service.name}.env": text, **first, **service.more}
+
+
+def profile(service: Service, files: Mapping[str, str]) -> str:
+    """Of the computer, for `share doctor`."""
+    found = re.search(r"^KIND=(ar|robot)$", files.get(f"{service.name}.env", ""), re.MULTILINE)
+    return PROFILES[found[1] if found else ""]
+
+
+def plan(
+    device: Device, release: Release, there: Facts, service: Service, files: Mapping[str, str]
+) -> list[str]:
+    where = f"{device.host}:{device.root}"
+    copied = release.name in there.releases
+    size = "is there already" if copied else f"copy {release.size / 1e6:.0f} MB"
+    return [
+        f"{where}/opt/share/releases/{release.name}: {size}",
+        *(
+            f"{where}/etc/share/{name}:\n" + "".join(f"    {line}\n" for line in text.splitlines())[:-1]
+            for name, text in files.items()
+        ),
+        f"{where}/etc/share/keys: a key pair, if there is none",
+        f"{where}/etc/systemd/system/share-*.service, /etc/udev/rules.d/99-share-realsense.rules",
+        f"{where}/opt/share/current: {there.current or 'none'} -> {release.name}",
+        f"start {service.unit}, now and on boot; it must stay up for {device.settle_s:g} s, "
+        f"else back to {there.current or 'none'}",
+    ]
+
+
+def _roll_back(device: Device, service: Service, dry_run: bool) -> None:
+    there = device.probe(service.name)
+    if dry_run:
+        click.echo(f"{device.host}: {there.current or 'none'} -> {there.previous or 'none'}")
+        return
+    click.echo(device.do("rollback"), nl=False)
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code("deploy", cli))
