@@ -142,5 +142,5 @@ def test_what_is_no_room_is_refused(tmp_path: Path) -> None:
 
 def test_without_trimesh_one_line_names_the_package(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "trimesh", None)
-    with pytest.raises(UsageError, match=r"trimesh: pip install 'share-slam\[emulate\]'"):
+    with pytest.raises(UsageError, match=r"trimesh is not installed: pip install 'share-slam\[emulate\]'"):
         load_gltf(file)

@@ -173,5 +173,5 @@ def test_without_embree_one_line_names_the_package(
     small_layout: Layout, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
-    with pytest.raises(UsageError, match=r"embreex: pip install 'share-slam\[emulate\]'"):
+    with pytest.raises(UsageError, match=r"embreex is not installed: pip install 'share-slam\[emulate\]'"):
         build(small_layout)
