@@ -12,10 +12,12 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import click
 import pytest
 from fake_device import TOOLS, FakeDevice, make_device
 from ssh_server import HOST, ssh_server
 
+from share.cli.main import cli
 from share.core.checkup.camera import RULE
 from share.errors import ShareError, UsageError
 from share.io.profile import shipped
@@ -314,3 +316,17 @@ def test_nobody_who_becomes_root_is_one_line(monkeypatch, tmp_path):
     ssh.chmod(0o755)
     with pytest.raises(UsageError, match="nobody can become root there without a password"):
         tool.Device("pi@headset1", str(ssh)).probe("agent-ann")
+
+
+def test_the_units_ask_the_program_for_what_it_understands():
+    for path in (TOOLS / "device").glob("*.service"):
+        text = path.read_text().replace("\\\n", " ")
+        (started,) = re.findall(r"^ExecStart=/opt/share/current/share (\w+(?: server)?)(.*)$", text, re.M)
+        command: click.Command = cli
+        for word in started[0].split():
+            assert isinstance(command, click.Group)
+            found = command.get_command(click.Context(command), word)
+            assert found is not None
+            command = found
+        known = {option for param in command.params for option in param.opts}
+        assert set(re.findall(r"--[a-z-]+", started[1])) <= known
