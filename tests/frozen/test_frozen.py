@@ -102,7 +102,7 @@ def test_an_edge_listens_and_ends_when_asked(program):
 def test_the_whole_system_and_the_same_digits_as_from_source(share, tmp_path):
     """Child processes, MCAP, poselib, SciPy, filterpy and matplotlib all work frozen."""
     said = share("demo", "--seconds", 20, "--out", tmp_path / "demo").stdout
-    assert re.search(r"\d of 3 agents in one map", said), said  # how many, hangs on how busy this machine is
+    assert re.search("[23] of 3 agents in one map", said), said  # a busy machine may lose one, in real time
     assert (tmp_path / "demo" / "trajectories.png").stat().st_size > 10_000
     (session,) = (tmp_path / ".cache" / "share").glob("session-*")
     share("track", session / "ar1", "--out", tmp_path / "frozen.tum")
