@@ -16,6 +16,7 @@ from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
     from share.config import Config
+    from share.io.feed import Feed
     from share.io.keys import AgentKeys
     from share.io.source import Source
     from share.io.transport import AgentLink
@@ -166,7 +167,8 @@ class _LiveLine(LiveLine):
 
     def __init__(self, streamed: bool) -> None:
         super().__init__()
-        self._streamed, self._total, self._feed = streamed, 0, None
+        self._streamed, self._total = streamed, 0
+        self._feed: Feed | None = None  # of a live camera
 
     def of(self, source: Source) -> None:
         """Whose frames are shown."""
@@ -183,8 +185,8 @@ class _LiveLine(LiveLine):
             else f"sent {r['sent']} acknowledged {r['acknowledged']} corrections {r['corrections']} "
             f"rtt {rtt} map {r['map_id'] or '–'}"
         )
-        of = f"/{self._total}" if self._feed is None else ""
-        self.write(f"{status.frames}{of} {status.state:4} {counts}")
+        of, camera = (f"/{self._total}", "") if self._feed is None else ("", f"{self._feed.status()}  ")
+        self.write(f"{status.frames}{of} {status.state:4} {camera}{counts}")
 
     def say(self, text: str) -> None:
         super().say(f"share agent: {text}")
