@@ -185,8 +185,8 @@ class _LiveLine(LiveLine):
             else f"sent {r['sent']} acknowledged {r['acknowledged']} corrections {r['corrections']} "
             f"rtt {rtt} map {r['map_id'] or '–'}"
         )
-        of, camera = (f"/{self._total}", "") if self._feed is None else ("", f"{self._feed.status()}  ")
-        self.write(f"{status.frames}{of} {status.state:4} {camera}{counts}")
+        of = f"/{self._total}" if self._feed is None else ""
+        self.write(f"{status.frames}{of} {status.state:4} {live.brief(self._feed)}{counts}")
 
     def say(self, text: str) -> None:
         super().say(f"share agent: {text}")

@@ -112,8 +112,17 @@ class Shown:
     def __call__(self, result: TrackResult) -> None:
         self._frames += 1
         if self._every.due(time.monotonic_ns()):
-            state = str(result.state) if result.waits is None else f"waits for {result.waits.words}"
-            self._line.write(f"{self._frames} frames  {state}  {self._feed.status()}")
+            waits = "" if result.waits is None else f", waits for {result.waits.words}"
+            camera = f"camera {self._feed.status()}"
+            self._line.write(f"{self._frames} frames  tracking {result.state}{waits}  {camera}")
+
+
+def brief(feed: Feed | None) -> str:
+    """A live camera's part of the agent's line; nothing without one."""
+    if feed is None:
+        return ""
+    told = feed.status()
+    return f"camera {told.health.value} cam0 {told.rates_hz['cam0']:.0f} Hz dropped {told.dropped}  "
 
 
 _MET = ("imu_alone", "foreign", "wraps", "jumps", "strays", "past", "restarts", "reconnections", "resets")
