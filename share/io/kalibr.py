@@ -27,7 +27,7 @@ def to_kalibr(rig: Rig) -> dict[str, Any]:
 
 
 def kalibr_texts(rig: Rig, remark: str) -> dict[str, str]:
-    """Both of Kalibr's chains, by the names of their files; one where the rig has no IMU. remark: one line."""
+    """Both of Kalibr's chains, by the names of their files; one where the rig has no IMU. remark: a line."""
     import yaml
 
     data = to_kalibr(rig)

@@ -27,7 +27,8 @@ def test_the_file_has_what_the_factory_measured(share: Callable[..., Done], tmp_
     assert done.code == 0, done.err
     assert "0123" in done.out
     rig = read_calibration(tmp_path / "mine").rig
-    assert rig.kind == "stereo+depth+imu"
+    assert rig.kind == "stereo+imu"
+    assert rig.depth == rig.cam0
     assert (rig.cam0.fx, rig.cam0.fy, rig.cam0.cx, rig.cam0.cy) == (385.0, 386.0, 320.5, 239.5)
     assert rig.baseline == pytest.approx(BASELINE)
     np.testing.assert_allclose(rig.T_body_cam0[:3, 3], T_GYRO_IR, atol=1e-8)
