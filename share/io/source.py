@@ -45,9 +45,20 @@ def _open_agent(path: Path, calibration: Calibration | None, frames: slice | Non
     return _open_mcap(recording, calibration or session.agents[path.name].calibration, frames)
 
 
+def _open_db3(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
+    from share.io.realsense.recorded import open_db3  # rosbags only where it is needed
+
+    return open_db3(path, calibration, frames)
+
+
+def _is_db3(path: Path) -> bool:
+    return path.suffix == ".db3" and path.is_file()
+
+
 READERS = (
     Reader("SESSION/NAME (a folder with session.yaml)", _is_agent, _open_agent),
     Reader("an MCAP recording (.mcap)", _is_mcap, _open_mcap),
+    Reader("a recording of the RealSense SDK (.db3)", _is_db3, _open_db3),
     Reader("an EuRoC/ASL folder (mav0/)", is_euroc, open_euroc),
     Reader("a TUM RGB-D folder (rgb.txt, depth.txt, camera.yaml)", is_tum, open_tum),
 )
