@@ -43,7 +43,7 @@ def track(
 ) -> None:
     """Track one agent over a recording, without an edge, as fast as it goes; or a camera until Ctrl-C.
 
-    SOURCE is an EuRoC/ASL folder, a TUM RGB-D folder with camera.yaml, an .mcap recording,
+    SOURCE is an EuRoC/ASL folder, a TUM RGB-D folder with camera.yaml, an .mcap or .db3 recording,
     SESSION/NAME or realsense[:SERIAL]. The same recording always gives the same poses, to the last
     digit. A frame that could not be tracked has no line in T.tum.
 

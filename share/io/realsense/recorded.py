@@ -25,14 +25,16 @@ from share.io.trajectory import Trajectory
 from share.types import F64, I64, checked_pose
 
 _LIKE = "d435i"  # its IMU is believed where the recording says nothing of one
-_NOTE = f"where the IMU sits and how noisy it is, is not recorded: taken from profile {_LIKE}; --calib knows better"
+_NOTE = f"does not say where the IMU sits and how noisy it is: taken from profile {_LIKE}, or give --calib"
 
 
 def open_db3(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
     """The recording in `path`. Raises UsageError, DataError."""
     file = Db3(path)
     if CAM0 not in file.streams:
-        raise UsageError(f"{path}: has no left infrared images; record Infrared 1, with 2 or with depth")
+        raise UsageError(
+            f"{path}: has no left infrared images (Infrared 1), compressed as the SDK does it; record them"
+        )
     if calibration is not None:
         return RecordedSource(file, calibration.rig, (), frames)
     rig = recorded_rig(file)
@@ -88,11 +90,9 @@ class RecordedSource(Source):
         return float(self._file.told(f"{self._file.streams[stream]}/info").get("fps", "30"))
 
     def _image(self, m: Measurement) -> EncodedImage:
-        camera, depth = self._cameras[m.stream], m.stream == DEPTH
+        camera, scale = self._cameras[m.stream], self._depth_scale if m.stream == DEPTH else 0.0
         where = f"{self._file.path}: {m.stream} at {m.stamp_ns}"
-        return EncodedImage(
-            m.payload, where, camera.width, camera.height, self._depth_scale if depth else 0.0
-        )
+        return EncodedImage(m.payload, where, camera.width, camera.height, scale)
 
 
 def recorded_rig(file: Db3) -> Rig:
