@@ -12,7 +12,9 @@ import numpy as np
 from software_camera import DEPTH_UNIT_M, SoftwareCamera
 
 from share.config import SequencerConfig
-from share.io.feed import Feed
+from share.core.watchdog import Watchdog
+from share.errors import UsageError
+from share.io.feed import Feed, MakeWatchdog
 from share.io.handover import Handover
 from share.io.profile import profile
 from share.io.realsense.camera import RealSense
@@ -30,15 +32,24 @@ class RoomCamera:
 
     def __init__(self, rs: Any, source: Source) -> None:
         self.source, self.camera = source, SoftwareCamera(rs, rate_hz=HZ, lens=LENS, depth=True)
+        self.there = True  # it can be connected
         self.first_ns = next(iter(source.measurements())).stamp_ns
 
     def device(self, wanted: Wanted, epoch: int = 0) -> RealSense:
         return RealSense(wanted, context=self.camera.context, epoch=epoch)
 
-    def feed(self, wanted: Wanted, queue: Handover, said: list[str]) -> Feed:
+    def feed(
+        self, wanted: Wanted, queue: Handover, said: list[str], watchdog: MakeWatchdog = Watchdog
+    ) -> Feed:
         """What the camera delivers, not opened yet."""
         rates, jump_s = wanted.rates_hz(), SequencerConfig().max_jump_s
-        return Feed(lambda _, epoch: self.device(wanted, epoch), None, rates, jump_s, said.append, queue)
+
+        def connect(serial: str | None, epoch: int) -> RealSense:
+            if not self.there:
+                raise UsageError("no camera")
+            return self.device(wanted, epoch)
+
+        return Feed(connect, None, rates, jump_s, said.append, queue, watchdog)
 
     def play(self, before_image: Callable[[], None] = lambda: None, begin_us: int = BEGIN_US) -> int:
         """All of it; the stamp of the camera's clock after it. before_image: called before each frame."""

@@ -3,12 +3,15 @@ comes to what tracking the original recording comes to."""
 
 from __future__ import annotations
 
+import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from capture_bench import quick
 from room_camera import BEGIN_US, HZ, RGBD, STEREO, RoomCamera
 
 from share.config import Config
@@ -110,3 +113,41 @@ def test_depth_of_a_live_camera_is_in_metres_and_is_tracked(plain_session: Path)
     run = tracked(source)
     assert run.report["frames"] == 45
     assert_same(room, run, original)
+
+
+def test_a_camera_that_was_unplugged_is_tracked_on_with_its_new_clock(plain_session: Path) -> None:
+    room, said = RoomCamera(rs, open_source(str(plain_session / "ar1"))), list[str]()
+    source = LiveSource(room.feed(STEREO, KeepNewest(200), said, quick), HZ)
+    feed = source.feed
+
+    def heard(text: str) -> Callable[[], bool]:
+        return lambda: any(text in line for line in said)
+
+    def plugged() -> None:
+        time.sleep(0.2)
+        room.play()
+        room.there = False
+        wait_for(heard("looks for camera"))
+        time.sleep(0.3)
+        room.there = True
+        wait_for(heard("connected again"))
+        room.play(lambda: time.sleep(1 / HZ), begin_us=0)
+        wait_for(lambda: feed.intake.streams["cam0"].samples == 90)
+        feed.stop()
+
+    threading.Thread(target=plugged, daemon=True).start()
+    run = tracked(source)
+    camera, stamps_ns = run.report["camera"], run.trajectory.stamps_ns
+    assert (camera["reconnections"], camera["stretches"], camera["restarts"]) == (1, 2, 0)
+    assert run.report["frames"] > 80
+    assert run.report["sequencer"]["gaps"] == 1
+    steps_s = np.diff(stamps_ns) * 1e-9
+    assert steps_s.min() > 0.03
+    assert 0.3 < steps_s.max() < 10  # as long as it was away, by the host's clock
+    assert (stamps_ns[-1] - stamps_ns[np.argmax(steps_s) + 1]) * 1e-9 > 1.0  # it is tracked again
+
+
+def wait_for(what: Callable[[], bool]) -> None:
+    until = time.monotonic() + 20
+    while not what() and time.monotonic() < until:
+        time.sleep(0.02)

@@ -12,31 +12,49 @@ import numpy as np
 import pytest
 from room_camera import RoomCamera
 from shell import Done
-from software_camera import BASELINE
+from software_camera import BASELINE, SoftwareCamera
 
 from share.config import Config
+from share.geometry import se3
+from share.io.profile import profile
+from share.io.realsense.camera import RealSense
+from share.io.realsense.streams import Wanted
 from share.io.source import open_source
 from share.run.track import track
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 
 
+class Turned(SoftwareCamera):
+    """Its right eye is turned about all axes."""
+
+    def _shift(self, *metres: float) -> Any:
+        told = super()._shift(*metres)
+        if metres[0] == -BASELINE:
+            told.rotation = se3.exp(np.array([0.1, 0.2, 0.3, 0, 0, 0]))[:3, :3].ravel(order="F").tolist()
+        return told
+
+
 def recorded(session: Path, name: str, out: Path) -> RoomCamera:
     """What an agent of the session saw, recorded by the SDK in `out`."""
     room = RoomCamera(rs, open_source(str(session / name)))
-    recorder = rs.recorder(str(out), room.camera.device)
+    record(room.camera, out, lambda: room.play(lambda: time.sleep(0.02)))
+    return room
+
+
+def record(camera: SoftwareCamera, out: Path, play: Callable[[], object]) -> None:
+    recorder = rs.recorder(str(out), camera.device)
     queues = []
     sensors = recorder.query_sensors()
     for sensor in sensors:
         queues.append(rs.frame_queue(5000, True))
         sensor.open(sensor.get_stream_profiles())
         sensor.start(queues[-1])
-    room.play(lambda: time.sleep(0.02))
+    play()
     time.sleep(0.5)
     for sensor in sensors:
         sensor.stop()
         sensor.close()
-    return room
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +86,23 @@ def test_images_are_the_same_to_the_last_bit_and_depth_is_in_metres(
     assert all(np.array_equal(a, b) for a, b in zip(ours["cam0"], theirs["cam0"], strict=True))
     for a, b in zip(ours["depth"], theirs["depth"], strict=True):
         np.testing.assert_allclose(np.nan_to_num(a), np.nan_to_num(b), atol=0.00026)
+
+
+def test_its_extrinsics_are_those_that_the_sdk_itself_tells(tmp_path: Path) -> None:
+    camera = Turned(rs)
+    with RealSense(Wanted(profile("d435i")), context=camera.context) as device:
+        theirs = device.rig
+
+    def play() -> None:
+        for eye in (0, 1):
+            camera.image(eye, 10**6, np.zeros((480, 640), np.uint8))
+
+    record(camera, tmp_path / "a.db3", play)
+    ours = open_source(str(tmp_path / "a.db3")).rig
+    assert theirs.T_cam1_cam0 is not None
+    assert ours.T_cam1_cam0 is not None
+    np.testing.assert_allclose(ours.T_cam1_cam0, theirs.T_cam1_cam0, atol=1e-6)
+    assert (ours.cam0, ours.imu) == (theirs.cam0, None)
 
 
 def test_it_is_converted_and_told_of(

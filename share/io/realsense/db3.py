@@ -41,10 +41,17 @@ class Db3:
             return self._text(data)
         return {}
 
+    def topic(self, begins: str) -> str:
+        """The first topic whose name begins so. Raises DataError if there is none."""
+        for name in sorted(self._ids):
+            if name.startswith(begins):
+                return name
+        raise DataError(f"{self.path}: has no {begins}, which the SDK writes")
+
     def samples(self, images: bool = True) -> Iterator[Sample]:
         """All of them as they came. images: with pixels, encoded; else an image's payload is None."""
         data = {self._ids[name]: stream for stream, name in self._data.items()}
-        metadata = {self._ids[_metadata(name)]: stream for stream, name in self._data.items()}
+        metadata = {self._ids[self.topic(_metadata(name))]: s for s, name in self._data.items()}
         read = [n for n, stream in data.items() if images or stream in (ACCEL, GYRO)] + list(metadata)
         marks = ", ".join("?" * len(read))
         query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id"

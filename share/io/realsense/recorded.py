@@ -122,8 +122,8 @@ def _camera(file: Db3, stream: str) -> Camera:
 
 
 def _T(file: Db3, stream: str) -> F64:
-    """T_stream_reference (4, 4). The SDK's rotation is column by column."""
-    told = file.told(f"{file.streams[stream]}/tf/ref_1")
+    """T_stream_reference (4, 4), one reference for the whole device. The rotation is column by column."""
+    told = file.told(file.topic(f"{file.streams[stream]}/tf/ref_"))
     try:
         T = np.eye(4)
         T[:3, :3] = np.reshape([float(v) for v in told["rotation"].split(",")], (3, 3), order="F")
