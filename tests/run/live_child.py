@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
 
 import pyrealsense2 as rs
 from room_camera import BEGIN_US, RoomCamera
@@ -19,16 +18,32 @@ rs.context = lambda: ROOM.camera.context
 START = adapter.RealSense.start
 
 
+ENDED = threading.Event()
+THREADS: list[threading.Thread] = []
+
+
+def pause() -> None:
+    """Before each frame."""
+    if ENDED.wait(1 / 15):
+        sys.exit()  # of the thread that plays
+
+
 def play() -> None:
     now = BEGIN_US
     while True:
-        now = 100_000 + ROOM.play(lambda: time.sleep(1 / 15), now)
+        now = 100_000 + ROOM.play(pause, now)
 
 
 def start(self: adapter.RealSense, sink: adapter.Sink) -> None:
     START(self, sink)
-    threading.Thread(target=play, daemon=True).start()
+    THREADS.append(threading.Thread(target=play, daemon=True))
+    THREADS[-1].start()
 
 
 adapter.RealSense.start = start  # type: ignore[method-assign]
-command_line.main(sys.argv[2:])
+try:
+    command_line.main(sys.argv[2:])
+finally:  # before the SDK is taken down under who still feeds it
+    ENDED.set()
+    for thread in THREADS:
+        thread.join()

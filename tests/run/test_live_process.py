@@ -71,7 +71,7 @@ def test_a_person_ends_tracking_and_finds_the_poses_and_what_the_camera_did(
     with running(plain_session / "ar1", *line) as (child, terminal):
         live = shown(terminal)
         told, after = ended(child, terminal)
-    assert child.returncode == 0, after
+    assert child.returncode == 0, (child.returncode, after[-500:])
     assert re.search(r"\r\x1b\[K\d+ frames  tracking OK  camera OK  accel", live), live
     assert "camera: missing " in told
     known = json.loads(report.read_text())
