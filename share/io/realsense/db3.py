@@ -28,7 +28,9 @@ class Db3:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._ids = {name: number for number, name in self._rows("SELECT id, name FROM topics")}
+        self._ids: dict[str, int] = {
+            name: number for number, name in self._rows("SELECT id, name FROM topics")
+        }
         parts = [(name.split("/"), name) for name in self._ids if name.endswith(_DATA)]
         self._data = {STREAMS[p[3]]: name for p, name in parts if len(p) > 3 and p[3] in STREAMS}
         self.streams = {stream: "/".join(name.split("/")[:4]) for stream, name in self._data.items()}
