@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from share.cli import options
+from share.cli import live, options
 from share.cli.progress import LiveLine
 from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
     from share.config import Config
+    from share.io.feed import Feed
     from share.io.keys import AgentKeys
     from share.io.source import Source
     from share.io.transport import AgentLink
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 @click.option("--true-error", is_flag=True, help="Tell the edge the true error of tracking, for experiments.")
 @options.calib
 @options.frames
+@live.camera
 @click.option("--out", metavar="DIR", help="Write odom.tum, map.tum, latency.csv and report.json here.")
 @options.config
 @options.verbose
@@ -59,6 +61,7 @@ def agent(
     true_error: bool,
     calib: str | None,
     frames: slice | None,
+    camera: live.Asked,
     out: str | None,
     config_file: str | None,
     verbose: bool,
@@ -67,13 +70,13 @@ def agent(
     """Track one agent at sensor rate, send keyframes to an edge, and take its corrections.
 
     The agent never waits for the edge: without it, odometry goes on unchanged, and the edge is
-    joined whenever it answers. Exit code 1 if it never did.
+    joined whenever it answers. Exit code 1 if it never did. SOURCE is a recording, which is played at
+    its own pace, or realsense[:SERIAL], a camera, until Ctrl-C.
 
     \b
     Example:  share agent rec/kitchen --name ann --kind ar --edge tcp://127.0.0.1:5555 --out out/ann
     """
     settings = options.load_config(config_file)
-    from share.io.source import open_source
     from share.io.transport import check_keys, connect, parse_address
     from share.run.agent import AgentRun
     from share.run.stop import on_stop
@@ -86,21 +89,22 @@ def agent(
     shaped = None if link is None else _shaped(link, link_seed)
     with_keys = _keys(keys, server_key)
     check_keys(parse_address(address), with_keys)
-    opened = open_source(source, calib, frames)
+    line = _LiveLine(streamed)
+    opened = live.open_source(source, calib, frames, camera, settings, line.say)
+    line.of(opened)
     options.say_notes(opened)
     run_id = secrets.randbits(63)
     hello = Hello(options.agent_name(name), AgentKind(kind), run_id, opened.rig, streamed)
-    live = _LiveLine(opened.images_count, streamed)
-    errors = _errors(opened, settings, true_error, live.say)
+    errors = _errors(opened, settings, true_error, line.say)
     folder = None if out is None else Path(out)
     dial = partial(connect, address, run_id, with_keys)
     through = dial if shaped is None else lambda: shaped(dial())
     run = (StreamRun if streamed else AgentRun)(
-        opened, hello, settings, through, folder, live.say, live.show, verbose, errors
+        opened, hello, settings, through, folder, line.say, line.show, verbose, errors
     )
     with on_stop(run.stop):
         run.go()
-    live.end()
+    line.end()
     if as_json:
         import json
 
@@ -161,23 +165,28 @@ def _shaped(name: str, seed: int) -> Callable[[AgentLink], AgentLink]:
 class _LiveLine(LiveLine):
     """How far the run is, written over; and what is said, on lines of its own."""
 
-    def __init__(self, total: int, streamed: bool) -> None:
+    def __init__(self, streamed: bool) -> None:
         super().__init__()
-        self._total, self._streamed = total, streamed
+        self._streamed, self._total = streamed, 0
+        self._feed: Feed | None = None  # of a live camera
+
+    def of(self, source: Source) -> None:
+        """Whose frames are shown."""
+        self._feed, self._total = getattr(source, "feed", None), source.images_count
 
     def show(self, status: Status) -> None:
         if not self.seen or (status.frames % 5 and status.frames != self._total):
             return
         r = status.report()
         rtt = "  –  " if r["rtt_ms"] is None else f"{r['rtt_ms']:.1f} ms"
-        if self._streamed:
-            counts = f"streamed {r['streamed']} answered {r['answered']} left out {r['drop_frame']}"
-            self.write(f"{status.frames}/{self._total} {status.state:4} {counts} rtt {rtt}")
-            return
-        self.write(
-            f"{status.frames}/{self._total} {status.state:4} sent {r['sent']} acknowledged "
-            f"{r['acknowledged']} corrections {r['corrections']} rtt {rtt} map {r['map_id'] or '–'}"
+        counts = (
+            f"streamed {r['streamed']} answered {r['answered']} left out {r['drop_frame']} rtt {rtt}"
+            if self._streamed
+            else f"sent {r['sent']} acknowledged {r['acknowledged']} corrections {r['corrections']} "
+            f"rtt {rtt} map {r['map_id'] or '–'}"
         )
+        of = f"/{self._total}" if self._feed is None else ""
+        self.write(f"{status.frames}{of} {status.state:4} {live.brief(self._feed)}{counts}")
 
     def say(self, text: str) -> None:
         super().say(f"share agent: {text}")
@@ -199,7 +208,7 @@ def _summary(run: AgentRun) -> str:
         lines.append(f"pose after {r['track_ms']['p50']:.1f} ms (95 %: {p95:.1f} ms)")
     if r["clock"]["uncertainty_ms"] is not None:
         lines.append(f"clock of the edge: {_clock(r['clock'])}")
-    return "\n".join(lines)
+    return "\n".join([*lines, *live.summary(r)])
 
 
 def _clock(c: dict[str, Any]) -> str:

@@ -7,6 +7,7 @@ import click
 from share.cli.calibrate_camera import camera
 from share.cli.calibrate_imu import imu
 from share.cli.calibrate_mocap import mocap
+from share.cli.calibrate_realsense import realsense
 from share.cli.calibrate_target import target
 
 
@@ -23,3 +24,4 @@ calibrate.add_command(camera)
 calibrate.add_command(imu)
 calibrate.add_command(mocap)
 calibrate.add_command(target)
+calibrate.add_command(realsense)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from share.cli import options
+from share.cli import live, options
 from share.cli.progress import LiveLine
 from share.errors import UsageError
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("source", default="realsense")
-@click.option("--profile", "profile_name", required=True, help="Kind of camera: d435i, or a profile's file.")
+@live.profile
 @click.option("--out", required=True, metavar="REC.mcap", type=click.Path(path_type=Path), help="Recording.")
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="End after so long.")
-@click.option("--mode", metavar="WxH[@HZ]", help="Image size and rate; default: the profile's.")
+@live.mode
 @click.option("--depth", is_flag=True, help="Record depth too.")
 @click.option("--imu-only", is_flag=True, help="No images: for `share calibrate imu`.")
 @click.option(
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 @options.as_json
 def capture(
     source: str,
-    profile_name: str,
+    profile_name: str | None,
     out: Path,
     seconds: float | None,
     mode: str | None,
@@ -48,50 +48,35 @@ def capture(
     SOURCE is realsense or realsense:SERIAL. After a power cut, `share dataset recover` mends the .part.
 
     \b
-    Example:  share capture --profile d435i --out walk.mcap --seconds 60
+    Example:  share capture --out walk.mcap --seconds 60
     """
     from share.config import SequencerConfig
+    from share.io.handover import Handover
     from share.io.profile import profile
-    from share.io.realsense.camera import RealSense
+    from share.io.realsense.live import feed_of
     from share.io.realsense.streams import Wanted
     from share.run.capture import Capture
     from share.run.stop import on_stop
 
     if depth and imu_only:
         raise UsageError("--depth, --imu-only: give one of them")
-    wanted = Wanted(profile(profile_name, mode), images=not imu_only, depth=depth)
+    wanted = Wanted(profile(profile_name or live.PROFILE, mode), images=not imu_only, depth=depth)
     line = LiveLine()
-    run = Capture(
-        lambda serial, epoch: RealSense(wanted, serial, epoch=epoch),
-        serial_of(source),
-        wanted.rates_hz(),
-        out,
-        SequencerConfig().max_jump_s,
-        min_free_gb,
-        lambda text: line.say(f"share: {text}"),
-        lambda status: line.write(_live(status)),
-    )
+
+    def say(text: str) -> None:
+        line.say(f"share: {text}")
+
+    feed = feed_of(source, wanted, SequencerConfig(), say, Handover())
+    run = Capture(feed, out, min_free_gb, say, lambda status: line.write(_live(status)))
     with on_stop(run.stop):
         report = run.go(seconds)
     line.end()
     click.echo(json.dumps(report) if as_json else _summary(report))
 
 
-def serial_of(source: str) -> str | None:
-    """The serial number in realsense[:SERIAL], None if there is none. Raises UsageError."""
-    kind, _, serial = source.partition(":")
-    if kind != "realsense":
-        raise UsageError(f"{source}: cannot be recorded; give realsense or realsense:SERIAL")
-    return serial or None
-
-
 def _live(status: Status) -> str:
-    rates = " ".join(f"{name} {hz:.0f}" for name, hz in status.rates_hz.items())
     lasts = "" if status.minutes == float("inf") else f" ({status.minutes:.0f} min)"
-    return (
-        f"{status.health.value}  {rates} Hz  missing {status.missing}  dropped {status.dropped}  "
-        f"queue {status.queue}  {status.mb_s:.1f} MB/s  {status.free_gb:.1f} GB free{lasts}"
-    )
+    return f"{status.feed}  {status.mb_s:.1f} MB/s  {status.free_gb:.1f} GB free{lasts}"
 
 
 def _summary(report: dict[str, Any]) -> str:
@@ -99,8 +84,7 @@ def _summary(report: dict[str, Any]) -> str:
 
     head = ["stream", "samples", "seconds", "gaps", "missing", "backward", "dropped"]
     rows = [[name, *(f"{told[key]:g}" for key in head[1:])] for name, told in report["streams"].items()]
-    met = ("imu_alone", "foreign", "wraps", "jumps", "strays", "past", "reconnections", "resets")
-    notes = ", ".join(f"{name.replace('_', ' ')} {report[name]}" for name in met if report[name])
+    notes = live.met(report)
     lines = [aligned([head, *rows]), f"{report['imu']} IMU samples joined" + (f"; {notes}" if notes else "")]
     if report["foreign"]:
         lines.append(

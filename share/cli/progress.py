@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -20,14 +21,14 @@ def progress(total: int, label: str) -> Iterator[Callable[[int], None]]:
 
 
 class LiveLine:
-    """One line on a terminal that is written over; where stderr is none, nothing."""
+    """One line on a terminal that is written over, cut where that ends; where stderr is none, nothing."""
 
     def __init__(self) -> None:
         self.seen, self._shown = sys.stderr.isatty(), False
 
     def write(self, text: str) -> None:
         if self.seen:
-            click.echo("\r\x1b[K" + text, err=True, nl=False)
+            click.echo("\r\x1b[K" + text[: _columns()], err=True, nl=False)
             self._shown = True
 
     def end(self) -> None:
@@ -40,6 +41,14 @@ class LiveLine:
         """A line of its own on stderr, terminal or not."""
         self.end()
         click.echo(text, err=True)
+
+
+def _columns() -> int | None:
+    """That fit into a line of the terminal; None if it does not tell."""
+    try:
+        return os.get_terminal_size(sys.stderr.fileno()).columns or None
+    except (OSError, ValueError):
+        return None
 
 
 class Stages:

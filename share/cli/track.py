@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from share.cli import options
-from share.cli.progress import progress
+from share.cli import live, options
+from share.cli.progress import LiveLine, progress
 from share.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from share.config import Config
+    from share.io.source import Source
+    from share.run.track import TrackRun
 
 _SOON_S = 1.0  # a first pose that needs no word
 
@@ -21,6 +26,7 @@ _SOON_S = 1.0  # a first pose that needs no word
 @options.frames
 @click.option("--out", metavar="T.tum", help="Write the causal poses of the body in odom here.")
 @click.option("--report", "report_file", metavar="R.json", help="Write the report here.")
+@live.camera
 @options.config
 @options.verbose
 @options.as_json
@@ -30,36 +36,40 @@ def track(
     frames: slice | None,
     out: str | None,
     report_file: str | None,
+    camera: live.Asked,
     config_file: str | None,
     verbose: bool,
     as_json: bool,
 ) -> None:
-    """Track one agent over a recording, without an edge, as fast as it goes.
+    """Track one agent over a recording, without an edge, as fast as it goes; or a camera until Ctrl-C.
 
-    SOURCE is an EuRoC/ASL folder, a TUM RGB-D folder with camera.yaml, an .mcap recording or
-    SESSION/NAME. The same recording always gives the same poses, to the last digit. A frame that
-    could not be tracked has no line in T.tum.
+    SOURCE is an EuRoC/ASL folder, a TUM RGB-D folder with camera.yaml, an .mcap or .db3 recording,
+    SESSION/NAME or realsense[:SERIAL]. The same recording always gives the same poses, to the last
+    digit. A frame that could not be tracked has no line in T.tum.
 
     \b
     Example:  share track rec/kitchen --out kitchen.tum --report kitchen.json
+              share track realsense --out walk.tum
     """
     settings = options.load_config(config_file)
     named = {"--out": out, "--report": report_file}
     from share.io.files import atomic_write
-    from share.io.source import open_source
     from share.io.trajectory import format_tum
-    from share.run.track import accuracy, track
+    from share.run.track import accuracy
 
-    opened = open_source(source, calib, frames)
+    line = LiveLine()
+    opened = live.open_source(
+        source, calib, frames, camera, settings, lambda text: line.say(f"share: {text}")
+    )
     options.say_notes(opened)
     wanted = _targets(named, source)
     truth = opened.truth()  # if it is damaged, better now than after tracking
-    with progress(opened.images_count, "tracking") as bar:
-        run = track(opened, settings, bar)
+    run = _tracked(opened, settings, line)
     if not len(run.trajectory.stamps_ns):
         raise DataError(
             f"{opened.name}: none of its {run.report['frames']} frames could be tracked; are they dark, "
-            "blurred or bare, or is the calibration another camera's?" + _waited(run.report)
+            "blurred or bare, or is the calibration another camera's?"
+            + "".join(f" {line}." for line in [*_waited(run.report), *live.summary(run.report)])
         )
     ate = accuracy(run, truth) if run.report["stretches"] == 1 else None
     report = {**run.report, "ate_m": ate.rmse if ate else None}
@@ -85,12 +95,27 @@ def _targets(named: dict[str, str | None], source: str) -> dict[str, Path]:
     return wanted
 
 
-def _waited(report: dict[str, Any]) -> str:
+def _tracked(opened: Source, settings: Config, line: LiveLine) -> TrackRun:
+    """All of a recording, or of a camera until somebody ends it."""
+    from share.io.live import LiveSource
+    from share.run.stop import on_stop
+    from share.run.track import track
+
+    if not isinstance(opened, LiveSource):
+        with progress(opened.images_count, "tracking") as bar:
+            return track(opened, settings, lambda result: bar(1))
+    with on_stop(opened.stop):
+        run = track(opened, settings, live.Shown(opened.feed, line))
+    line.end()
+    return run
+
+
+def _waited(report: dict[str, Any]) -> list[str]:
     """For what, for most of the time without a pose."""
     from share.types import Wait
 
     frames = report["waited"]
-    return f" The tracker waited for {Wait(max(frames, key=frames.get)).words}" if frames else ""
+    return [f"The tracker waited for {Wait(max(frames, key=frames.get)).words}"] if frames else []
 
 
 def _summary(report: dict[str, Any], ate: Any) -> str:
@@ -101,7 +126,7 @@ def _summary(report: dict[str, Any], ate: Any) -> str:
         f"and {report['decode_ms_per_frame']:.1f} ms to decode it",
     ]
     if report["init_s"] > _SOON_S:
-        lines.append(f"the first pose came after {report['init_s']:.1f} s." + _waited(report))
+        lines.append(". ".join([f"the first pose came after {report['init_s']:.1f} s", *_waited(report)]))
     if report["contradicted"]:
         lines.append(
             f"images and IMU contradict each other in {report['contradicted']} frames: see whether the "
@@ -116,4 +141,4 @@ def _summary(report: dict[str, Any], ate: Any) -> str:
             f"ATE {100 * ate.rmse:.2f} cm rms, {100 * ate.max:.2f} cm at most "
             f"({ate.n} causal poses, SE3 alignment)"
         )
-    return "\n".join(lines)
+    return "\n".join([*lines, *live.summary(report)])

@@ -9,6 +9,7 @@ from typing import Any
 from share.core.gaps import Gaps
 from share.core.inertial_join import InertialJoin
 from share.core.measurement import IMU, Measurement
+from share.core.restart import Restart
 from share.core.stamps import StampRepair
 
 ACCEL, GYRO = "accel", "gyro"
@@ -44,38 +45,47 @@ class _Clock:
 class Intake:
     """Repairs stamps, joins accel and gyro, counts. Pure: no clock but what the samples say.
 
-    After a reconnection time goes on by as much as the host's clock went on. `foreign` counts samples
+    After a reconnection, and where the device's clock begins anew without one (`restarts`), a new stretch
+    begins and time goes on by as much as the host's clock went on. `foreign` counts samples
     whose stamps are not of the device's clock: they are used, but a person has to know; `wraps`, `jumps`,
     `strays` and `past` are those of `StampRepair`; `streams` has the gaps of every stream of the device.
     """
 
     def __init__(self, rates_hz: Mapping[str, float], max_jump_s: float) -> None:
         """rates_hz: of every stream that is expected."""
-        self.foreign = self.stretches = 0
+        self.foreign = self.stretches = self.restarts = 0
         self.streams = {stream: Gaps(rate) for stream, rate in rates_hz.items()}
         gap_s = _ACCEL_GAP / rates_hz.get(ACCEL, 1.0)
         self.join = InertialJoin(int(gap_s * 1e9))
         self._max_jump_s = max_jump_s
         self._epoch = -1
         self._clocks: list[_Clock] = []
+        self._restart = Restart()
         self._last: tuple[int, int] | None = None  # (stamp, arrived) of the newest sample
 
     def feed(self, sample: Sample) -> Iterator[Measurement]:
         """What may now be used: mostly this sample, perhaps none or several."""
+        self.foreign += not sample.hardware
         if sample.epoch != self._epoch:
             self._begin(sample)
-        self.foreign += not sample.hardware
+        clock = self._clocks[-1]
+        past = clock.repair.past
+        for stamp, measurement in self._repaired(sample):
+            yield from self._use(stamp, measurement.payload)
+        if clock.repair.past > past:
+            self._refuse(sample)
+
+    def _repaired(self, sample: Sample) -> Iterator[tuple[int, Measurement]]:
         clock = self._clocks[-1]
         raw = Measurement(sample.stream, sample.stamp_ns, sample)
-        for stamp, measurement in clock.repair.feed(raw):
-            yield from self._use(stamp + clock.offset_ns, measurement.payload)
+        return ((stamp + clock.offset_ns, usable) for stamp, usable in clock.repair.feed(raw))
 
     def counts(self) -> dict[str, int]:
         """What was repaired or left out, by name."""
         repairs = [clock.repair for clock in self._clocks]
         names = ("wraps", "jumps", "strays", "past")
         out = {name: sum(getattr(repair, name) for repair in repairs) for name in names}
-        return out | {"foreign": self.foreign, "imu_alone": self.join.alone}
+        return out | {"restarts": self.restarts, "foreign": self.foreign, "imu_alone": self.join.alone}
 
     def _begin(self, sample: Sample) -> None:
         clock = _Clock(StampRepair(self._max_jump_s))
@@ -84,12 +94,23 @@ class Intake:
             clock.offset_ns = stamp + (sample.arrived_ns - arrived) - sample.stamp_ns
         self._clocks.append(clock)
         self._epoch = sample.epoch
+        self._restart.used()
         self.stretches += 1
+
+    def _refuse(self, sample: Sample) -> None:
+        """Its stamp lies in the past. Where that goes on, the next sample begins a new stretch."""
+        if self._restart.refused(sample.stream, sample.stamp_ns):
+            self.restarts += 1
+            self._begin(sample)
 
     def _use(self, stamp: int, sample: Sample) -> Iterator[Measurement]:
         gaps = self.streams.get(sample.stream)
-        if gaps is None or not gaps.feed(stamp, sample.number):
+        if gaps is None:
             return
+        if not gaps.feed(stamp, sample.number):
+            self._refuse(sample)
+            return
+        self._restart.used()
         if self._last is None or stamp > self._last[0]:
             self._last = (stamp, sample.arrived_ns)
         if sample.stream == GYRO:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from enum import Enum
 
+from share.core.intake import ACCEL, GYRO
 from share.core.measurement import IMU
+
+_MOTION = (IMU, ACCEL, GYRO)
 
 
 class Action(Enum):
@@ -28,6 +31,7 @@ class Health(Enum):
 class Watchdog:
     """Silence of the IMU: one reset, then vision only. Silence of the images, or a device that is
     gone: reconnect, again and again. Silence is not counted in the first warm_up_ms after a connection.
+    `resets` and `reconnections` are counted.
     """
 
     def __init__(
@@ -41,14 +45,24 @@ class Watchdog:
     ) -> None:
         self.health = Health.OK
         self.resets = 0
+        self._connections = 0
         self._has_images, self._has_imu = has_images, has_imu
         self._silent_ns, self._warm_up_ns = int(silent_ms * 1e6), int(warm_up_ms * 1e6)
         self._retry_ns = int(retry_ms * 1e6)
-        self.connected(now_ns)
+        self._listen(now_ns)
+
+    @property
+    def reconnections(self) -> int:
+        """Connections after the first."""
+        return max(0, self._connections - 1)
 
     def connected(self, now_ns: int) -> None:
         """The device delivers, or is about to."""
         self.health = Health.OK
+        self._connections += 1
+        self._listen(now_ns)
+
+    def _listen(self, now_ns: int) -> None:
         patience = now_ns + self._warm_up_ns - self._silent_ns
         self._imu_ns = self._image_ns = patience
 
@@ -59,7 +73,7 @@ class Watchdog:
 
     def heard(self, stream: str, now_ns: int) -> None:
         """A sample of the stream came. cam0, cam1, depth count as images."""
-        if stream == IMU:
+        if stream in _MOTION:
             self._imu_ns = max(self._imu_ns, now_ns)
         else:
             self._image_ns = max(self._image_ns, now_ns)

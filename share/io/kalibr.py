@@ -6,7 +6,7 @@ from typing import Any
 
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.io.calibration import TIMESHIFT
+from share.io.calibration import CAMCHAIN, IMU_CHAIN, TIMESHIFT
 
 _DEPTH_SCALE = 1000.0  # 16-bit depth in millimetres
 
@@ -24,6 +24,20 @@ def to_kalibr(rig: Rig) -> dict[str, Any]:
         T = rig.T_depth_cam0.tolist()
         out["depth"] = _camera(rig.depth) | {"T_depth_cam0": T, "depth_scale": _DEPTH_SCALE}
     return out
+
+
+def kalibr_texts(rig: Rig, remark: str) -> dict[str, str]:
+    """Both of Kalibr's chains, by the names of their files; one where the rig has no IMU. remark: a line."""
+    import yaml
+
+    data = to_kalibr(rig)
+    parts = {CAMCHAIN: {k: v for k, v in data.items() if k != "imu0"}}
+    if "imu0" in data:
+        parts[IMU_CHAIN] = {"imu0": data["imu0"]}
+    return {
+        name: f"# {remark}\n" + yaml.safe_dump(part, sort_keys=False, default_flow_style=None)
+        for name, part in parts.items()
+    }
 
 
 def _camera(camera: Camera) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from share.types import F64, I64
 
 
 class Source(ABC):
-    """One agent's recording. `rig` decides which streams there are; `notes` are for a person."""
+    """One agent's recording, or its camera. `rig` decides which streams there are; `notes` are for people."""
 
     name: str
     rig: Rig
@@ -36,6 +36,13 @@ class Source(ABC):
     @abstractmethod
     def truth(self) -> Trajectory | None:
         """True poses of the body in the world, if the recording has them."""
+
+    def stop(self) -> None:  # noqa: B027 -- a recording ends by itself
+        """Ask a live camera to end, from any thread or signal handler."""
+
+    def report(self) -> dict[str, Any]:
+        """What a live camera met, for report.json."""
+        return {}
 
     @property
     def images_count(self) -> int:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from share.errors import UsageError
 from share.io.calibration import Calibration, read_calibration
 from share.io.euroc import is_euroc, open_euroc
+from share.io.realsense.devices import is_camera
 from share.io.recording import Source
 from share.io.session import is_session, read_session
 from share.io.tum import is_tum, open_tum
@@ -44,9 +45,20 @@ def _open_agent(path: Path, calibration: Calibration | None, frames: slice | Non
     return _open_mcap(recording, calibration or session.agents[path.name].calibration, frames)
 
 
+def _open_db3(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
+    from share.io.realsense.recorded import open_db3  # rosbags only where it is needed
+
+    return open_db3(path, calibration, frames)
+
+
+def _is_db3(path: Path) -> bool:
+    return path.suffix == ".db3" and path.is_file()
+
+
 READERS = (
     Reader("SESSION/NAME (a folder with session.yaml)", _is_agent, _open_agent),
     Reader("an MCAP recording (.mcap)", _is_mcap, _open_mcap),
+    Reader("a recording of the RealSense SDK (.db3)", _is_db3, _open_db3),
     Reader("an EuRoC/ASL folder (mav0/)", is_euroc, open_euroc),
     Reader("a TUM RGB-D folder (rgb.txt, depth.txt, camera.yaml)", is_tum, open_tum),
 )
@@ -58,10 +70,10 @@ def open_source(spec: str, calib: str | None = None, frames: slice | None = None
     frames: only these images of cam0 (by number, no step), and the IMU samples since the one before.
     Raises UsageError, ConfigError or DataError.
     """
-    if spec == "realsense" or spec.startswith("realsense:"):
+    if is_camera(spec):
         raise UsageError(f"{spec}: a live camera is recorded with `share capture`; then give the recording")
     path = Path(spec)
-    calibration = None if calib is None else read_calibration(_existing(Path(calib), "--calib"))
+    calibration = calibration_of(calib)
     for reader in READERS:
         if reader.knows(path):
             return reader.open(path, calibration, frames)
@@ -73,6 +85,11 @@ def open_source(spec: str, calib: str | None = None, frames: slice | None = None
         raise UsageError(f"{spec}: is a session; name one of its agents: {agents}")
     known = "; ".join(reader.what for reader in READERS)
     raise UsageError(f"{spec}: is none of the recordings that SHARE reads: {known}")
+
+
+def calibration_of(calib: str | None) -> Calibration | None:
+    """What --calib names, None where it was not given. Raises UsageError, ConfigError."""
+    return None if calib is None else read_calibration(_existing(Path(calib), "--calib"))
 
 
 def _existing(path: Path, what: str) -> Path:

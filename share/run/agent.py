@@ -3,6 +3,8 @@
     reader: decode, wait until the sensor would have delivered -> tracker: pose, then keyframe
         -> main: the machine, the link, the files
 
+A live camera has no reader: the tracker takes what is newest (`run.arrivals`).
+
 A recording is played at its own pace and no frame of it is dropped: the reader waits when the tracker
 is behind (policy `block`), while a frame still counts as arrived when it was due. So the poses of a
 recording are the same to the last digit on any machine, with an edge or without, and lateness shows
@@ -25,10 +27,12 @@ from share.core import events as ev
 from share.core.agent import Agent
 from share.core.sequencer import SequencerCounters
 from share.errors import DataError
+from share.io.live import LiveSource
 from share.io.source import Source
 from share.io.transport import AgentLink
 from share.metrics.runlog import RunLog
 from share.run.agent_files import AgentFiles
+from share.run.arrivals import Arrivals, Played, Seen
 from share.run.errors import Errors, Unknown
 from share.run.late import Late
 from share.run.pipeline import frames_of, tracker_for
@@ -36,7 +40,6 @@ from share.strict import to_mapping
 from share.types import Frame, TrackState, Wait
 from share.wire.messages import Hello
 
-READ_AHEAD = 30  # frames decoded before they are due
 TICK_MS = 50
 
 
@@ -53,7 +56,6 @@ class Status:
 class _Shared:
     """What the threads tell each other."""
 
-    frames: queue.Queue[Frame | None] = field(default_factory=lambda: queue.Queue(READ_AHEAD))
     inbox: queue.SimpleQueue[ev.AgentEvent] = field(default_factory=queue.SimpleQueue)
     stop: threading.Event = field(default_factory=threading.Event)
     error: BaseException | None = None  # what ended a thread
@@ -89,6 +91,7 @@ class AgentRun:
         self._counters = SequencerCounters()
         self._link = connect()  # last: whatever is wrong with the above has been said by now
         self._shared = _Shared()
+        self._arrivals = self._make_arrivals()
         self._damaged = 0
         self._waits: Wait | None = None  # the tracker, for what
         self._ended = False
@@ -102,54 +105,36 @@ class AgentRun:
     def stop(self) -> None:
         """End early, in good order: no more frames, but what was sent is still waited for."""
         self._shared.stop.set()
+        self._arrivals.stop()
 
     def go(self) -> None:
         """Raises what ended the run before its time, after everything was closed."""
-        threads = [threading.Thread(target=f, name=n, daemon=True) for n, f in self._threads().items()]
-        for thread in threads:
-            thread.start()
+        tracker = threading.Thread(target=self._track, name="tracker", daemon=True)
+        tracker.start()
         try:
             self._loop()
             self.report = self._report()
             self._files.finish(self._log, self.report)
         finally:
-            self._shared.stop.set()
+            self.stop()
             self._files.release()
             self._link.close()
-            for thread in threads:
-                thread.join(timeout=2)
+            tracker.join(timeout=4)
             self._errors.close()
         if self._shared.error is not None:
             raise self._shared.error
 
-    def _threads(self) -> dict[str, Callable[[], None]]:
-        return {"reader": self._read, "tracker": self._track}
+    # ------------------------------------------------------------------ frames
 
-    # ------------------------------------------------------------------ reader
+    def _make_arrivals(self) -> Arrivals:
+        if isinstance(self._source, LiveSource):
+            return Seen(self._decoded, self._source)
+        return Played(self._decoded, self._late)
 
-    def _read(self) -> None:
-        shared = self._shared
-        try:
-            frames = frames_of(
-                self._source, self._settings, self._counters, self._skip_damaged, self._log.add_decode
-            )
-            for frame in frames:
-                if not self._put(frame):
-                    return
-        except BaseException as error:
-            shared.error = error
-        finally:
-            self._put(None)
-
-    def _put(self, frame: Frame | None) -> bool:
-        """Wait for room, unless the run is over."""
-        while not self._shared.stop.is_set():
-            try:
-                self._shared.frames.put(frame, timeout=0.1)
-                return True
-            except queue.Full:
-                continue
-        return False
+    def _decoded(self) -> Iterator[Frame]:
+        return frames_of(
+            self._source, self._settings, self._counters, self._skip_damaged, self._log.add_decode
+        )
 
     def _skip_damaged(self, error: DataError) -> None:
         self._damaged += 1
@@ -159,31 +144,12 @@ class AgentRun:
 
     def _track(self) -> None:
         try:
-            for frame, arrived_ns in self._due_frames():
+            for frame, arrived_ns in self._arrivals.each():
                 self._track_one(frame, arrived_ns)
         except BaseException as error:
             self._shared.error = error
         finally:
             self._post(ev.Finished())
-
-    def _due_frames(self) -> Iterator[tuple[Frame, int]]:
-        """Frames when the sensor would have delivered them, and that moment."""
-        began: tuple[int, int] | None = None
-        while not self._shared.stop.is_set():
-            try:
-                frame = self._shared.frames.get(timeout=0.1)
-            except queue.Empty:
-                continue
-            if frame is None:
-                return
-            now = time.monotonic_ns()
-            began = (now, frame.stamp_ns) if began is None else began
-            due = began[0] + frame.stamp_ns - began[1]
-            if due > now and self._shared.stop.wait((due - now) * 1e-9):
-                return
-            behind_ns, another = time.monotonic_ns() - due, not self._shared.frames.empty()
-            if (taken := self._late.take(frame, behind_ns, another)) is not None:
-                yield taken, due
 
     def _track_one(self, frame: Frame, arrived_ns: int) -> None:
         cpu = time.thread_time()
@@ -272,6 +238,7 @@ class AgentRun:
             "bytes_down": protocol["bytes_down"],
             "damaged_images": self._damaged,
             "drop_late": self._late.dropped,
+            **self._source.report(),
             **self._errors.report(),
             "sequencer": dataclasses.asdict(self._counters),
             "clock": self._machine.clock(time.monotonic_ns()).report(),

@@ -1,7 +1,7 @@
 """`share capture`: a camera's streams to a recording, for as long as the disk lasts.
 
-the device's threads -> bounded queue -> writer thread: repair, join, write
-    main thread: watchdog, disk, live line
+the camera's feed -> writer thread: the file
+    main thread: disk, live line
 """
 
 from __future__ import annotations
@@ -10,52 +10,25 @@ import contextlib
 import shutil
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from share.core.intake import ACCEL, GYRO, Intake, Sample
-from share.core.measurement import CAM0, IMU
-from share.core.watchdog import Action, Health, Watchdog
 from share.errors import ShareError, UsageError
-from share.geometry.camera import Rig
+from share.io.feed import Feed
+from share.io.feed_status import FeedStatus
 from share.io.mcap.recorder import Recorder
-from share.run.handover import Handover
 
 _TICK_S = 0.1
 _SHOW_S = 1.0
-_WAIT_S = 0.2
-
-
-class Device(Protocol):
-    """A camera that is connected, such as `share.io.realsense.camera.RealSense`."""
-
-    @property
-    def rig(self) -> Rig: ...
-
-    @property
-    def serial(self) -> str: ...
-
-    def start(self, sink: Callable[[Sample], None]) -> None: ...
-
-    def stop(self) -> None: ...
-
-    def reset(self) -> None: ...
-
-
-Connect = Callable[[str | None, int], Device]  # serial number (None: any), how often it was tried before
 
 
 @dataclass(frozen=True)
 class Status:
-    """For the live line. rates_hz: of every stream in the last second; minutes: that the disk lasts."""
+    """For the live line. minutes: that the disk lasts, infinite where nothing is written."""
 
-    health: Health
-    rates_hz: dict[str, float]
-    missing: int
-    dropped: int
-    queue: int
+    feed: FeedStatus
     mb_s: float
     free_gb: float
     minutes: float
@@ -70,29 +43,17 @@ class Capture:
 
     def __init__(
         self,
-        connect: Connect,
-        serial: str | None,
-        rates_hz: Mapping[str, float],
+        feed: Feed,
         out: Path,
-        max_jump_s: float,
         min_free_gb: float,
         say: Callable[[str], None],
         show: Callable[[Status], None] = lambda status: None,
-        watchdog: Callable[[int, bool, bool], Watchdog] = Watchdog,
     ) -> None:
-        self._connect, self._serial, self._rates = connect, serial, dict(rates_hz)
-        self._out, self._free_least = out, min_free_gb * 1e9
+        self._feed, self._out, self._free_least = feed, out, min_free_gb * 1e9
         self._say, self._show = say, show
-        self._intake = Intake(rates_hz, max_jump_s)
-        self._handover = Handover()
-        self._make_watchdog = watchdog
-        self._watchdog = self._new_watchdog()
         self._stop = threading.Event()
-        self._device: Device | None = None
-        self._heard: dict[str, int] = {}
-        self._reconnections = self._attempts = 0
         self._error: BaseException | None = None
-        self._shown: tuple[float, int, dict[str, int]] = (time.monotonic(), 0, {})
+        self._shown = (time.monotonic(), 0)  # when, and bytes by then
         self.ended = "stopped"
 
     def stop(self) -> None:
@@ -102,95 +63,48 @@ class Capture:
     def go(self, seconds: float | None = None) -> dict[str, Any]:
         """Record, and tell what came of it."""
         _check_disk(self._out, self._free_least)
-        self._device = device = self._connect(self._serial, 0)
-        self._serial = device.serial
-        device.start(self._take)  # before there is a file: the queue holds what comes meanwhile
+        rig = self._feed.open()  # before there is a file: the queue holds what comes meanwhile
         try:
-            self._record(Recorder(self._out, device.rig, durable=True), seconds)
-        finally:
-            self._leave()
+            recorder = Recorder(self._out, rig, durable=True)
+        except BaseException:
+            self._feed.close()
+            raise
+        self._record(recorder, seconds)
         if self._error is not None:
             raise self._error
-        return self.report()
+        return {"out": str(self._out), "ended": self.ended, **self._feed.report()}
 
     def _record(self, recorder: Recorder, seconds: float | None) -> None:
         """Until it ends; then the file is whole, or keeps its `.part` if something went wrong."""
         writer = threading.Thread(target=self._write, args=(recorder,), daemon=True)
         writer.start()
-        self._watchdog = self._new_watchdog()
         try:
             self._loop(seconds)
         except BaseException as error:
             self._error = self._error or error
-        self._leave()
+        self._feed.stop()
         writer.join()
         if self._error is not None:
             recorder.abort()
-        elif not any(gaps.samples for gaps in self._intake.streams.values()):
+        elif not any(gaps.samples for gaps in self._feed.intake.streams.values()):
             recorder.abort()
             recorder.part.unlink()
-            self._error = ShareError(f"camera {self._serial}: no sample came; nothing was recorded")
+            self._error = ShareError(f"camera {self._feed.serial}: no sample came; nothing was recorded")
         else:
             recorder.close()
 
-    def _leave(self) -> None:
-        """Let the camera go; what it sent is still written."""
-        if self._device is not None:
-            self._device.stop()
-        self._handover.close()
-
-    def report(self) -> dict[str, Any]:
-        """What was recorded, repaired and lost."""
-        streams = {
-            name: {
-                "samples": gaps.samples,
-                "seconds": round(gaps.seconds, 3),
-                "gaps": gaps.gaps,
-                "missing": gaps.missing,
-                "backward": gaps.backward,
-                "dropped": self._handover.dropped.get(name, 0),
-            }
-            for name, gaps in self._intake.streams.items()
-        }
-        return {
-            "out": str(self._out),
-            "ended": self.ended,
-            "streams": streams,
-            "imu": self._intake.join.joined,
-            "stretches": self._intake.stretches,
-            "reconnections": self._reconnections,
-            "resets": self._watchdog.resets,
-            "health": self._watchdog.health.value,
-            **self._intake.counts(),
-        }
-
-    def _new_watchdog(self) -> Watchdog:
-        return self._make_watchdog(time.monotonic_ns(), CAM0 in self._rates, GYRO in self._rates)
-
-    def _take(self, sample: Sample) -> None:
-        """In the device's threads."""
-        self._heard[sample.stream] = time.monotonic_ns()
-        self._handover.put(sample)
-
-    # ------------------------------------------------------------------ writer
-
     def _write(self, recorder: Recorder) -> None:
         try:
-            while not self._handover.done:
-                sample = self._handover.get(_WAIT_S)
-                for measurement in self._intake.feed(sample) if sample is not None else ():
-                    recorder.write(measurement)
+            for measurement in self._feed.measurements():
+                recorder.write(measurement)
         except BaseException as error:
             self._error = error
+            self._feed.close()
             self._stop.set()
-            self._handover.close()
-
-    # ------------------------------------------------------------------ main
 
     def _loop(self, seconds: float | None) -> None:
         began = time.monotonic()
         while not self._stop.wait(_TICK_S):
-            self._guard()
             if shutil.disk_usage(self._out.parent).free < self._free_least:
                 self.ended = "disk almost full"
                 self._say(f"{self._out.parent}: less than {self._free_least / 1e9:g} GB left; ends here")
@@ -201,59 +115,14 @@ class Capture:
             if time.monotonic() - self._shown[0] >= _SHOW_S:
                 self._show(self._status())
 
-    def _guard(self) -> None:
-        """Feed the watchdog, and do what it asks for."""
-        if self._device is not None:
-            for stream, now_ns in list(self._heard.items()):
-                self._watchdog.heard(IMU if stream in (ACCEL, GYRO) else stream, now_ns)
-        match self._watchdog.tick(time.monotonic_ns()):
-            case Action.RESET:
-                self._say("the IMU is silent; the camera is reset once")
-                if self._device is not None:
-                    self._device.reset()
-                self._device = None
-            case Action.VISION_ONLY:
-                self._say("the IMU stays silent; VISION_ONLY: images are recorded without it")
-            case Action.HEARD_AGAIN:
-                self._say("the IMU is heard again")
-            case Action.RECONNECT:
-                self._reconnect()
-
-    def _reconnect(self) -> None:
-        if self._device is not None:
-            self._say(f"no more samples come; looks for camera {self._serial} until it is back")
-            self._device.stop()
-            self._device = None
-        self._attempts += 1
-        try:
-            device = self._connect(self._serial, self._attempts)
-            device.start(self._take)
-        except ShareError:
-            self._watchdog.lost(time.monotonic_ns())
-            return
-        self._reconnections += 1
-        self._device = device
-        self._watchdog.connected(time.monotonic_ns())
-        self._say(f"camera {self._serial} is connected again; a new stretch begins")
-
     def _status(self) -> Status:
-        then, size, counts = self._shown
-        now = time.monotonic()
-        streams = self._intake.streams
-        self._shown = (now, _size(self._out), {name: gaps.samples for name, gaps in streams.items()})
+        (then, size), now = self._shown, time.monotonic()
+        self._shown = (now, _size(self._out))
         mb_s = (self._shown[1] - size) / (now - then) / 1e6
         free = shutil.disk_usage(self._out.parent).free
         left = max(0.0, free - self._free_least)
-        return Status(
-            health=self._watchdog.health,
-            rates_hz={n: (c - counts.get(n, 0)) / (now - then) for n, c in self._shown[2].items()},
-            missing=sum(gaps.missing for gaps in streams.values()),
-            dropped=sum(self._handover.dropped.values()),
-            queue=len(self._handover),
-            mb_s=mb_s,
-            free_gb=free / 1e9,
-            minutes=left / (mb_s * 1e6) / 60 if mb_s > 0 else float("inf"),
-        )
+        minutes = left / (mb_s * 1e6) / 60 if mb_s > 0 else float("inf")
+        return Status(self._feed.status(), mb_s, free / 1e9, minutes)
 
 
 def _check_disk(out: Path, least: float) -> None:

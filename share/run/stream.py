@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from typing import Any
 
 from share.core import events as ev
-from share.run.agent import READ_AHEAD, TICK_MS, AgentRun
+from share.io.live import LiveSource
+from share.run.agent import TICK_MS, AgentRun
+from share.run.arrivals import READ_AHEAD
 from share.run.pipeline import check_trackable
 from share.types import Frame
 
@@ -27,13 +28,17 @@ class StreamRun(AgentRun):
         self._room = threading.Semaphore(READ_AHEAD)  # frames between the threads: policy block
         self._may_begin = threading.Event()
 
-    def _due_frames(self) -> Iterator[tuple[Frame, int]]:
+    def _track(self) -> None:
+        if not isinstance(self._source, LiveSource):
+            self._await_edge()
+        super()._track()
+
+    def _await_edge(self) -> None:
         deadline = time.monotonic() + self._settings.stream.begin_s
         while not (self._may_begin.wait(TICK_MS / 1e3) or self._shared.stop.is_set()):
             if time.monotonic() >= deadline:
                 self._say("the edge does not track this agent yet; the recording begins without")
                 break
-        return super()._due_frames()
 
     def _track_one(self, frame: Frame, arrived_ns: int) -> None:
         while not self._room.acquire(timeout=0.1):

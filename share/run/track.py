@@ -13,6 +13,7 @@ import numpy as np
 from share import __version__, config
 from share.core.sequencer import SequencerCounters
 from share.errors import DataError
+from share.estimator.result import TrackResult
 from share.io.source import Source
 from share.io.trajectory import Trajectory
 from share.metrics.ate import Ate, ate
@@ -29,8 +30,8 @@ class TrackRun:
     report: dict[str, Any]
 
 
-def track(source: Source, settings: config.Config, progress: Callable[[int], None]) -> TrackRun:
-    """Track every frame in turn. `progress` is called with 1 after each."""
+def track(source: Source, settings: config.Config, told: Callable[[TrackResult], None]) -> TrackRun:
+    """Track every frame in turn, of a live camera the newest. `told` is what came of each."""
     tracker, log, counters = tracker_for(source, settings), RunLog(), SequencerCounters()
     stamps, poses = [], []
     for frame in frames_of(source, settings, counters, spent=log.add_decode):
@@ -45,9 +46,9 @@ def track(source: Source, settings: config.Config, progress: Callable[[int], Non
         if result.T_odom_body is not None:
             stamps.append(frame.stamp_ns)
             poses.append(result.T_odom_body)
-        progress(1)
+        told(result)
     trajectory = Trajectory(np.array(stamps, np.int64), np.array(poses).reshape(-1, 4, 4))
-    return TrackRun(trajectory, report_of(log, counters, settings))
+    return TrackRun(trajectory, report_of(log, counters, settings) | source.report())
 
 
 def report_of(log: RunLog, counters: SequencerCounters, settings: config.Config) -> dict[str, Any]:

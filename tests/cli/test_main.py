@@ -113,7 +113,7 @@ def test_no_arguments_is_the_help_and_wrong_use(capsys):
         ("dataset inf", "No such command 'inf'. Did you mean 'info'?"),
         ("track", "Missing argument 'SOURCE'"),
         ("track x y", "unexpected extra argument (y)"),
-        ("track x --ot y", "No such option '--ot'. (Did you mean one of: '--json', '--out'"),
+        ("track x --ot y", "No such option '--ot'. (Did you mean one of: '--mode', '--out'"),
         ("track x --out", "Option '--out' requires an argument"),
         ("track x --frames 3", "'3' is not a range of frames such as 0:250"),
         ("track x --frames 5:5", "'5:5' is not a range of frames"),

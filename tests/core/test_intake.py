@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 
 from share.core.gaps import Gaps
@@ -68,3 +70,33 @@ def test_a_camera_that_numbers_anew_has_not_lost_frames() -> None:
     for stamp, number in ((0, 500), (100, 0), (200, 1)):
         gaps.feed(stamp * MS, number)
     assert gaps.missing == 0
+
+
+def fed(intake: Intake, stream: str, begin_ms: int, count: int, arrived_ms: int) -> list[int]:
+    """Stamps in ms that come of `count` samples, one every 5 ms."""
+    told = []
+    for k in range(0, 5 * count, 5):
+        at = Sample(stream, (begin_ms + k) * MS, (0, 0, 0), (arrived_ms + k) * MS)
+        told += [stamp // MS for stamp in stamps(intake, at)]
+    return told
+
+
+@pytest.mark.parametrize("before_ms", [900_000, 3_000])
+def test_a_clock_that_begins_anew_without_a_word_is_noticed(before_ms: int) -> None:
+    intake = Intake(RATES, 10.0)
+    assert fed(intake, "cam0", before_ms, 100, 7_000)[-1] == before_ms + 495
+    told = fed(intake, "cam0", 0, 100, 7_500)
+    assert told[0] == pytest.approx(before_ms + 500 + 250, abs=10)  # 0.25 s are the price of being sure
+    assert [b - a for a, b in itertools.pairwise(told)] == [5] * (len(told) - 1)
+    assert len(told) == 100 - 51
+    assert (intake.restarts, intake.stretches) == (1, 2)
+
+
+def test_late_and_doubled_samples_are_no_new_clock() -> None:
+    intake = Intake(RATES, 10.0)
+    fed(intake, "cam0", 10_000, 100, 0)
+    for again in range(20):  # the same 40 ms twenty times: doubled, not a clock
+        assert fed(intake, "cam0", 10_200, 8, 500 + 40 * again) == []
+    assert fed(intake, "cam0", 9_000, 40, 1500) == []  # 0.2 s late
+    assert fed(intake, "cam0", 10_500, 2, 2000) == [10_500, 10_505]
+    assert (intake.restarts, intake.stretches) == (0, 1)

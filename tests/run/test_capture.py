@@ -2,104 +2,22 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from software_camera import SoftwareCamera
+from capture_bench import PICTURE, WANTED, WRAP_US, Bench, Fake, quick
 
-from share.config import SequencerConfig
-from share.core.intake import Sample
-from share.core.watchdog import Watchdog
 from share.errors import ShareError, UsageError
+from share.io.feed import Feed
+from share.io.handover import Handover
 from share.io.mcap.recorder import Recorder
-from share.io.profile import profile
-from share.io.realsense.camera import RealSense
-from share.io.realsense.streams import Wanted
 from share.io.source import open_source
 from share.run.capture import Capture
-from share.run.handover import Handover
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
-
-WANTED = Wanted(profile("d435i"))
-PICTURE = np.tile(np.arange(640, dtype=np.uint16) % 251, (480, 1)).astype(np.uint8)
-WRAP_US = 2**32
-
-
-class Fake:
-    """RealSense on a camera of software, whose hardware reset is counted instead of done."""
-
-    resets = 0
-
-    def __init__(self, camera: SoftwareCamera, epoch: int) -> None:
-        self.device = RealSense(WANTED, context=camera.context, epoch=epoch)
-        self.rig, self.serial = self.device.rig, self.device.serial
-        self.start, self.stop = self.device.start, self.device.stop
-
-    def reset(self) -> None:
-        Fake.resets += 1
-        self.stop()
-
-
-class Bench:
-    """A capture in a thread of its own, and the camera that feeds it."""
-
-    def __init__(self, out: Path, watchdog: Callable[[int, bool, bool], Watchdog] = Watchdog) -> None:
-        self.camera, self.said, self.there = SoftwareCamera(rs), list[str](), True
-        self.connected = 0
-        max_jump_s = SequencerConfig().max_jump_s
-        self.run = Capture(
-            self.connect, None, WANTED.rates_hz(), out, max_jump_s, 0.0, self.said.append, watchdog=watchdog
-        )
-        self.report: dict[str, Any] = {}
-        self.thread = threading.Thread(target=self._go, daemon=True)
-
-    def connect(self, serial: str | None, epoch: int) -> Fake:
-        if not self.there:
-            raise UsageError("no camera")
-        fake = Fake(self.camera, epoch)
-        self.connected += 1
-        return fake
-
-    def __enter__(self) -> Bench:
-        Fake.resets = 0
-        self.thread.start()
-        self.wait(lambda: self.connected > 0)
-        time.sleep(0.3)  # until the sensors deliver
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        time.sleep(0.3)  # until all has been read
-        self.run.stop()
-        self.thread.join(timeout=10)
-        assert not self.thread.is_alive()
-
-    def wait(self, until: Callable[[], bool], limit_s: float = 8.0) -> None:
-        end = time.monotonic() + limit_s
-        while not until():
-            assert time.monotonic() < end, f"waited in vain; said: {self.said}"
-            time.sleep(0.02)
-
-    def feed(self, begin_us: int, frames: int, imu: bool = True, wrap: bool = False) -> int:
-        """Frames at 30 Hz with IMU at 400 and 250 Hz; gives the stamp after them."""
-        for k in range(frames):
-            now = begin_us + k * 33_333
-            at = [(now + i * 2500, True) for i in range(13)] + [(now + i * 4000, False) for i in range(8)]
-            for stamp, turns in sorted(at) if imu else []:
-                device_us = stamp % WRAP_US if wrap else stamp
-                (self.camera.turn if turns else self.camera.force)(device_us, 0.1, 0.2, 9.8)
-            for eye in (0, 1):
-                self.camera.image(eye, now % WRAP_US if wrap else now, PICTURE)
-            time.sleep(0.01)
-        return begin_us + frames * 33_333
-
-    def _go(self) -> None:
-        self.report = self.run.go()
 
 
 def test_what_the_camera_sees_is_in_the_recording(tmp_path: Path) -> None:
@@ -137,16 +55,13 @@ def test_backward_and_missing_frames_are_counted_and_left_out(tmp_path: Path) ->
     assert len(open_source(str(tmp_path / "a.mcap")).stamps()["cam0"]) == 5
 
 
-def quick(now_ns: int, has_images: bool, has_imu: bool) -> Watchdog:
-    return Watchdog(now_ns, has_images, has_imu, silent_ms=300, warm_up_ms=500, retry_ms=100)
-
-
 def test_a_silent_imu_is_reset_once_then_images_go_on_alone(tmp_path: Path) -> None:
     with Bench(tmp_path / "a.mcap", quick) as bench:
         now, until = bench.feed(1_000_000, 10), time.monotonic() + 20
         while not any("VISION_ONLY" in text for text in bench.said) and time.monotonic() < until:
             now = bench.feed(now, 5, imu=False)
         bench.feed(now, 10, imu=False)
+        bench.run.stop()  # at once: images that stop coming are another story
     assert Fake.resets == 1
     assert bench.report["health"] == "VISION_ONLY"
     assert bench.report["stretches"] == 2
@@ -179,8 +94,7 @@ def test_a_slow_disk_costs_images_that_are_counted_and_never_the_imu(
         write(self, measurement, log_ns)
 
     monkeypatch.setattr(Recorder, "write", slow)
-    with Bench(tmp_path / "a.mcap") as bench:
-        bench.run._handover = Handover(most_images=8)
+    with Bench(tmp_path / "a.mcap", most_images=8) as bench:
         bench.feed(1_000_000, 30)
     told = bench.report["streams"]
     assert told["cam0"]["dropped"] > 5
@@ -193,7 +107,7 @@ def test_a_recording_is_not_overwritten_and_not_begun_on_a_full_disk(tmp_path: P
     there = tmp_path / "a.mcap"
     there.write_bytes(b"dear")
     for out, least, says in ((there, 0.0, "never overwritten"), (tmp_path / "b.mcap", 1e9, "must stay free")):
-        run = Capture(_never, None, WANTED.rates_hz(), out, 10.0, least, print)
+        run = Capture(Feed(_never, None, WANTED.rates_hz(), 10.0, print, Handover()), out, least, print)
         with pytest.raises(UsageError, match=says):
             run.go()
     assert there.read_bytes() == b"dear"
@@ -202,17 +116,3 @@ def test_a_recording_is_not_overwritten_and_not_begun_on_a_full_disk(tmp_path: P
 
 def _never(serial: str | None, epoch: int) -> Any:
     raise ShareError("the camera was opened")
-
-
-def test_both_images_of_a_pair_go_or_stay() -> None:
-    queue = Handover(most_images=3)
-    for stamp in range(5):
-        for stream in ("cam0", "cam1"):
-            queue.put(Sample(stream, stamp, None, 0))
-    queue.put(Sample("gyro", 9, (0, 0, 0), 0))
-    queue.close()
-    taken = []
-    while (sample := queue.get(0)) is not None:
-        taken.append((sample.stream, sample.stamp_ns))
-    assert taken == [("cam0", 0), ("cam1", 0), ("cam0", 1), ("cam1", 1), ("gyro", 9)]
-    assert queue.dropped == {"cam0": 3, "cam1": 3}

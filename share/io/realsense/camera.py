@@ -6,11 +6,12 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from types import TracebackType
 from typing import Any
 
 from share.core.intake import ACCEL, GYRO, Sample
-from share.core.measurement import CAM0, DEPTH
+from share.core.measurement import CAM0, CAM1, DEPTH
 from share.errors import ShareError
 from share.geometry.camera import Rig
 from share.io.realsense.devices import attached, choose
@@ -120,15 +121,12 @@ class RealSense:
             if not there:
                 continue
             sample = to_sample(self._rs, frame, depth_unit_m, time.monotonic_ns(), self._epoch)
-            if self._spoiled(sample.stream, frame):
-                self.lit += 1
-            else:
+            if not (self._wanted.interleaved and sample.stream in (CAM0, CAM1)):
                 sink(sample)
-
-    def _spoiled(self, stream: str, frame: Any) -> bool:
-        """An infrared image with dots in it, where every other one has none."""
-        infrared = stream not in (ACCEL, GYRO, DEPTH)
-        return infrared and self._wanted.interleaved and has_dots(self._rs, frame)
+            elif has_dots(self._rs, frame):
+                self.lit += 1
+            else:  # numbers count the images with dots too, which are not missing
+                sink(replace(sample, number=None))
 
 
 def _depth_unit(one: Opened) -> float:

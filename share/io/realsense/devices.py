@@ -9,6 +9,20 @@ from share.core.checkup.camera import version
 from share.errors import UsageError
 from share.io.profile_types import DeviceFacts
 
+KIND = "realsense"
+
+
+def is_camera(spec: str) -> bool:
+    """Whether a SOURCE is a live camera."""
+    return spec == KIND or spec.startswith(f"{KIND}:")
+
+
+def serial_of(spec: str) -> str | None:
+    """The serial number in realsense[:SERIAL], None if there is none. Raises UsageError."""
+    if not is_camera(spec):
+        raise UsageError(f"{spec}: is not a camera; give {KIND} or {KIND}:SERIAL")
+    return spec.partition(":")[2] or None
+
 
 @dataclass(frozen=True, eq=False)
 class Attached:

@@ -13,20 +13,25 @@ from share.io.profile_types import Profile
 
 @dataclass(frozen=True)
 class Wanted:
-    """What to record: stereo images, depth, IMU, as the firmware profile says."""
+    """What to read: images, depth, IMU, as the firmware profile says. right: the other eye's images too."""
 
     profile: Profile
     images: bool = True
     depth: bool = False
+    right: bool = True
 
     def rates_hz(self) -> dict[str, float]:
         """Expected rate of every stream. Of images with an interleaved emitter, every other one is used."""
         imu = self.profile.device.imu
         rates = {ACCEL: imu.accel.rate_hz, GYRO: imu.gyro.rate_hz}
-        if self.images:
-            image = self.profile.rate_hz / (2 if self.interleaved else 1)
-            rates |= {CAM0: image, CAM1: image}
-        return rates | {DEPTH: self.profile.rate_hz} if self.depth else rates
+        image_hz = self.profile.rate_hz / (2 if self.interleaved else 1)
+        return rates | {name: self.profile.rate_hz if name == DEPTH else image_hz for name in self.cameras}
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The streams of images."""
+        have = ((CAM0, self.images), (CAM1, self.images and self.right), (DEPTH, self.depth))
+        return tuple(name for name, wanted in have if wanted)
 
     @property
     def interleaved(self) -> bool:

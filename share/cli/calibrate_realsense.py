@@ -1,0 +1,45 @@
+"""`share calibrate realsense`: the calibration that the factory measured, as a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from share.cli import live, options
+from share.errors import UsageError
+
+
+@click.command(short_help="The factory calibration of an attached RealSense, as files.")
+@click.argument("serial", required=False)
+@live.profile
+@live.mode
+@click.option("--depth", is_flag=True, help="Also of the depth stream.")
+@options.out_folder
+def realsense(serial: str | None, profile_name: str | None, mode: str | None, depth: bool, out: Path) -> None:
+    """Write the calibration that the factory stored in the camera, for --calib. SERIAL: which camera, where
+    several are attached. The factory measures no IMU noise: the profile's is written. Files that are there
+    are not overwritten.
+
+    \b
+    Example:  share calibrate realsense --out calib/mine
+    """
+    from share.io.calibration import CAMCHAIN, IMU_CHAIN
+    from share.io.files import atomic_write, writable_dir
+    from share.io.kalibr import kalibr_texts
+    from share.io.profile import profile
+    from share.io.realsense.camera import RealSense
+    from share.io.realsense.streams import Wanted
+
+    for path in (out / CAMCHAIN, out / IMU_CHAIN):
+        if path.exists():
+            raise UsageError(f"{path}: exists and is not overwritten; give another --out")
+    wanted = Wanted(profile(profile_name or live.PROFILE, mode), depth=depth)
+    with RealSense(wanted, serial) as camera:
+        rig, who = camera.rig, f"factory calibration of {camera.serial}"
+    writable_dir(out)
+    for name, text in kalibr_texts(rig, f"{who}; IMU noise of profile {wanted.profile.name}").items():
+        atomic_write(out / name, text)
+    size = f"{rig.cam0.width}x{rig.cam0.height}, f {rig.cam0.fx:.1f} {rig.cam0.fy:.1f} px"
+    click.echo(f"{out}: {who}: {size}, baseline {100 * rig.baseline:.2f} cm")
+    click.echo("the IMU's noise is the profile's: the factory measures none, `share calibrate imu` does")

@@ -1,0 +1,143 @@
+"""A live camera in place of a recording: its options, and how it is opened."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from share.cli.progress import LiveLine
+from share.core.rate import Every
+from share.errors import UsageError
+
+if TYPE_CHECKING:
+    from share.config import Config
+    from share.estimator.result import TrackResult
+    from share.io.feed import Feed
+    from share.io.realsense.streams import Wanted
+    from share.io.source import Source
+
+PROFILE = "d435i"
+
+profile = click.option(
+    "--profile",
+    "profile_name",
+    metavar="P",
+    help=f"Kind of camera: a profile's name or file.  [default: {PROFILE}]",
+)
+mode = click.option("--mode", metavar="WxH[@HZ]", help="Image size and rate; default: the profile's.")
+sensors = click.option(
+    "--sensors",
+    type=click.Choice(["stereo", "rgbd"]),
+    help="Of a camera: infrared pair, or left image and depth.  [default: stereo]",
+)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What was asked of a live camera; None: nothing."""
+
+    profile_name: str | None
+    mode: str | None
+    sensors: str | None
+
+    def wanted(self) -> Wanted:
+        """Raises ConfigError for an unknown profile or mode."""
+        from share.io.profile import profile
+        from share.io.realsense.streams import Wanted
+
+        rgbd = self.sensors == "rgbd"
+        return Wanted(profile(self.profile_name or PROFILE, self.mode), depth=rgbd, right=not rgbd)
+
+    def check_recording(self, source: str) -> None:
+        """Raises UsageError where a recording was asked for what only a camera has."""
+        named = {"--profile": self.profile_name, "--mode": self.mode, "--sensors": self.sensors}
+        given = ", ".join(option for option, value in named.items() if value is not None)
+        if given:
+            raise UsageError(f"{source}: {given} goes with a live camera (realsense) only; leave it out")
+
+
+def camera(command: Callable[..., None]) -> Callable[..., None]:
+    """Gives a command the options of a live camera, as `camera: Asked`."""
+
+    @functools.wraps(command)
+    def with_camera(*args: Any, profile_name: str, mode: str, sensors: str, **options: Any) -> None:
+        command(*args, camera=Asked(profile_name, mode, sensors), **options)
+
+    return profile(mode(sensors(with_camera)))
+
+
+def open_source(
+    source: str,
+    calib: str | None,
+    frames: slice | None,
+    camera: Asked,
+    settings: Config,
+    say: Callable[[str], None],
+) -> Source:
+    """A recording or a live camera, which is let go when the command ends. `say` is told what happens to it.
+
+    Raises UsageError, ConfigError, DataError, ShareError.
+    """
+    from share.io.realsense.devices import is_camera
+    from share.io.source import open_source
+
+    if not is_camera(source):
+        camera.check_recording(source)
+        return open_source(source, calib, frames)
+    if frames is not None:
+        raise UsageError("--frames: goes with a recording, not with a live camera")
+    from share.io.realsense.live import open_live
+    from share.io.source import calibration_of
+
+    given = calibration_of(calib)
+    rig = None if given is None else given.rig
+    live = open_live(source, camera.wanted(), settings.sequencer, say, rig)
+    click.get_current_context().with_resource(closing(live))
+    return live
+
+
+class Shown:
+    """The live line of `share track`, once a second."""
+
+    def __init__(self, feed: Feed, line: LiveLine) -> None:
+        self._feed, self._line, self._frames = feed, line, 0
+        self._every = Every(1.0)
+
+    def __call__(self, result: TrackResult) -> None:
+        self._frames += 1
+        if self._every.due(time.monotonic_ns()):
+            waits = "" if result.waits is None else f", waits for {result.waits.words}"
+            camera = f"camera {self._feed.status()}"
+            self._line.write(f"{self._frames} frames  tracking {result.state}{waits}  {camera}")
+
+
+def brief(feed: Feed | None) -> str:
+    """A live camera's part of the agent's line; nothing without one."""
+    if feed is None:
+        return ""
+    told = feed.status()
+    return f"camera {told.health.value} cam0 {told.rates_hz['cam0']:.0f} Hz dropped {told.dropped}  "
+
+
+_MET = ("imu_alone", "foreign", "wraps", "jumps", "strays", "past", "restarts", "reconnections", "resets")
+
+
+def met(report: dict[str, Any]) -> str:
+    """What happened to the camera, without what never did; of its report."""
+    return ", ".join(f"{name.replace('_', ' ')} {report[name]}" for name in _MET if report[name])
+
+
+def summary(report: dict[str, Any]) -> list[str]:
+    """Of a run's report: lines on its camera, none if it had none."""
+    if "camera" not in report:
+        return []
+    told = report["camera"]
+    streams = told["streams"].values()
+    counts = [f"{name} {sum(one[name] for one in streams)}" for name in ("missing", "dropped", "backward")]
+    return [f"camera: {', '.join([*counts, *filter(None, [met(told)])])} (docs/capture.md)"]

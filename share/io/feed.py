@@ -1,0 +1,183 @@
+"""A live camera's measurements for as long as they are wanted, whatever happens to the camera.
+
+the device's threads -> bounded queue -> who reads: repair, join; watchdog, reconnection
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Protocol
+
+from share.core.intake import GYRO, Intake, Sample
+from share.core.measurement import CAM0, Measurement
+from share.core.rate import Every
+from share.core.watchdog import Action, Health, Watchdog
+from share.errors import ShareError
+from share.geometry.camera import Rig
+from share.io.feed_status import FeedStatus, Rates, feed_report
+from share.io.handover import Handover
+
+_TICK_S = 0.1
+_REMEMBERED = 1000  # images whose arrival can be asked for
+_SAID = {
+    Action.RESET: "the IMU is silent; the camera is reset once",
+    Action.VISION_ONLY: "the IMU stays silent; VISION_ONLY: goes on with images alone",
+    Action.HEARD_AGAIN: "the IMU is heard again",
+}
+
+
+class Device(Protocol):
+    """A camera that is connected, such as `share.io.realsense.camera.RealSense`."""
+
+    @property
+    def rig(self) -> Rig: ...
+
+    @property
+    def serial(self) -> str: ...
+
+    def start(self, sink: Callable[[Sample], None]) -> None: ...
+
+    def stop(self) -> None: ...
+
+    def reset(self) -> None: ...
+
+
+Connect = Callable[[str | None, int], Device]  # serial number (None: any), how often it was tried before
+MakeWatchdog = Callable[[int, bool, bool], Watchdog]
+
+
+class Feed:
+    """`open` it, read `measurements` in one thread, `stop` it from any; the reader lets the camera go.
+
+    `say` is told what happens to the camera, a line each.
+    """
+
+    def __init__(
+        self,
+        connect: Connect,
+        serial: str | None,
+        rates_hz: Mapping[str, float],
+        max_jump_s: float,
+        say: Callable[[str], None],
+        queue: Handover,
+        watchdog: MakeWatchdog = Watchdog,
+    ) -> None:
+        """rates_hz: of every stream that is expected."""
+        self._connect, self._say, self.queue = connect, say, queue
+        self.serial, self.intake = serial, Intake(rates_hz, max_jump_s)
+        self._watchdog = watchdog(time.monotonic_ns(), CAM0 in rates_hz, GYRO in rates_hz)
+        self._tick = Every(_TICK_S)
+        self._stop = threading.Event()
+        self._device: Device | None = None
+        self._heard: dict[str, int] = {}
+        self._attempts = self._restarts = 0
+        self._arrivals: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
+        self._rates = Rates()
+
+    def open(self) -> Rig:
+        """Connect; samples come from now on, and wait. Raises UsageError, ShareError, DataError."""
+        device = self._connect(self.serial, 0)
+        rig, self.serial = device.rig, device.serial
+        device.start(self._take)
+        self._device = device
+        self._watchdog.connected(time.monotonic_ns())
+        return rig
+
+    def measurements(self) -> Iterator[Measurement]:
+        """Until it is stopped; what has come by then is still given."""
+        try:
+            while not self.queue.done:
+                self._guard()
+                sample = self.queue.get(_TICK_S)
+                if sample is not None:
+                    yield from self._used(sample)
+        finally:
+            self.close()
+
+    def stop(self) -> None:
+        """Ask for the end, from any thread or signal handler."""
+        self._stop.set()
+
+    def close(self) -> None:
+        """Let the camera go; what it sent can still be read. Only for who reads, or before anyone does."""
+        if self._device is not None:
+            self._device.stop()
+        self._device = None
+        self.queue.close()
+
+    def arrived_ns(self, stamp_ns: int) -> int:
+        """When cam0's image of that stamp came, on the host's monotonic clock; now, if that is not known."""
+        known = (arrived for stamp, arrived in reversed(self._arrivals) if stamp == stamp_ns)
+        return next(known, time.monotonic_ns())
+
+    @property
+    def health(self) -> Health:
+        return self._watchdog.health
+
+    def status(self) -> FeedStatus:
+        """For a live line."""
+        streams = self.intake.streams
+        return FeedStatus(
+            health=self.health,
+            rates_hz=self._rates.of({name: gaps.samples for name, gaps in streams.items()}, time.monotonic()),
+            missing=sum(gaps.missing for gaps in streams.values()),
+            dropped=sum(self.queue.dropped.values()),
+            queue=len(self.queue),
+        )
+
+    def report(self) -> dict[str, Any]:
+        """What came, was repaired and lost."""
+        return feed_report(self.intake, self.queue.dropped, self._watchdog)
+
+    def _take(self, sample: Sample) -> None:
+        """In the device's threads."""
+        self._heard[sample.stream] = time.monotonic_ns()
+        self.queue.put(sample)
+
+    def _used(self, sample: Sample) -> Iterator[Measurement]:
+        for measurement in self.intake.feed(sample):
+            if measurement.stream == CAM0:
+                self._arrivals.append((measurement.stamp_ns, sample.arrived_ns))
+            yield measurement
+        if self.intake.restarts > self._restarts:
+            self._restarts = self.intake.restarts
+            self._say("the camera's clock began anew; so does a new stretch")
+
+    def _guard(self) -> None:
+        """Feed the watchdog, and do what it asks for."""
+        if self._stop.is_set():
+            self.close()
+        if self.queue.closed or not self._tick.due(time.monotonic_ns()):
+            return
+        if self._device is not None:
+            for stream, now_ns in list(self._heard.items()):
+                self._watchdog.heard(stream, now_ns)
+        self._do(self._watchdog.tick(time.monotonic_ns()))
+
+    def _do(self, action: Action) -> None:
+        if action in _SAID:
+            self._say(_SAID[action])
+        if action is Action.RESET and self._device is not None:
+            self._device.reset()
+            self._device = None
+        if action is Action.RECONNECT:
+            self._reconnect()
+
+    def _reconnect(self) -> None:
+        if self._device is not None:
+            self._say(f"no more samples come; looks for camera {self.serial} until it is back")
+            self._device.stop()
+            self._device = None
+        self._attempts += 1
+        try:
+            device = self._connect(self.serial, self._attempts)
+            device.start(self._take)
+        except ShareError:
+            self._watchdog.lost(time.monotonic_ns())
+            return
+        self._device = device
+        self._watchdog.connected(time.monotonic_ns())
+        self._say(f"camera {self.serial} is connected again; a new stretch begins")

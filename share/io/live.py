@@ -1,0 +1,62 @@
+"""A live camera as a SOURCE: frames as they come, until somebody stops it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Any
+
+from share.core.measurement import CAM0, Measurement
+from share.errors import UsageError
+from share.geometry.camera import Rig
+from share.io.feed import Feed
+from share.io.recording import Source
+from share.io.trajectory import Trajectory
+from share.types import I64
+
+WAITING = 2  # frames that may wait for the tracker
+
+
+class LiveSource(Source):
+    """The camera is opened here, and let go at the end of `measurements`.
+
+    Raises UsageError, ShareError or DataError where it cannot be opened.
+    """
+
+    def __init__(self, feed: Feed, rate_hz: float, rig: Rig | None = None) -> None:
+        """rate_hz: of cam0; rig: in place of the factory's."""
+        factory = feed.open()
+        self.feed, self._rate_hz = feed, rate_hz
+        self.name, self.rig, self.notes = f"realsense:{feed.serial}", rig or factory, ()
+
+    def stamps(self) -> dict[str, I64]:
+        raise UsageError(f"{self.name}: nobody knows yet what a live camera will see; record it first")
+
+    def measurements(self) -> Iterator[Measurement]:
+        """Once only."""
+        return self.feed.measurements()
+
+    def truth(self) -> Trajectory | None:
+        return None
+
+    def stop(self) -> None:
+        self.feed.stop()
+
+    def close(self) -> None:
+        """Let the camera go, whether it was read or not."""
+        self.feed.close()
+
+    def arrived_ns(self, stamp_ns: int) -> int:
+        """When cam0's image of that stamp came, on the host's monotonic clock."""
+        return self.feed.arrived_ns(stamp_ns)
+
+    def report(self) -> dict[str, Any]:
+        return {"camera": self.feed.report()}
+
+    @property
+    def images_count(self) -> int:
+        return self.feed.intake.streams[CAM0].samples
+
+    @cached_property
+    def rate_hz(self) -> float:
+        return self._rate_hz

@@ -1,0 +1,45 @@
+"""realsense[:SERIAL] to a feed of its samples, and to a SOURCE."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from share.config import SequencerConfig
+from share.core.measurement import CAM0
+from share.geometry.camera import Rig
+from share.io.feed import Feed
+from share.io.handover import Handover, KeepNewest
+from share.io.live import WAITING, LiveSource
+from share.io.realsense.camera import RealSense
+from share.io.realsense.devices import serial_of
+from share.io.realsense.streams import Wanted
+
+
+def feed_of(
+    spec: str, wanted: Wanted, config: SequencerConfig, say: Callable[[str], None], queue: Handover
+) -> Feed:
+    """What the camera delivers. It is not opened yet."""
+    return Feed(
+        lambda serial, epoch: RealSense(wanted, serial, epoch=epoch),
+        serial_of(spec),
+        wanted.rates_hz(),
+        config.max_jump_s,
+        say,
+        queue,
+    )
+
+
+def open_live(
+    spec: str,
+    wanted: Wanted,
+    config: SequencerConfig,
+    say: Callable[[str], None],
+    rig: Rig | None = None,
+) -> LiveSource:
+    """The camera as a source, with the factory's calibration or `rig`.
+
+    Raises UsageError, ShareError, DataError.
+    """
+    rates = wanted.rates_hz()
+    queue = KeepNewest(WAITING * len(wanted.cameras))
+    return LiveSource(feed_of(spec, wanted, config, say, queue), rates[CAM0], rig)

@@ -1,0 +1,108 @@
+"""A capture from a camera of software in a thread of its own, and the camera that feeds it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from software_camera import SoftwareCamera
+
+from share.config import SequencerConfig
+from share.core.watchdog import Watchdog
+from share.errors import UsageError
+from share.io.feed import Feed
+from share.io.handover import Handover
+from share.io.profile import profile
+from share.io.realsense.camera import RealSense
+from share.io.realsense.sdk import load_sdk
+from share.io.realsense.streams import Wanted
+from share.run.capture import Capture
+
+WANTED = Wanted(profile("d435i"))
+PICTURE = np.tile(np.arange(640, dtype=np.uint16) % 251, (480, 1)).astype(np.uint8)
+WRAP_US = 2**32
+
+
+class Fake:
+    """RealSense on a camera of software, whose hardware reset is counted instead of done."""
+
+    resets = 0
+
+    def __init__(self, camera: SoftwareCamera, wanted: Wanted, epoch: int) -> None:
+        self.device = RealSense(wanted, context=camera.context, epoch=epoch)
+        self.rig, self.serial = self.device.rig, self.device.serial
+        self.start, self.stop = self.device.start, self.device.stop
+
+    def reset(self) -> None:
+        Fake.resets += 1
+        self.stop()
+
+
+class Bench:
+    """A capture in a thread of its own, and the camera that feeds it."""
+
+    def __init__(
+        self,
+        out: Path,
+        watchdog: Callable[[int, bool, bool], Watchdog] = Watchdog,
+        wanted: Wanted = WANTED,
+        most_images: int = 60,
+    ) -> None:
+        self.camera, self.said, self.there = SoftwareCamera(load_sdk()), list[str](), True
+        self.wanted, self.connected = wanted, 0
+        rates_hz, max_jump_s = wanted.rates_hz(), SequencerConfig().max_jump_s
+        queue = Handover(most_images)
+        feed = Feed(self.connect, None, rates_hz, max_jump_s, self.said.append, queue, watchdog)
+        self.run = Capture(feed, out, 0.0, self.said.append)
+        self.report: dict[str, Any] = {}
+        self.thread = threading.Thread(target=self._go, daemon=True)
+
+    def connect(self, serial: str | None, epoch: int) -> Fake:
+        if not self.there:
+            raise UsageError("no camera")
+        fake = Fake(self.camera, self.wanted, epoch)
+        self.connected += 1
+        return fake
+
+    def __enter__(self) -> Bench:
+        Fake.resets = 0
+        self.thread.start()
+        self.wait(lambda: self.connected > 0)
+        time.sleep(0.3)  # until the sensors deliver
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        time.sleep(0.3)  # until all has been read
+        self.run.stop()
+        self.thread.join(timeout=10)
+        assert not self.thread.is_alive()
+
+    def wait(self, until: Callable[[], bool], limit_s: float = 8.0) -> None:
+        end = time.monotonic() + limit_s
+        while not until():
+            assert time.monotonic() < end, f"waited in vain; said: {self.said}"
+            time.sleep(0.02)
+
+    def feed(self, begin_us: int, frames: int, imu: bool = True, wrap: bool = False) -> int:
+        """Frames at 30 Hz with IMU at 400 and 250 Hz; gives the stamp after them."""
+        for k in range(frames):
+            now = begin_us + k * 33_333
+            at = [(now + i * 2500, True) for i in range(13)] + [(now + i * 4000, False) for i in range(8)]
+            for stamp, turns in sorted(at) if imu else []:
+                device_us = stamp % WRAP_US if wrap else stamp
+                (self.camera.turn if turns else self.camera.force)(device_us, 0.1, 0.2, 9.8)
+            for eye in (0, 1):
+                self.camera.image(eye, now % WRAP_US if wrap else now, PICTURE)
+            time.sleep(0.01)
+        return begin_us + frames * 33_333
+
+    def _go(self) -> None:
+        self.report = self.run.go()
+
+
+def quick(now_ns: int, has_images: bool, has_imu: bool) -> Watchdog:
+    return Watchdog(now_ns, has_images, has_imu, silent_ms=600, warm_up_ms=800, retry_ms=100)

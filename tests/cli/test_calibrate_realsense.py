@@ -1,0 +1,68 @@
+"""`share calibrate realsense` on the maker's SDK, with a camera of software."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from shell import Done
+from software_camera import BASELINE, T_GYRO_IR, SoftwareCamera
+
+from share.io.calibration import read_calibration
+
+rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
+
+
+@pytest.fixture(autouse=True)
+def attached(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = SoftwareCamera(rs, depth=True)
+    monkeypatch.setattr(rs, "context", lambda: camera.context)
+
+
+def test_the_file_has_what_the_factory_measured(share: Callable[..., Done], tmp_path: Path) -> None:
+    done = share("calibrate", "realsense", "0123", "--depth", "--out", tmp_path / "mine")
+    assert done.code == 0, done.err
+    assert "0123" in done.out
+    rig = read_calibration(tmp_path / "mine").rig
+    assert rig.kind == "stereo+imu"
+    assert rig.depth == rig.cam0
+    assert (rig.cam0.fx, rig.cam0.fy, rig.cam0.cx, rig.cam0.cy) == (385.0, 386.0, 320.5, 239.5)
+    assert rig.baseline == pytest.approx(BASELINE)
+    np.testing.assert_allclose(rig.T_body_cam0[:3, 3], T_GYRO_IR, atol=1e-8)
+
+
+def test_a_calibration_that_is_there_is_not_overwritten(share: Callable[..., Done], tmp_path: Path) -> None:
+    dear = tmp_path / "kalibr_imu_chain.yaml"
+    dear.write_text("dear")
+    done = share("calibrate", "realsense", "--out", tmp_path)
+    assert (done.code, done.out) == (2, "")
+    assert "is not overwritten" in done.err
+    assert [path.name for path in tmp_path.iterdir()] == [dear.name]
+    assert dear.read_text() == "dear"
+
+
+def test_a_camera_that_is_not_there_is_said_and_nothing_is_written(
+    share: Callable[..., Done], tmp_path: Path
+) -> None:
+    done = share("calibrate", "realsense", "999", "--out", tmp_path / "mine")
+    assert done.code == 2
+    assert "0123 (Intel RealSense D435I)" in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_only_a_camera_has_is_not_for_a_recording(share: Callable[..., Done], tmp_path: Path) -> None:
+    done = share("track", tmp_path, "--sensors", "rgbd")
+    assert done.code == 2
+    assert "--sensors goes with a live camera" in done.err
+    done = share("track", "realsense", "--frames", "0:10")
+    assert done.code == 2
+    assert "--frames" in done.err
+
+
+def test_a_camera_is_no_recording_to_look_into(share: Callable[..., Done]) -> None:
+    done = share("dataset", "info", "realsense")
+    assert done.code == 2
+    assert "recorded with `share capture`" in done.err

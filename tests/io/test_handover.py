@@ -1,0 +1,49 @@
+"""Queues that are full: what they keep, and what they count."""
+
+from __future__ import annotations
+
+from share.core.intake import Sample
+from share.io.handover import Handover, KeepNewest
+
+
+def filled(queue: Handover, pairs: int) -> list[tuple[str, int]]:
+    """What can be taken after so many pairs of images, each with a sample of the gyroscope before it."""
+    for stamp in range(pairs):
+        for stream in ("gyro", "cam0", "cam1"):
+            queue.put(Sample(stream, stamp, None, 0))
+    queue.close()
+    taken = []
+    while (sample := queue.get(0)) is not None:
+        taken.append((sample.stream, sample.stamp_ns))
+    return taken
+
+
+def images(taken: list[tuple[str, int]]) -> list[tuple[str, int]]:
+    return [one for one in taken if one[0] != "gyro"]
+
+
+def test_the_oldest_pairs_stay_and_a_pair_is_never_parted() -> None:
+    queue = Handover(most_images=3)
+    assert images(filled(queue, 5)) == [("cam0", 0), ("cam1", 0), ("cam0", 1), ("cam1", 1)]
+    assert queue.dropped == {"cam0": 3, "cam1": 3}
+
+
+def test_the_newest_pairs_stay_and_a_pair_is_never_parted() -> None:
+    queue = KeepNewest(most_images=4)
+    assert images(filled(queue, 5)) == [("cam0", 3), ("cam1", 3), ("cam0", 4), ("cam1", 4)]
+    assert queue.dropped == {"cam0": 3, "cam1": 3}
+
+
+def test_the_imu_stays_in_order_whatever_is_dropped() -> None:
+    for queue in (Handover(most_images=2), KeepNewest(most_images=2)):
+        taken = filled(queue, 50)
+        assert [stamp for stream, stamp in taken if stream == "gyro"] == list(range(50))
+        assert "gyro" not in queue.dropped
+        assert (queue.images, len(queue)) == (0, 0)
+
+
+def test_a_bound_holds_for_the_imu_too() -> None:
+    queue = Handover(most_motion=3)
+    for stamp in range(5):
+        queue.put(Sample("accel", stamp, None, 0))
+    assert (len(queue), queue.dropped) == (3, {"accel": 2})

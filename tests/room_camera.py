@@ -1,0 +1,93 @@
+"""A recording of a room, played through the SDK's camera of software."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from software_camera import DEPTH_UNIT_M, SoftwareCamera
+
+from share.config import SequencerConfig
+from share.core.watchdog import Watchdog
+from share.errors import UsageError
+from share.io.feed import Feed, MakeWatchdog
+from share.io.handover import Handover
+from share.io.profile import profile
+from share.io.realsense.camera import RealSense
+from share.io.realsense.streams import Wanted
+from share.io.source import Source
+
+HZ, LENS = 15, (385.0, 385.0, 320.4, 239.6)  # of the demo's cameras
+STEREO = Wanted(profile("d435i", f"640x480@{HZ}"))
+RGBD = Wanted(STEREO.profile, depth=True, right=False)
+BEGIN_US = 5_000_000  # of the camera's clock
+
+
+class RoomCamera:
+    """The devices of `source`, with its lenses. It plays when somebody listens."""
+
+    def __init__(self, rs: Any, source: Source) -> None:
+        self.source, self.camera = source, SoftwareCamera(rs, rate_hz=HZ, lens=LENS, depth=True)
+        self.there = True  # it can be connected
+        self.first_ns = next(iter(source.measurements())).stamp_ns
+
+    def device(self, wanted: Wanted, epoch: int = 0) -> RealSense:
+        return RealSense(wanted, context=self.camera.context, epoch=epoch)
+
+    def feed(
+        self, wanted: Wanted, queue: Handover, said: list[str], watchdog: MakeWatchdog = Watchdog
+    ) -> Feed:
+        """What the camera delivers, not opened yet."""
+        rates, jump_s = wanted.rates_hz(), SequencerConfig().max_jump_s
+
+        def connect(serial: str | None, epoch: int) -> RealSense:
+            if not self.there:
+                raise UsageError("no camera")
+            return self.device(wanted, epoch)
+
+        return Feed(connect, None, rates, jump_s, said.append, queue, watchdog)
+
+    def play(self, before_image: Callable[[], None] = lambda: None, begin_us: int = BEGIN_US) -> int:
+        """All of it; the stamp of the camera's clock after it. before_image: called before each frame."""
+        now = begin_us
+        for m in self.source.measurements():
+            now = begin_us + (m.stamp_ns - self.first_ns) // 1000
+            if m.stream == "imu":
+                self.camera.force(now, *m.payload[3:])
+                self.camera.turn(now, *m.payload[:3])
+            elif m.stream == "depth":
+                steps = np.nan_to_num(m.payload.load()) / DEPTH_UNIT_M
+                self.camera.far(now, np.rint(steps).astype(np.uint16))
+            else:
+                if m.stream == "cam0":
+                    before_image()
+                self.camera.image(m.stream == "cam1", now, m.payload.load())
+        return now
+
+    def begin(self, feed: Feed, pause_s: float = 0.0) -> threading.Thread:
+        """Play to who reads `feed`, then stop it. A frame is shown when those before it are taken; where a
+        pause is given, after that."""
+        images = [name for name in feed.intake.streams if name not in ("accel", "gyro")]
+        shown = itertools.count()
+
+        def taken() -> None:
+            before, until = next(shown), time.monotonic() + 20
+            time.sleep(pause_s)
+            while not pause_s and time.monotonic() < until:
+                if all(feed.intake.streams[name].samples >= before for name in images):
+                    return
+                time.sleep(0.001)
+
+        def play() -> None:
+            time.sleep(0.2)  # until the sensors deliver
+            self.play(taken)
+            time.sleep(0.5)
+            feed.stop()
+
+        thread = threading.Thread(target=play, daemon=True)
+        thread.start()
+        return thread

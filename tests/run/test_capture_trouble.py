@@ -1,0 +1,87 @@
+"""What goes wrong in the field while a camera of software is recorded through the real SDK."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from capture_bench import PICTURE, WANTED, Bench
+
+from share.io.imu_table import read_imu
+from share.io.mcap.recover import recover
+from share.io.realsense.streams import Wanted
+from share.io.source import open_source
+
+rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
+
+CHILD = Path(__file__).with_name("capture_child.py")
+ENV = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, CHILD.parents[1:3]))}  # tests, and the checkout
+
+
+def test_a_clock_that_begins_anew_without_a_disconnection_begins_a_new_stretch(tmp_path: Path) -> None:
+    with Bench(tmp_path / "a.mcap") as bench:
+        bench.feed(500_000_000, 20)
+        bench.feed(0, 30)
+    stamps = open_source(str(tmp_path / "a.mcap")).stamps()["cam0"]
+    steps = np.diff(stamps) * 1e-9
+    assert (bench.report["restarts"], bench.report["stretches"], bench.report["reconnections"]) == (1, 2, 0)
+    assert 40 <= len(stamps) <= 43  # 0.25 s are the price of being sure
+    assert steps.min() > 0
+    assert steps.max() < 1.0  # as long as it was by the host's clock
+    assert bench.said == ["the camera's clock began anew; so does a new stretch"]
+
+
+def test_without_images_the_imu_alone_is_recorded(tmp_path: Path) -> None:
+    with Bench(tmp_path / "a.mcap", wanted=replace(WANTED, images=False)) as bench:
+        for k in range(400):
+            bench.camera.force(1_000_000 + 2500 * k, 0.1, 0.2, 9.8)
+            bench.camera.turn(1_000_000 + 2500 * k, k, 0.0, 0.0)
+    imu = read_imu(str(tmp_path / "a.mcap")).imu
+    assert bench.report["streams"].keys() == {"accel", "gyro"}
+    np.testing.assert_array_equal(imu.stamps_ns, 10**9 + 2_500_000 * np.arange(400))
+    np.testing.assert_array_equal(imu.gyro[:, 0], np.arange(400.0))
+
+
+def test_of_an_interleaved_emitter_the_images_without_dots_are_recorded(tmp_path: Path) -> None:
+    device = replace(WANTED.profile.device, emitter="interleaved")
+    wanted = Wanted(replace(WANTED.profile, device=device))
+    dots = np.full_like(PICTURE, 255)
+    with Bench(tmp_path / "a.mcap", wanted=wanted) as bench:
+        for k in range(20):
+            bench.camera.stereo.set_metadata(rs.frame_metadata_value.frame_laser_power_mode, k % 2)
+            for eye in (0, 1):
+                bench.camera.image(eye, 1_000_000 + 33_333 * k, dots if k % 2 else PICTURE)
+            time.sleep(0.01)
+    source = open_source(str(tmp_path / "a.mcap"))
+    images = [m.payload.load() for m in source.measurements() if m.stream != "imu"]
+    assert len(images) == 20
+    assert all(np.array_equal(image, PICTURE) for image in images)
+    told = bench.report["streams"]["cam0"]
+    assert (told["gaps"], told["missing"]) == (0, 0)
+
+
+def test_a_disk_that_fills_ends_the_recording_in_a_line_and_what_was_written_is_saved(tmp_path: Path) -> None:
+    most = 15_000_000  # bytes; the kernel refuses more, as a full disk does
+    child = subprocess.run(
+        [sys.executable, str(CHILD), str(tmp_path / "a.mcap")],
+        env=ENV,
+        text=True,
+        capture_output=True,
+        timeout=60,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (most, most)),
+    )
+    reason = os.strerror(errno.EFBIG)
+    assert child.returncode == 1
+    assert child.stderr == f"share: {tmp_path / 'a.mcap'}: cannot be written: {reason}\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap.part"]
+    recover(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
+    assert len(open_source(str(tmp_path / "b.mcap")).stamps()["cam0"]) > 15

@@ -1,0 +1,153 @@
+"""A room seen by a camera of software, through the real SDK: tracked live, and recorded and then tracked, it
+comes to what tracking the original recording comes to."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from capture_bench import quick
+from room_camera import BEGIN_US, HZ, RGBD, STEREO, RoomCamera
+
+from share.config import Config
+from share.estimator.result import TrackResult
+from share.io.handover import Handover, KeepNewest
+from share.io.live import WAITING, LiveSource
+from share.io.source import Source, open_source
+from share.run.capture import Capture
+from share.run.track import TrackRun, track
+
+rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
+
+SAME_M = 0.002  # calibration and IMU are of single precision there
+
+
+def tracked(source: Source) -> TrackRun:
+    return track(source, Config(), lambda result: None)
+
+
+def assert_same(room: RoomCamera, run: TrackRun, original: TrackRun) -> None:
+    """Poses at the same moments, and at the same places."""
+    theirs = original.trajectory
+    shift_ns = BEGIN_US * 1000 - room.first_ns
+    np.testing.assert_allclose(run.trajectory.stamps_ns, theirs.stamps_ns + shift_ns, rtol=0, atol=1000)
+    apart = np.linalg.norm(run.trajectory.T[:, :3, 3] - theirs.T[:, :3, 3], axis=1)
+    assert apart.max() < SAME_M
+    travelled = np.linalg.norm(np.diff(theirs.T[:, :3, 3], axis=0), axis=1).sum()
+    assert travelled > 20 * SAME_M
+
+
+@pytest.fixture(scope="module")
+def room(plain_session: Path) -> RoomCamera:
+    return RoomCamera(rs, open_source(str(plain_session / "ar1")))
+
+
+@pytest.fixture(scope="module")
+def original(room: RoomCamera) -> TrackRun:
+    return tracked(room.source)
+
+
+def test_a_recorded_camera_is_tracked_as_the_original(
+    room: RoomCamera, original: TrackRun, tmp_path: Path
+) -> None:
+    feed, said = room.feed(STEREO, Handover(), told := []), told
+    room.begin(feed)
+    run = Capture(feed, tmp_path / "a.mcap", 0.0, said.append)
+    feed_stopped = feed.stop
+    feed.stop = lambda: (feed_stopped(), run.stop())  # type: ignore[method-assign,assignment]
+    report = run.go(30)
+    assert (report["ended"], said) == ("stopped", [])
+    assert_same(room, tracked(open_source(str(tmp_path / "a.mcap"))), original)
+
+
+def test_a_live_camera_is_tracked_as_the_original(room: RoomCamera, original: TrackRun) -> None:
+    said: list[str] = []
+    source = LiveSource(room.feed(STEREO, KeepNewest(2 * WAITING), said), HZ)
+    assert source.name == "realsense:0123"
+    room.begin(source.feed)
+    run = tracked(source)
+    assert_same(room, run, original)
+    assert run.report["camera"]["streams"]["cam0"] | {"seconds": 0} == {
+        "samples": 45,
+        "seconds": 0,
+        "gaps": 0,
+        "missing": 0,
+        "backward": 0,
+        "dropped": 0,
+    }
+    assert said == []
+
+
+def test_a_tracker_slower_than_its_camera_takes_the_newest_and_all_of_the_imu(room: RoomCamera) -> None:
+    source = LiveSource(room.feed(STEREO, KeepNewest(2 * WAITING), []), HZ)
+    waited = []
+
+    def slowly(result: TrackResult) -> None:
+        stamp_ns = source.feed.intake.streams["cam0"].last_ns
+        waited.append(time.monotonic_ns() - source.arrived_ns(stamp_ns or 0))
+        time.sleep(0.15)
+
+    room.begin(source.feed, pause_s=0.03)
+    run = track(source, Config(), slowly)
+    streams = run.report["camera"]["streams"]
+    assert streams["cam0"]["dropped"] == streams["cam1"]["dropped"] > 10
+    assert run.report["frames"] + streams["cam0"]["dropped"] == 45
+    assert (streams["gyro"]["dropped"], streams["accel"]["dropped"]) == (0, 0)
+    assert run.report["sequencer"]["imu_samples"] > 1100
+    assert run.report["tracked"] > 0.5 * run.report["frames"]
+    assert np.median(waited) < 0.5e9
+
+
+def test_depth_of_a_live_camera_is_in_metres_and_is_tracked(plain_session: Path) -> None:
+    room = RoomCamera(rs, open_source(str(plain_session / "robot")))
+    assert room.source.rig.depth is not None
+    original = tracked(room.source)
+    source = LiveSource(room.feed(RGBD, KeepNewest(2 * WAITING), []), HZ)
+    assert (source.rig.cam1, source.rig.kind) == (None, "rgbd+imu")
+    room.begin(source.feed)
+    run = tracked(source)
+    assert run.report["frames"] == 45
+    assert_same(room, run, original)
+
+
+def test_a_camera_that_was_unplugged_is_tracked_on_with_its_new_clock(plain_session: Path) -> None:
+    room, said = RoomCamera(rs, open_source(str(plain_session / "ar1"))), list[str]()
+    source = LiveSource(room.feed(STEREO, KeepNewest(200), said, quick), HZ)
+    feed = source.feed
+
+    def heard(text: str) -> Callable[[], bool]:
+        return lambda: any(text in line for line in said)
+
+    def plugged() -> None:
+        time.sleep(0.2)
+        room.play()
+        room.there = False
+        wait_for(heard("looks for camera"))
+        time.sleep(0.3)
+        room.there = True
+        wait_for(heard("connected again"))
+        room.play(lambda: time.sleep(1 / HZ), begin_us=0)
+        wait_for(lambda: feed.intake.streams["cam0"].samples == 90)
+        feed.stop()
+
+    threading.Thread(target=plugged, daemon=True).start()
+    run = tracked(source)
+    camera, stamps_ns = run.report["camera"], run.trajectory.stamps_ns
+    assert (camera["reconnections"], camera["stretches"], camera["restarts"]) == (1, 2, 0)
+    assert run.report["frames"] > 80
+    assert run.report["sequencer"]["gaps"] == 1
+    steps_s = np.diff(stamps_ns) * 1e-9
+    assert steps_s.min() > 0.03
+    assert 0.3 < steps_s.max() < 10  # as long as it was away, by the host's clock
+    assert (stamps_ns[-1] - stamps_ns[np.argmax(steps_s) + 1]) * 1e-9 > 1.0  # it is tracked again
+
+
+def wait_for(what: Callable[[], bool]) -> None:
+    until = time.monotonic() + 20
+    while not what() and time.monotonic() < until:
+        time.sleep(0.02)
