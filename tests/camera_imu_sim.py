@@ -85,7 +85,9 @@ def _stamps(t: F64) -> I64:
     return START_NS + np.round(t * 1e9).astype(np.int64)
 
 
-def _seen(T_target_cam0: F64, rng: np.random.Generator, noise_px: float, wrong: float) -> tuple[Detection, ...]:
+def _seen(
+    T_target_cam0: F64, rng: np.random.Generator, noise_px: float, wrong: float
+) -> tuple[Detection, ...]:
     out = []
     for camera, mount in ((CAM0, np.eye(4)), (CAM1, T_CAM1_CAM0)):
         px = camera.project(se3.transform(mount @ se3.inverse(T_target_cam0), TARGET.corners))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from share.calibration.bundle import View
-from share.calibration.camera_imu.normal import Normal, Sigmas, covers, inertial, normal, poses
+from share.calibration.camera_imu.normal import Sigmas, covers, inertial, normal, poses
 from share.calibration.camera_imu.sights import Sights, seen, sights
 from share.calibration.camera_imu.solve import Arrow, arrow, solve
 from share.calibration.camera_imu.start import (
@@ -24,9 +24,8 @@ from share.calibration.camera_imu.start import (
     first_state,
     refined_poses,
 )
-from share.calibration.camera_imu.state import MOUNT, SHARED, SHIFT, State
+from share.calibration.camera_imu.state import SHARED, SHIFT, State
 from share.errors import DataError, MisfitError
-from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
 from share.geometry.target import Target
 from share.types import F64, I64, ImuBatch
@@ -137,12 +136,16 @@ class _Batch:
 
     def stated(self) -> Sigmas:
         """A sample's noise, by the density that the IMU's file has and the rate that the samples have."""
-        root = np.sqrt(1e9 / float(np.median(np.diff(self.imu.stamps_ns))))
+        root = float(np.sqrt(1e9 / np.median(np.diff(self.imu.stamps_ns))))
         return Sigmas(_LEAST_PX, self.noise.gyro_density * root, self.noise.accel_density * root)
 
     def descend(self, state: State, sigmas: Sigmas) -> State:
         """Downhill until the cost stands still. Raises MisfitError where it never does."""
         damping, (system, cost) = 1e-5, self._at(state, sigmas)
+        if not np.isfinite(cost):
+            raise MisfitError(
+                "camera and IMU: the board would lie behind a camera; is --target the board shown?"
+            )
         for _ in range(_STEPS):
             knots, border, _ = _solved(system, damping)
             trial = state.moved(knots, border)
@@ -169,8 +172,7 @@ class _Batch:
         """Adds what holds the biases: their first node hardly, each next one by the walk. The cost."""
         walk = np.repeat([self.noise.gyro_walk, self.noise.accel_walk], 3)
         weight = 1 / (np.maximum(walk, _LEAST_WALK) ** 2 * NODE_S)
-        corner, g = np.diag(system.corner[SHARED:, SHARED:]), system.g_border[SHARED:].reshape(-1, 6)
-        del corner
+        g = system.g_border[SHARED:].reshape(-1, 6)  # a view
         steps = np.diff(state.biases, axis=0)
         own = np.zeros_like(state.biases)
         own[0] += _BIAS_SIGMA**-2
@@ -213,4 +215,6 @@ def _solved(system: Arrow, damping: float) -> tuple[F64, F64, F64]:
     try:
         return solve(system, damping)
     except np.linalg.LinAlgError:
-        raise DataError("camera and IMU: the recording does not tell the motion; move and turn more") from None
+        raise DataError(
+            "camera and IMU: the recording does not tell the motion; move and turn more"
+        ) from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -17,7 +18,7 @@ _SHARED = slice(KNOTS, KNOTS + SHARED)
 
 @dataclass(frozen=True)
 class Sigmas:
-    """Of a corner's coordinate px, of a sample rad/s and m/s^2. huber: times px, whence corners are doubted."""
+    """Of a corner's coordinate px, of a sample rad/s and m/s^2. huber: times px, where doubt begins."""
 
     px: float
     gyro: float
@@ -95,7 +96,7 @@ def _add_imu(out: Normal, state: State, imu: ImuBatch, sigmas: Sigmas) -> float:
     sigma = np.repeat([sigmas.gyro, sigmas.accel], 3)
     r, J = r / sigma, J / sigma[:, None]
     ends = np.searchsorted(segment, np.arange(state.curve.segments + 1))
-    for k, (first, last) in enumerate(zip(ends[:-1], ends[1:], strict=True)):
+    for k, (first, last) in enumerate(pairwise(ends)):
         A = J[first:last].reshape(-1, LOCAL)
         out.H[k] += A.T @ A
         out.g[k] += A.T @ r[first:last].reshape(-1)

@@ -1,6 +1,7 @@
 """The arrow: knots that meet only their neighbours, and a border that meets all.
 
-The banded part is factored by Cholesky, the border follows by the Schur complement (Triggs et al., 2000, 6.1).
+The banded part is factored by Cholesky; the border follows by the Schur complement (Triggs et al., *Bundle
+adjustment: a modern synthesis*, 2000, 6.1).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from share.calibration.camera_imu.state import KNOTS, LOCAL, SHARED, State
 from share.types import F64
 
 _WIDE = 6 * ORDER  # diagonals of the upper half, with the main one
+_NOTHING = 1e-150
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +84,7 @@ def solve(system: Arrow, damping: float) -> tuple[F64, F64, F64]:
     band[-1] *= 1 + damping
     factor = (cholesky_banded(band), False)
     back = cho_solve_banded(factor, np.column_stack([system.edge, system.g_knots]))
+    back[np.abs(back) < _NOTHING] = 0  # far from a bias node they fade, and denormal numbers are slow
     corner = system.corner + damping * np.diag(np.diag(system.corner))
     covariance = np.linalg.inv(corner - system.edge.T @ back[:, :-1])
     step = covariance @ (system.g_border - system.edge.T @ back[:, -1])

@@ -30,7 +30,7 @@ def _matrix() -> F64:
         signed = (
             (-1) ** (left - s) * comb(k, left - s) * (k - 1 - left) ** (k - 1 - n) for left in range(s, k)
         )
-        return comb(k - 1, n) / factorial(k - 1) * sum(signed)
+        return float(comb(k - 1, n) / factorial(k - 1) * sum(signed))
 
     plain = np.array([[entry(s, n) for n in range(k)] for s in range(k)], np.float64)
     return np.asarray(np.cumsum(plain[::-1], axis=0)[::-1], np.float64)

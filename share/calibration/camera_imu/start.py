@@ -1,4 +1,4 @@
-"""Where it begins, with no guess from anybody: poses of the board, the clocks, the mounting's rotation, gravity.
+"""Where it begins, with no guess from anybody: poses of the board, clocks, the mounting's rotation, gravity.
 
 Camera and IMU turn as one, so their rates differ by a rotation and a bias at the right offset of the clocks.
 For each offset the best rotation is closed form (Umeyama, PAMI 1991, eq. 40), and how well it fits is the
@@ -28,7 +28,7 @@ STEP_S = 0.02  # between knots: carries what a hand does, up to 10 Hz and more
 NODE_S = 5.0  # between nodes of the biases
 EDGE_S = 0.05  # pictures nearer to the ends are left out: the offset may yet carry them beyond
 _LAG_S = 0.005
-_JOINED_S = 0.15  # pictures farther apart do not tell a rate
+_JOINED_S = 0.25  # pictures farther apart do not tell a rate
 _LEAST_PAIRS = 50
 _LEAST_CORRELATION = 0.6
 _LEAST_RATE = 0.05  # rad/s rms about the second axis; below, the mounting cannot be told
@@ -56,7 +56,8 @@ def refined_poses(sights: Sights, T: F64, sigma_px: float = 1.0) -> F64:
         step = pose_normal(sights, T, sigma_px, 2.5)
         if not np.isfinite(step.cost):
             break
-        T = T @ se3.exp(np.linalg.solve(step.H + 1e-9 * np.eye(6), step.g[..., None])[..., 0])
+        xi = np.linalg.solve(step.H + 1e-9 * np.eye(6), step.g[..., None])[..., 0]
+        T = T @ se3.exp(np.asarray(xi, np.float64))
     return T
 
 
@@ -120,7 +121,7 @@ class _Turned:
         """(N, 3) rad/s from stamps to stamps (N,), both shifted."""
         a, b = ((stamps - self._start) * 1e-9 + shift_s for stamps in (from_ns, to_ns))
         turn = [np.interp(b, self._t, one) - np.interp(a, self._t, one) for one in self._sum.T]
-        return np.stack(turn, axis=1) / (b - a)[:, None]
+        return np.asarray(np.stack(turn, axis=1) / (b - a)[:, None], np.float64)
 
 
 def _likeness(camera: F64, gyro: F64) -> tuple[float, F64]:
@@ -141,14 +142,16 @@ def _peak(score: F64, i: int) -> float:
 
 def first_state(stamps_ns: I64, T: F64, imu: ImuBatch, found: Alignment) -> State:
     """Knots by straight lines between the poses T (F, 4, 4) of cam0, which begins at the IMU's own place."""
-    shifted = stamps_ns + round(found.shift_s * 1e9)
+    shifted: I64 = stamps_ns + round(found.shift_s * 1e9)
     begin = max(int(shifted[0]) - round(2 * EDGE_S * 1e9), int(imu.stamps_ns[0]))
     end = min(int(shifted[-1]) + round(2 * EDGE_S * 1e9), int(imu.stamps_ns[-1]))
     segments = int((end - begin) * 1e-9 / STEP_S)
     if segments * STEP_S < 1:
         raise DataError("IMU and pictures of the board have less than a second in common")
-    at = (np.arange(segments + EDGE) - (EDGE - 1) / 2) * STEP_S  # where each knot weighs most
-    t = (shifted - begin) * 1e-9
+    at: F64 = (
+        np.arange(segments + EDGE, dtype=np.float64) - (EDGE - 1) / 2
+    ) * STEP_S  # where each weighs most
+    t = np.asarray((shifted - begin) * 1e-9, np.float64)
     R = _between(t, T[:, :3, :3] @ found.R_imu_cam0.T, at)
     p = np.stack([np.interp(at, t, column) for column in T[:, :3, 3].T], axis=1)
     curve = Curve(begin, STEP_S, R, p)

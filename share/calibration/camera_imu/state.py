@@ -31,9 +31,7 @@ class State:
 
     def moved(self, knots: F64, border: F64) -> State:
         """By a step of the knots (K, 6) and of SHARED + 6 M others."""
-        curve = replace(
-            self.curve, R=self.curve.R @ se3.so3_exp(knots[:, :3]), p=self.curve.p + knots[:, 3:]
-        )
+        curve = replace(self.curve, R=self.curve.R @ se3.so3_exp(knots[:, :3]), p=self.curve.p + knots[:, 3:])
         return replace(
             self,
             curve=curve,
