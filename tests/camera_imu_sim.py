@@ -10,7 +10,7 @@ from share.calibration.bundle import View
 from share.calibration.detect import Detection
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.geometry.target import AprilGrid
+from share.geometry.target import AprilGrid, Target
 from share.types import F64, I64, ImuBatch
 
 NOISE = ImuNoise(2.4e-4, 1.5e-3, 1e-5, 1.5e-4, 200.0)  # a D435i's
@@ -27,17 +27,19 @@ _STEP = 1e-4  # s, for derivatives by differences: exact to 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Dance:
-    """Sums of sines, up to about 2 rad/s and 1 m/s. axes (3,): how much the camera turns about each."""
+    """Sums of sines, up to about 2 rad/s and 1 m/s. axes (3,): how much the camera turns about each; what
+    it looks at."""
 
     seed: int = 0
     axes: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    target: Target = TARGET
 
     def camera(self, t: F64) -> F64:
         """T_target_cam0 (N, 4, 4) at t (N,) s."""
         rng = np.random.default_rng((self.seed, 7))
         hz, phase = rng.uniform(0.15, 0.9, (4, 6)), rng.uniform(0, 6.28, (4, 6))
         waves = np.sin(2 * np.pi * hz[:, :, None] * t + phase[:, :, None]).sum(axis=0)
-        middle = np.append(TARGET.extent.mean(axis=0), 0.8)
+        middle = np.append(self.target.extent.mean(axis=0), 0.8)
         facing = se3.compose(np.diag([1.0, -1, -1]), middle)
         turn = 0.13 * waves[:3].T * self.axes
         return facing @ se3.compose(se3.so3_exp(turn), 0.06 * waves[3:].T)

@@ -14,10 +14,13 @@ from share.cli.table import aligned
 from share.errors import DataError, ShareError
 
 if TYPE_CHECKING:
+    from share.calibration.camera_imu.verdict import Comparison
     from share.geometry.camera import ImuNoise
     from share.io.camera_imu_report import Outcome
     from share.io.rig_pictures import RigPictures
     from share.types import F64
+
+_WORTH = 2.0  # times the stated noise: worth a word
 
 
 @click.command("camera-imu", short_help="Where cameras sit on an IMU, and the offset of their clocks.")
@@ -162,8 +165,18 @@ def _list(values: F64) -> str:
 
 
 def _warnings(outcome: Outcome) -> list[str]:
-    """What a person ought to know of the calibration that was there before."""
-    before = outcome.before
+    """What a person ought to know before believing it: a line each."""
+    verdict = outcome.verdict
+    return _of_given(outcome.before) + [
+        f"{name} errs by {times:.1f} times its stated noise: scale, axes, or the board's size; the sigmas "
+        "take that into account"
+        for name, times in (("gyroscope", verdict.gyro), ("accelerometer", verdict.accel))
+        if times > _WORTH and verdict.passed
+    ]
+
+
+def _of_given(before: Comparison | None) -> list[str]:
+    """How the calibration that was there before compares."""
     if before is None:
         return []
     if before.inverted:

@@ -152,11 +152,21 @@ def test_corners_that_were_found_wrongly_do_little_harm(found: Fit) -> None:
 
 
 def test_an_imu_noisier_than_stated_makes_sigmas_larger_and_fails(dance: Recorded, found: Fit) -> None:
-    run = record(Dance(1), 12.0, hz=6.0, imu=replace(NOISE, gyro_density=2.4e-3, accel_density=1.5e-2))
+    run = record(Dance(1), 12.0, hz=6.0, imu=replace(NOISE, gyro_density=4.8e-3, accel_density=1.5e-2))
     noisy = calibrated(run)
     assert noisy.sigma_shift > 3 * found.sigma_shift
-    assert noisy.sigmas.gyro == pytest.approx(10 * noisy.stated.gyro, rel=0.2)
+    assert noisy.sigmas.gyro == pytest.approx(20 * noisy.stated.gyro, rel=0.2)
     assert any("gyroscope's residuals" in reason for reason in judge(noisy).reasons)
+
+
+def test_a_gyro_that_errs_in_scale_has_larger_sigmas(dance: Recorded, found: Fit) -> None:
+    """By half a percent: far below its noise in each sample, far above it in the long run."""
+    imu = replace(dance.imu, gyro=dance.imu.gyro * np.array([1.005, 0.996, 1.003]))
+    scaled = calibrated(replace(dance, imu=imu))
+    assert judge(scaled).gyro > 3 > 1.1 > judge(found).gyro
+    assert scaled.sigma_shift > 1.5 * found.sigma_shift
+    off = error(scaled)
+    assert np.degrees(np.linalg.norm(off[:3])) < 0.1 and np.linalg.norm(off[3:6]) < 2e-3
 
 
 def test_turning_too_little_about_one_axis_is_said() -> None:

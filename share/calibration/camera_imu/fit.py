@@ -12,31 +12,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from share.calibration.bundle import View
-from share.calibration.camera_imu.normal import Sigmas, covers, inertial, normal, poses
-from share.calibration.camera_imu.sights import Sights, seen, sights
-from share.calibration.camera_imu.solve import Arrow, arrow, solve
+from share.calibration.camera_imu.batch import Batch
+from share.calibration.camera_imu.normal import Sigmas, covers
+from share.calibration.camera_imu.sights import Sights, sights
 from share.calibration.camera_imu.start import (
     EDGE_S,
-    NODE_S,
     Alignment,
     align,
     first_poses,
     first_state,
     refined_poses,
 )
-from share.calibration.camera_imu.state import SHARED, SHIFT, State
-from share.errors import DataError, MisfitError
+from share.calibration.camera_imu.state import SHIFT, State
+from share.errors import DataError
 from share.geometry.camera import ImuNoise, Rig
 from share.geometry.target import Target
 from share.types import F64, I64, ImuBatch
 
 _HOLE_NS = 100_000_000  # longer without an IMU sample, and the curve goes its own way
 _FIRST_PX = 1.0
-_LEAST_PX = 0.01  # below this corners are not found, whatever the residuals say
-_BIAS_SIGMA = np.repeat([0.2, 1.0], 3)  # rad/s, m/s^2: no IMU is worse
-_LEAST_WALK = 1e-7
-_ROUNDS, _STEPS = 3, 30
-_STILL = 1e-7  # relative fall of the cost at which it has arrived
+_ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +101,7 @@ def fit(
     found = align(corners.stamps_ns, T, imu, within_s)
     state = first_state(corners.stamps_ns, T, imu, found)
     inside = covers(state.curve, corners.stamps_ns, state.shift_s, EDGE_S)
-    batch = _Batch(corners.take(inside), _during(imu, state), noise)
+    batch = Batch(corners.take(inside), _during(imu, state), noise)
     stated = batch.stated()
     sigmas = replace(stated, px=_FIRST_PX)
     for done in range(_ROUNDS):
@@ -114,7 +109,11 @@ def fit(
         state = batch.descend(state, sigmas)
         sigmas = batch.spread(state, stated)
     told(_ROUNDS, _ROUNDS)
-    return batch.report(state, sigmas, stated, found)
+    gyro, accel = batch.inertial(state)
+    covariance = batch.covariance(state, sigmas)
+    return Fit(
+        state, covariance, sigmas, stated, batch.sights, batch.imu, batch.corners(state), gyro, accel, found
+    )
 
 
 def _during(imu: ImuBatch, state: State) -> ImuBatch:
@@ -124,97 +123,3 @@ def _during(imu: ImuBatch, state: State) -> ImuBatch:
     if longest > _HOLE_NS:
         raise DataError(f"IMU: nothing for {longest * 1e-9:.2f} s while the board was seen; record it again")
     return used
-
-
-@dataclass(frozen=True, eq=False)
-class _Batch:
-    """One problem."""
-
-    sights: Sights
-    imu: ImuBatch
-    noise: ImuNoise
-
-    def stated(self) -> Sigmas:
-        """A sample's noise, by the density that the IMU's file has and the rate that the samples have."""
-        root = float(np.sqrt(1e9 / np.median(np.diff(self.imu.stamps_ns))))
-        return Sigmas(_LEAST_PX, self.noise.gyro_density * root, self.noise.accel_density * root)
-
-    def descend(self, state: State, sigmas: Sigmas) -> State:
-        """Downhill until the cost stands still. Raises MisfitError where it never does."""
-        damping, (system, cost) = 1e-5, self._at(state, sigmas)
-        if not np.isfinite(cost):
-            raise MisfitError(
-                "camera and IMU: the board would lie behind a camera; is --target the board shown?"
-            )
-        for _ in range(_STEPS):
-            knots, border, _ = _solved(system, damping)
-            trial = state.moved(knots, border)
-            after, trial_cost = self._at(trial, sigmas)
-            if not trial_cost < cost:
-                if damping > 1e6 or trial_cost - cost < _STILL * cost:
-                    return state
-                damping *= 10
-                continue
-            arrived = cost - trial_cost < _STILL * cost
-            state, system, cost, damping = trial, after, trial_cost, max(damping / 10, 1e-12)
-            if arrived:
-                return state
-        raise MisfitError(
-            f"camera and IMU: no solution after {_STEPS} steps; are --target, --camera and --imu of this rig?"
-        )
-
-    def _at(self, state: State, sigmas: Sigmas) -> tuple[Arrow, float]:
-        one = normal(state, self.sights, self.imu, sigmas)
-        system = arrow(one, state)
-        return system, one.cost + self._biases(state, system)
-
-    def _biases(self, state: State, system: Arrow) -> float:
-        """Adds what holds the biases: their first node hardly, each next one by the walk. The cost."""
-        walk = np.repeat([self.noise.gyro_walk, self.noise.accel_walk], 3)
-        weight = 1 / (np.maximum(walk, _LEAST_WALK) ** 2 * NODE_S)
-        g = system.g_border[SHARED:].reshape(-1, 6)  # a view
-        steps = np.diff(state.biases, axis=0)
-        own = np.zeros_like(state.biases)
-        own[0] += _BIAS_SIGMA**-2
-        own[1:] += weight
-        own[:-1] += weight
-        here = np.arange(SHARED, SHARED + state.biases.size)
-        system.corner[here, here] += own.reshape(-1)
-        across = np.tile(weight, len(steps))
-        system.corner[here[:-6], here[6:]] -= across
-        system.corner[here[6:], here[:-6]] -= across
-        g[1:] -= weight * steps
-        g[:-1] += weight * steps
-        g[0] -= state.biases[0] / _BIAS_SIGMA**2
-        return float(((state.biases[0] / _BIAS_SIGMA) ** 2).sum() + (weight * steps**2).sum()) / 2
-
-    def spread(self, state: State, stated: Sigmas) -> Sigmas:
-        """What residuals show: of corners as it is, of the IMU where it is more than stated."""
-        corners = np.concatenate(self._corners(state))
-        px = float(np.median(np.linalg.norm(corners, axis=1))) / 1.1774
-        gyro, accel = (float(np.sqrt((part**2).mean())) for part in self._inertial(state))
-        return Sigmas(max(px, _LEAST_PX), max(gyro, stated.gyro), max(accel, stated.accel))
-
-    def _corners(self, state: State) -> tuple[F64, ...]:
-        T = poses(state, self.sights.stamps_ns)
-        return tuple(seen(self.sights, eye, T)[0] for eye in range(len(self.sights.cameras)))
-
-    def _inertial(self, state: State) -> tuple[F64, F64]:
-        left = inertial(state, self.imu)[0]
-        return left[:, :3], left[:, 3:]
-
-    def report(self, state: State, sigmas: Sigmas, stated: Sigmas, began: Alignment) -> Fit:
-        covariance = _solved(self._at(state, sigmas)[0], 0.0)[2][:7, :7]
-        gyro, accel = self._inertial(state)
-        return Fit(
-            state, covariance, sigmas, stated, self.sights, self.imu, self._corners(state), gyro, accel, began
-        )
-
-
-def _solved(system: Arrow, damping: float) -> tuple[F64, F64, F64]:
-    try:
-        return solve(system, damping)
-    except np.linalg.LinAlgError:
-        raise DataError(
-            "camera and IMU: the recording does not tell the motion; move and turn more"
-        ) from None

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from share.calibration.camera_imu.batch import rough
 from share.calibration.camera_imu.fit import Fit
 from share.geometry import se3
 from share.types import F64
@@ -24,7 +25,7 @@ class Limits:
 
     rms_px: float = 1.0
     wrong: float = 0.05
-    imu: float = 3.0
+    imu: float = 10.0
     gravity: float = 0.15
     turning: float = 0.15
     moving: float = 0.2
@@ -36,7 +37,8 @@ class Limits:
 @dataclass(frozen=True, eq=False)
 class Verdict:
     """reasons: what fails, none where it passes. rms_px and wrong corners of each camera; turning (3,) rad/s
-    and moving (3,) m/s^2: rms by principal axes, largest first; gyro, accel: residuals' rms over stated."""
+    and moving (3,) m/s^2: rms by principal axes, largest first; gyro, accel: residuals, the rms of all or
+    of slow ones, over stated."""
 
     reasons: tuple[str, ...]
     rms_px: tuple[float, ...]
@@ -56,8 +58,8 @@ def judge(fit: Fit, limits: Limits = Limits()) -> Verdict:
     told = [(r, kept(fit, r)) for r in fit.corners]
     rms = tuple(float(np.sqrt((r[k] ** 2).sum(axis=1).mean())) if k.any() else float("nan") for r, k in told)
     wrong = tuple(int((~k).sum()) for _, k in told)
-    gyro = float(np.sqrt((fit.gyro**2).mean())) / fit.stated.gyro
-    accel = float(np.sqrt((fit.accel**2).mean())) / fit.stated.accel
+    gyro = rough(fit.imu.stamps_ns, fit.gyro) / fit.stated.gyro
+    accel = rough(fit.imu.stamps_ns, fit.accel) / fit.stated.accel
     turning, moving = _excitation(fit)
     reasons = [
         *_corner_reasons(fit, rms, wrong, limits),
@@ -113,7 +115,7 @@ def _motion_reasons(turning: F64, moving: F64, limits: Limits) -> list[str]:
 def _imu_reasons(gyro: float, accel: float, gravity: F64, limits: Limits) -> list[str]:
     out = [
         f"{name}'s residuals are {times:.1f} times its stated noise, at most {limits.imu:g}: is --imu of "
-        "this device, is the IMU fixed to the cameras, did it strike something?"
+        "this device, the IMU fixed to the cameras, the board as large as --target says?"
         for name, times in (("gyroscope", gyro), ("accelerometer", accel))
         if not times <= limits.imu
     ]
