@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from share.cli.calibrate_camera import camera
+from share.cli.calibrate_camera_imu import camera_imu
 from share.cli.calibrate_imu import imu
 from share.cli.calibrate_mocap import mocap
 from share.cli.calibrate_realsense import realsense
@@ -21,6 +22,7 @@ def calibrate() -> None:
 
 
 calibrate.add_command(camera)
+calibrate.add_command(camera_imu)
 calibrate.add_command(imu)
 calibrate.add_command(mocap)
 calibrate.add_command(target)

@@ -21,10 +21,7 @@ if TYPE_CHECKING:
 
 @click.command(short_help="Intrinsics of one or two cameras from views of a board.")
 @click.argument("source")
-@click.option(
-    "--target", "target_name", required=True, metavar="T",
-    help="The board: aprilgrid or charuco of the usual sizes, or its YAML file.",
-)  # fmt: skip
+@options.target
 @click.option("--camera", type=click.Choice(["cam0", "both"]), default="both", show_default=True)
 @click.option(
     "--every", type=click.IntRange(1), default=1, show_default=True, metavar="N",
@@ -60,8 +57,9 @@ def camera(
     from share.io.board_views import open_pictures
     from share.io.files import atomic_write, writable_dir
     from share.io.json_file import known
+    from share.io.target import named_target
 
-    target = _target(target_name)
+    target = named_target(target_name)
     pictures = open_pictures(source, ("cam0", "cam1") if camera == "both" else ("cam0",), calib)
     writable_dir(out)
     outcome = _calibrated(source, pictures, target, every, most)
@@ -74,14 +72,6 @@ def camera(
         raise ShareError(
             f"{source}: not to be believed ({out} is written): " + "; ".join(outcome.verdict.reasons)
         )
-
-
-def _target(name: str) -> Target:
-    from share.geometry.target import AprilGrid, CharucoBoard
-    from share.io.target import read_target
-
-    usual = {"aprilgrid": AprilGrid, "charuco": CharucoBoard}
-    return usual[name]() if name in usual else read_target(Path(name))
 
 
 def _calibrated(source: str, pictures: Pictures, target: Target, every: int, most: int) -> Outcome:

@@ -15,7 +15,6 @@ from share.errors import UsageError
 
 if TYPE_CHECKING:
     from share.calibration.mounting import Check
-    from share.geometry.camera import ImuNoise
     from share.mocap.fit import Fit
     from share.mocap.mocap import Mocap
     from share.types import F64
@@ -77,6 +76,7 @@ def mocap(
     from share.io.json_file import known
     from share.io.mocap_file import read_mocap
     from share.io.mocap_report import mocap_json, mocap_text
+    from share.io.stated_noise import stated_noise
     from share.mocap.fit import fit
     from share.mocap.options import FitOptions
     from share.mocap.verdict import unsure
@@ -84,7 +84,7 @@ def mocap(
     chosen = FitOptions(sigma_position=sigma_mm * 1e-3, within_s=within)
     if one_clock:
         chosen = replace(chosen, within_s=0.0, offset_sigma=1e-5, drift_sigma=1e-8)
-    noise, seen = _noise(source, calib), read_mocap(truth)
+    noise, seen = stated_noise(source, calib, "--calib"), read_mocap(truth)
     writable_dir(out)
     with Stages() as stages:
         table = read_imu(source, lambda done, total: stages("reading", done, total))
@@ -100,25 +100,6 @@ def mocap(
         click.echo(f"share: {source}: {doubt}", err=True)
     if checked and not checked.agrees:
         click.echo(f"share: {track}: does not agree with the fit; is it of this recording?", err=True)
-
-
-def _noise(source: str, calib: str | None) -> ImuNoise:
-    """Of --calib (a folder with the IMU's chain, or that file), else as the source carries it."""
-    from share.io.calibration import IMU_CHAIN, imu_noise
-    from share.io.section import read_yaml
-    from share.io.source import open_source
-
-    if calib is not None:
-        path = Path(calib) / IMU_CHAIN if Path(calib).is_dir() else Path(calib)
-        if not path.is_file():
-            raise UsageError(f"--calib {calib}: has no {IMU_CHAIN}")
-        return imu_noise(read_yaml(path).section("imu0"), "update_rate")
-    if Path(source).suffix == ".csv":
-        raise UsageError(f"{source}: a table does not say how noisy the IMU is; give --calib DIR")
-    noise = open_source(source).rig.imu
-    if noise is None:
-        raise UsageError(f"{source}: does not say how noisy the IMU is; give --calib DIR")
-    return noise
 
 
 def _check(found: Fit, track: Path, seen: Mocap) -> Check:

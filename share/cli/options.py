@@ -28,6 +28,10 @@ keys = click.option(
 out_folder = click.option(
     "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Where the files go."
 )
+target = click.option(
+    "--target", "target_name", required=True, metavar="T",
+    help="The board: aprilgrid or charuco of the usual sizes, or its YAML file.",
+)  # fmt: skip
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
 
 

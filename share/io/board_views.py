@@ -23,7 +23,8 @@ _TOGETHER_NS = 2_000_000  # stamps of two pictures taken at once
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """count: of cam0's; rig: the calibration so far, if the source has one; read: name and images of each."""
+    """count: of cam0's; rig: the calibration so far, if the source has one; read: name and images of each,
+    which of a recording is the stamp of the first camera's, ns."""
 
     count: int
     rig: Rig | None
@@ -50,8 +51,9 @@ def open_pictures(source: str, eyes: Sequence[str], calib: str | None = None) ->
             waiting[m.stream] = (m.stamp_ns, m.payload)
             stamps = [stamp for stamp, _ in waiting.values()]
             if len(waiting) == len(eyes) and max(stamps) - min(stamps) <= _TOGETHER_NS:
+                first = waiting[eyes[0]][0]
                 pair = tuple(waiting.pop(eye)[1].load() for eye in eyes)  # type: ignore[attr-defined]
-                yield str(stamps[0]), pair
+                yield str(first), pair
 
     return Pictures(opened.images_count, opened.rig, read)
 

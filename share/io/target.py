@@ -46,6 +46,11 @@ def read_target(path: Path) -> Target:
     return target_of(read_yaml(path))
 
 
+def named_target(name: str) -> Target:
+    """`aprilgrid` or `charuco` of the usual sizes, or a YAML file. Raises ConfigError."""
+    return _KEYS[name][0]() if name in _KEYS else read_target(Path(name))
+
+
 def target_of(section: Section) -> Target:
     """The target of one mapping. Raises ConfigError naming where it stands and the key."""
     kind = section.text(_TYPE)

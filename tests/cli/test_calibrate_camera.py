@@ -6,17 +6,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from board_pictures import PAPER, printed
 from shell import Done
 
 from share.geometry import se3
 from share.geometry.target import CharucoBoard
 from share.io.calibration import read_calibration
-from share.types import F64, U8
-from share.vision.target_picture import darkness, ink
 
 K = np.array([[420, 0, 319.5], [0, 424, 241], [0, 0, 1]])
-FINE = np.array([[3, 0, 1], [0, 3, 1], [0, 0, 1]])  # to pixels a third as large: edges without steps
-TEXEL, MARGIN = 0.001, 0.04
 
 
 def test_pictures_without_a_board_are_one_line_and_leave_nothing(
@@ -33,20 +30,10 @@ def test_pictures_without_a_board_are_one_line_and_leave_nothing(
     assert not list((tmp_path / "out").glob("*"))
 
 
-def _printed(board: CharucoBoard) -> tuple[U8, F64]:
-    """A picture of the board, and what takes (x, y, 1) m on it to pixels there."""
-    low, high = board.extent[0] - MARGIN, board.extent[1] + MARGIN
-    columns, rows = np.round((high - low) / TEXEL).astype(int)
-    xs, ys = low[0] + TEXEL * np.arange(columns + 1), high[1] - TEXEL * np.arange(rows + 1)
-    shift = (-low[0] / TEXEL - 0.5, high[1] / TEXEL - 0.5)
-    to_texels = np.array([[1 / TEXEL, 0, shift[0]], [0, -1 / TEXEL, shift[1]], [0, 0, 1]])
-    return np.round(220 - 190 * darkness(ink(board), xs, ys)).astype(np.uint8), to_texels
-
-
 def _pictures(folder: Path, rng: np.random.Generator) -> None:
     """14 of a board all over the image, and one in which a single row of its corners is to be seen."""
     board = CharucoBoard()
-    printed, to_texels = _printed(board)
+    print_out = printed(board)
     middle = np.append(board.extent.mean(axis=0), 0)
     facing = se3.exp(np.array([np.pi, 0, 0, 0, 0, 0]))
     folder.mkdir(parents=True)
@@ -54,12 +41,9 @@ def _pictures(folder: Path, rng: np.random.Generator) -> None:
         T = facing @ se3.exp(np.append(rng.uniform(-0.5, 0.5, 3), [0, 0, 0]))
         depth = rng.uniform(0.5, 0.9)
         T[:3, 3] = np.append(rng.uniform((-0.25, -0.2), (0.25, 0.2)), 1) * depth - T[:3, :3] @ middle
-        H = FINE @ K @ T[:3, [0, 1, 3]] @ np.linalg.inv(to_texels)
-        fine = cv2.warpPerspective(printed, H, (3 * 640, 3 * 480), borderValue=220)
-        seen = cv2.resize(fine, (640, 480), interpolation=cv2.INTER_AREA)
-        cv2.imwrite(str(folder / f"{k:02}.png"), seen)
-    row = np.full((480, 640), 220, np.uint8)
-    half = cv2.resize(printed, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)[:94]
+        cv2.imwrite(str(folder / f"{k:02}.png"), print_out.seen(K, T, (640, 480)))
+    row = np.full((480, 640), PAPER, np.uint8)
+    half = cv2.resize(print_out.picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)[:94]
     row[100:194, 20 : 20 + half.shape[1]] = half
     cv2.imwrite(str(folder / "row.png"), row)
 

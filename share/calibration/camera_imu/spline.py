@@ -1,0 +1,138 @@
+"""A body's path as uniform B-splines of order six: cumulative on SO(3), plain in position.
+
+Rotation, its rate and both their derivatives by the knots go by the recursions of Sommer et al., *Efficient
+derivative computation for cumulative B-splines on Lie groups* (CVPR 2020); a spline of its own for position
+keeps accelerations linear in the knots (Haarbach et al., 3DV 2018).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from math import comb, factorial
+
+import numpy as np
+
+from share.geometry import se3
+from share.types import F64, I64
+
+ORDER = 6
+EDGE = ORDER - 1  # knots more than there are segments
+
+
+@cache
+def _matrix() -> F64:
+    """(6, 6): powers of u in each of the cumulative blending functions (Qin, *General matrix representations
+    for B-splines*, 2000)."""
+    k = ORDER
+
+    def entry(s: int, n: int) -> float:
+        signed = (
+            (-1) ** (left - s) * comb(k, left - s) * (k - 1 - left) ** (k - 1 - n) for left in range(s, k)
+        )
+        return float(comb(k - 1, n) / factorial(k - 1) * sum(signed))
+
+    plain = np.array([[entry(s, n) for n in range(k)] for s in range(k)], np.float64)
+    return np.asarray(np.cumsum(plain[::-1], axis=0)[::-1], np.float64)
+
+
+def blending(u: F64, derivative: int) -> F64:
+    """Cumulative weights (N, 6) at u (N,) in 0 .. 1, or their derivative by u."""
+    powers = np.arange(ORDER)
+    fall = np.array([factorial(n) / factorial(n - derivative) if n >= derivative else 0.0 for n in powers])
+    return np.asarray((fall * u[:, None] ** np.maximum(powers - derivative, 0)) @ _matrix().T, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where on a curve: segment (N,), whose knots are segment .. segment + 5, and u (N,) in it."""
+
+    segment: I64
+    u: F64
+
+
+@dataclass(frozen=True, eq=False)
+class Turning:
+    """R (N, 3, 3) and rate (N, 3) rad/s, in the body. by (N, 6, 3, 3): phi of R Exp(phi) by each knot's;
+    rate_by (N, 6, 3, 3)."""
+
+    R: F64
+    rate: F64
+    by: F64
+    rate_by: F64
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Knots R (K, 3, 3), p (K, 3) m every step_s from start_ns on; K - 5 segments."""
+
+    start_ns: int
+    step_s: float
+    R: F64
+    p: F64
+
+    @property
+    def segments(self) -> int:
+        return len(self.p) - EDGE
+
+    @property
+    def end_s(self) -> float:
+        """Seconds from the start that it covers."""
+        return self.segments * self.step_s
+
+    def place(self, stamps_ns: I64, shift_s: float = 0.0) -> Place:
+        """Of stamps (N,), shifted. What lies outside is told by the curve's ends."""
+        t = ((stamps_ns - self.start_ns) * 1e-9 + shift_s) / self.step_s
+        segment = np.clip(np.floor(t).astype(np.int64), 0, self.segments - 1)
+        return Place(segment, np.clip(t - segment, 0.0, 1.0))
+
+    def position(self, at: Place, derivative: int = 0) -> tuple[F64, F64]:
+        """p (N, 3) in the world, or its derivative by time, and the weight (N, 6) of each knot in it."""
+        cumulative = blending(at.u, derivative) / self.step_s**derivative
+        weight = cumulative - np.concatenate([cumulative[:, 1:], np.zeros((len(at.u), 1))], axis=1)
+        knots = self.p[at.segment[:, None] + np.arange(ORDER)]
+        return np.einsum("nk,nki->ni", weight, knots), weight
+
+    def turning(self, at: Place) -> Turning:
+        between = se3.so3_log(self.R[:-1].swapaxes(1, 2) @ self.R[1:])
+        back = np.linalg.inv(se3.so3_right_jacobian(between))
+        pairs = at.segment[:, None] + np.arange(EDGE)
+        share = blending(at.u, 0)[:, 1:, None]
+        pace = blending(at.u, 1)[:, 1:, None, None] / self.step_s
+        step = between[pairs]
+        A = se3.so3_exp(share * step)
+        bent = se3.so3_right_jacobian(share * step) * share[..., None]
+        rate, rate_by = _rates(A, bent, pace, step)
+        after = _after(A)  # what turns follow each
+        by, rate_by = after[:, 1:] @ bent, after[:, 1:] @ rate_by
+        R = self.R[at.segment] @ after[:, 0].swapaxes(1, 2)
+        out = Turning(R, rate, _by_knots(by, back[pairs]), _by_knots(rate_by, back[pairs]))
+        out.by[:, 0] += after[:, 0]
+        return out
+
+
+def _rates(A: F64, bent: F64, pace: F64, step: F64) -> tuple[F64, F64]:
+    """Rate (N, 3), and the derivatives (N, 5, 3, 3) of each turn's rate, where it ends, by its step."""
+    rate, by = np.zeros((len(A), 3)), np.empty_like(A)
+    for j in range(EDGE):
+        carried = (A[:, j].swapaxes(1, 2) @ rate[..., None])[..., 0]
+        by[:, j] = se3.hat(carried) @ bent[:, j] + pace[:, j] * np.eye(3)
+        rate = carried + pace[:, j, 0] * step[:, j]
+    return rate, by
+
+
+def _after(A: F64) -> F64:
+    """(N, 6, 3, 3): transposed products of A[j:] for j = 0 .. 5."""
+    out = np.empty((len(A), ORDER, 3, 3))
+    out[:, EDGE] = np.eye(3)
+    for j in reversed(range(EDGE)):
+        out[:, j] = out[:, j + 1] @ A[:, j].swapaxes(1, 2)
+    return out
+
+
+def _by_knots(by_steps: F64, back: F64) -> F64:
+    """Derivatives (N, 6, 3, 3) by knots from those by the five steps between them."""
+    out = np.zeros((len(back), ORDER, 3, 3))
+    out[:, 1:] = by_steps @ back
+    out[:, :-1] -= by_steps @ back.swapaxes(-1, -2)  # the left Jacobian is the right one's transpose
+    return out

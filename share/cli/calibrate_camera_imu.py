@@ -1,0 +1,192 @@
+"""`share calibrate camera-imu`: where cameras sit on an IMU, and how far their clocks are apart."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from share.cli import options
+from share.cli.progress import Stages
+from share.cli.table import aligned
+from share.errors import DataError, ShareError
+
+if TYPE_CHECKING:
+    from share.calibration.camera_imu.verdict import Comparison
+    from share.geometry.camera import ImuNoise
+    from share.io.camera_imu_report import Outcome
+    from share.io.rig_pictures import RigPictures
+    from share.types import F64
+
+_WORTH = 2.0  # times the stated noise: worth a word
+
+
+@click.command("camera-imu", short_help="Where cameras sit on an IMU, and the offset of their clocks.")
+@click.argument("source")
+@options.target
+@click.option(
+    "--camera", metavar="CALIB.yaml",
+    help="The cameras, by share calibrate camera: a camchain file or a folder with one.",
+)  # fmt: skip
+@click.option(
+    "--imu", metavar="IMU.yaml",
+    help="The IMU's noise, by share calibrate imu: that file or a folder with it.",
+)  # fmt: skip
+@click.option(
+    "--every", type=click.IntRange(1), default=1, show_default=True, metavar="N",
+    help="Look at each N-th picture.",
+)  # fmt: skip
+@click.option(
+    "--within", type=click.FloatRange(0.01, 1.0), default=0.5, show_default=True, metavar="S",
+    help="How far apart the clocks may be, s.",
+)  # fmt: skip
+@options.out_folder
+@options.as_json
+def camera_imu(
+    source: str,
+    target_name: str,
+    camera: str | None,
+    imu: str | None,
+    every: int,
+    within: float,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Find T_cam_imu of each camera and the time offset of camera and IMU, from a minute in which a rig was
+    turned and moved before a calibration board. What is not given is taken from the recording.
+
+    Exit code 1 where the result is not to be believed; the files are written all the same.
+
+    \b
+    Example:  share calibrate camera-imu dance.mcap --target board.yaml --camera calib/mine \\
+                --imu calib/mine --out calib/mine
+    """
+    from share.io import camera_imu_report as report
+    from share.io.camera_imu_chart import residual_png
+    from share.io.files import atomic_write, writable_dir
+    from share.io.json_file import known
+    from share.io.rig_pictures import open_rig_pictures
+    from share.io.stated_noise import stated_noise
+
+    pictures = open_rig_pictures(source, camera)
+    noise = stated_noise(source, imu, "--imu")
+    writable_dir(out)
+    outcome = _calibrated(source, pictures, noise, target_name, every, within)
+    text = json.dumps(known(report.to_json(outcome)), indent=1)
+    verdict = "passed" if outcome.verdict.passed else "FAILED"
+    atomic_write(out / "kalibr_imucam_chain.yaml", report.camchain_text(outcome, source))
+    if imu is None or (out / "kalibr_imu_chain.yaml").resolve() not in _files(imu):
+        atomic_write(out / "kalibr_imu_chain.yaml", report.imu_chain_text(outcome, source))
+    atomic_write(out / "camera-imu-report.json", text + "\n")
+    atomic_write(out / "camera-imu-report.png", residual_png(outcome.fit, f"{source}: {verdict}"))
+    click.echo(text if as_json else _summary(outcome, out))
+    for warning in _warnings(outcome):
+        click.echo(f"share: {source}: {warning}", err=True)
+    if not outcome.verdict.passed:
+        reasons = "; ".join(outcome.verdict.reasons)
+        raise ShareError(f"{source}: not to be believed ({out} is written): {reasons}")
+
+
+def _files(given: str) -> tuple[Path, Path]:
+    """What --imu may mean."""
+    return Path(given).resolve(), (Path(given) / "kalibr_imu_chain.yaml").resolve()
+
+
+def _calibrated(
+    source: str, pictures: RigPictures, noise: ImuNoise, target_name: str, every: int, within: float
+) -> Outcome:
+    from share.calibration.camera_imu.fit import fit
+    from share.calibration.camera_imu.verdict import compare, judge
+    from share.io.camera_imu_report import Outcome
+    from share.io.imu_table import read_imu
+    from share.io.rig_pictures import find_stamped
+    from share.io.target import named_target
+
+    target = named_target(target_name)
+    with Stages() as stages:
+        table = read_imu(source, lambda done, total: stages("reading the IMU", done, total))
+        if not len(table.imu):
+            raise DataError(f"{source}: has no IMU")
+        stamps, views, looked = find_stamped(
+            pictures, target, every, lambda done, total: stages("looking for the board", done, total)
+        )
+        found = fit(
+            stamps, views, target, pictures.rig, table.imu, noise, within,
+            lambda done, total: stages("fitting", done, total),
+        )  # fmt: skip
+    before = None if pictures.before is None else compare(found.T_imu_cam0, pictures.before)
+    return Outcome(found, judge(found), pictures.rig, noise, before, looked, len(views))
+
+
+def _summary(outcome: Outcome, out: Path) -> str:
+    import numpy as np
+
+    from share.geometry import se3
+
+    fit, verdict = outcome.fit, outcome.verdict
+    turn = np.degrees(se3.so3_log(fit.T_imu_cam0[:3, :3]))
+    rows = [
+        ["", "", "x", "y", "z"],
+        ["rotation of cam0", "deg", *_cells(turn, np.degrees(fit.sigma_rotation), 3)],
+        ["position of cam0", "mm", *_cells(fit.T_imu_cam0[:3, 3] * 1e3, fit.sigma_position * 1e3, 2)],
+    ]
+    shift = f"{fit.shift_s * 1e3:+.3f} ± {fit.sigma_shift * 1e3:.3f} ms"
+    lines = [
+        f"{outcome.seen} of {outcome.looked} pictures show the board, {fit.state.curve.end_s:.1f} s",
+        "",
+        aligned(rows),
+        "in the IMU's frame (rotation vector); ± one sigma",
+        "",
+        f"time offset: {shift} (t_imu = t_cam + offset)",
+        *(
+            f"cam{eye}: {rms:.3f} px RMS, {wrong} of {len(r)} corners left out"
+            for eye, (rms, wrong, r) in enumerate(
+                zip(verdict.rms_px, verdict.wrong, fit.corners, strict=True)
+            )
+        ),
+        f"gyroscope: residuals {verdict.gyro:.2f} times its stated noise; turned by "
+        f"{_list(verdict.turning)} rad/s rms",
+        f"accelerometer: {verdict.accel:.2f} times; moved by {_list(verdict.moving)} m/s^2 rms; "
+        f"gravity {np.linalg.norm(fit.state.gravity):.4f} m/s^2",
+        f"{out}: kalibr_imucam_chain.yaml, kalibr_imu_chain.yaml, camera-imu-report.json, "
+        "camera-imu-report.png",
+    ]
+    return "\n".join(lines)
+
+
+def _cells(values: F64, errors: F64, digits: int) -> list[str]:
+    return [f"{v:+.{digits}f} ± {e:.{digits}f}" for v, e in zip(values, errors, strict=True)]
+
+
+def _list(values: F64) -> str:
+    return ", ".join(f"{value:.2f}" for value in values)
+
+
+def _warnings(outcome: Outcome) -> list[str]:
+    """What a person ought to know before believing it: a line each."""
+    verdict = outcome.verdict
+    return _of_given(outcome.before) + [
+        f"{name} errs by {times:.1f} times its stated noise: scale, axes, or the board's size; the sigmas "
+        "take that into account"
+        for name, times in (("gyroscope", verdict.gyro), ("accelerometer", verdict.accel))
+        if times > _WORTH and verdict.passed
+    ]
+
+
+def _of_given(before: Comparison | None) -> list[str]:
+    """How the calibration that was there before compares."""
+    if before is None:
+        return []
+    if before.inverted:
+        return [
+            "the extrinsics that were given are inverted: what stands there as T_cam_imu is T_imu_cam, or "
+            "the other way round; the new file has it right"
+        ]
+    if before.far:
+        return [
+            f"cam0 sits {before.shifted_mm:.0f} mm and {before.turned_deg:.1f} deg from where the given "
+            "calibration has it"
+        ]
+    return []

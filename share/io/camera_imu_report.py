@@ -1,0 +1,103 @@
+"""What `share calibrate camera-imu` leaves behind: Kalibr's chains, a report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import yaml
+
+from share.calibration.camera_imu.fit import Fit
+from share.calibration.camera_imu.verdict import Comparison, Verdict
+from share.geometry import se3
+from share.geometry.camera import ImuNoise, Rig
+from share.io.kalibr import to_kalibr
+from share.types import F64
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """All that is told of one calibration. rig: the cameras as they were known; before: how T_imu_cam0 that
+    was given compares; looked, seen: pictures, and those that show the board."""
+
+    fit: Fit
+    verdict: Verdict
+    rig: Rig
+    noise: ImuNoise
+    before: Comparison | None
+    looked: int
+    seen: int
+
+    @property
+    def calibrated(self) -> Rig:
+        return replace(
+            self.rig, T_body_cam0=self.fit.T_imu_cam0, timeshift_s=self.fit.shift_s, imu=self.noise
+        )
+
+    @property
+    def T_cam_imu(self) -> tuple[F64, ...]:
+        """(4, 4) of each camera."""
+        T = se3.inverse(self.fit.T_imu_cam0)
+        return tuple(mount @ T for mount in self.fit.sights.mounts)
+
+
+def camchain_text(outcome: Outcome, source: str) -> str:
+    """Kalibr's camchain-imucam: intrinsics as they were, T_cam_imu and timeshift_cam_imu of each camera."""
+    chain = to_kalibr(outcome.calibrated)
+    del chain["imu0"]
+    for eye, T in enumerate(outcome.T_cam_imu):
+        chain[f"cam{eye}"] |= {"T_cam_imu": T.tolist(), "timeshift_cam_imu": outcome.fit.shift_s}
+    verdict = "passed" if outcome.verdict.passed else "FAILED, see camera-imu-report.json"
+    head = f"# share calibrate camera-imu {source}: {verdict}\n# t_imu = t_cam + timeshift_cam_imu\n"
+    return head + yaml.safe_dump(chain, sort_keys=False, default_flow_style=None)
+
+
+def imu_chain_text(outcome: Outcome, source: str) -> str:
+    """The IMU's noise as it was given, so that the folder is whole."""
+    chain = {"imu0": to_kalibr(outcome.calibrated)["imu0"]}
+    return f"# as given to share calibrate camera-imu {source}\n" + yaml.safe_dump(chain, sort_keys=False)
+
+
+def to_json(outcome: Outcome) -> dict[str, Any]:
+    """Plain data."""
+    fit, verdict, before = outcome.fit, outcome.verdict, outcome.before
+    return {
+        "passed": verdict.passed,
+        "reasons": list(verdict.reasons),
+        "pictures": outcome.looked,
+        "pictures_with_target": outcome.seen,
+        "seconds": fit.state.curve.end_s,
+        "T_cam_imu": [T.tolist() for T in outcome.T_cam_imu],
+        "T_imu_cam0": fit.T_imu_cam0.tolist(),
+        "timeshift_cam_imu": fit.shift_s,
+        "sigmas": {
+            "rotation_rad": fit.sigma_rotation.tolist(),
+            "position_m": fit.sigma_position.tolist(),
+            "timeshift_s": fit.sigma_shift,
+        },
+        "covariance": fit.covariance.tolist(),
+        "gravity": fit.state.gravity.tolist(),
+        "gravity_norm": float(np.linalg.norm(fit.state.gravity)),
+        "gyro_bias": fit.state.biases[:, :3].mean(axis=0).tolist(),
+        "accel_bias": fit.state.biases[:, 3:].mean(axis=0).tolist(),
+        "turning_rms": verdict.turning.tolist(),
+        "moving_rms": verdict.moving.tolist(),
+        "residuals": _residuals(outcome),
+        "began": {"timeshift_cam_imu": fit.began.shift_s, "correlation": fit.began.correlation},
+        "given": None if before is None else vars(before) | {"far": before.far},
+    }
+
+
+def _residuals(outcome: Outcome) -> dict[str, Any]:
+    fit, verdict = outcome.fit, outcome.verdict
+    cameras = [
+        {"rms_px": rms, "corners": len(r), "corners_left_out": wrong}
+        for rms, r, wrong in zip(verdict.rms_px, fit.corners, verdict.wrong, strict=True)
+    ]
+    rows = (("gyro", fit.gyro, fit.stated.gyro), ("accel", fit.accel, fit.stated.accel))
+    inertial = {
+        name: {"rms": np.sqrt((r**2).mean(axis=0)).tolist(), "stated": stated, "samples": len(r)}
+        for name, r, stated in rows
+    }
+    return {"cameras": cameras, "corner_sigma_px": fit.sigmas.px} | inertial

@@ -1,0 +1,94 @@
+"""Pictures of a calibration target with their stamps, from a recording whose cameras are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from share.calibration.bundle import View
+from share.core.measurement import CAM0, CAM1
+from share.errors import DataError, UsageError
+from share.geometry.camera import Camera, Rig
+from share.geometry.target import Target
+from share.io.board_views import Pictures, find_views, open_pictures
+from share.io.calibration import CAMCHAIN, kalibr_T_imu_cam
+from share.io.section import read_yaml
+from share.types import F64, I64
+
+
+@dataclass(frozen=True, eq=False)
+class RigPictures:
+    """rig: the cameras; before: T_imu_cam0 (4, 4) as it was given, if it was."""
+
+    name: str
+    pictures: Pictures
+    rig: Rig
+    before: F64 | None
+
+
+def open_rig_pictures(source: str, camera: str | None) -> RigPictures:
+    """Of a recording, or a folder with cam0/STAMP.png. camera: a camchain or a folder with one, in place
+    of the source's own. Raises UsageError, ConfigError or DataError."""
+    chain = None if camera is None else _chain(camera)
+    first = open_pictures(source, (CAM0,), None if chain is None else str(chain))
+    if first.rig is None:
+        raise UsageError(f"{source}: does not say what its cameras are like; give --camera FILE")
+    eyes = (CAM0, CAM1) if first.rig.cam1 is not None else (CAM0,)
+    pictures = open_pictures(source, eyes, None if chain is None else str(chain)) if len(eyes) > 1 else first
+    own = first.rig.T_body_cam0 if first.rig.imu is not None else None
+    return RigPictures(source, pictures, first.rig, own if chain is None else _given(chain))
+
+
+def _chain(camera: str) -> Path:
+    """The file alone: with the IMU's beside it, a reader asks for extrinsics that are yet to be found."""
+    path = Path(camera) / CAMCHAIN if Path(camera).is_dir() else Path(camera)
+    if not path.is_file():
+        raise UsageError(f"--camera {camera}: no such file, or no {CAMCHAIN} in it")
+    return path
+
+
+def _given(chain: Path) -> F64 | None:
+    top = read_yaml(chain)
+    cam0 = top.section("cam0") if "cam0" in top else top
+    return kalibr_T_imu_cam(cam0) if {"T_cam_imu", "T_imu_cam"} & cam0.data.keys() else None
+
+
+def find_stamped(
+    source: RigPictures, target: Target, every: int, told: Callable[[int, int], None]
+) -> tuple[I64, list[View], int]:
+    """Stamps (F,) ns rising and views with at least one corner; how many pictures were looked at.
+
+    told: how many are done, of how many. Raises DataError.
+    """
+    done = 0
+
+    def more(count: int) -> None:
+        nonlocal done
+        done += count
+        told(done, source.pictures.count)
+
+    views, sizes = find_views(source.pictures, target, every, more)
+    cameras = [camera for camera in (source.rig.cam0, source.rig.cam1) if camera is not None]
+    for eye, (size, camera) in enumerate(zip(sizes, cameras, strict=False)):
+        _same_size(source.name, eye, size, camera)
+    seen = [view for view in views if any(len(one) for one in view.seen)]
+    if not seen:
+        raise DataError(
+            f"{source.name}: no board in {len(views)} pictures; is --target the board that was shown?"
+        )
+    if not all(view.name.isdecimal() for view in seen):
+        raise DataError(f"{source.name}: pictures without stamps; name them cam0/STAMP.png, STAMP in ns")
+    stamps = np.array([int(view.name) for view in seen], np.int64)
+    later = stamps > np.maximum.accumulate(np.concatenate([[-(2**62)], stamps[:-1]]))
+    return stamps[later], [view for view, keep in zip(seen, later, strict=True) if keep], len(views)
+
+
+def _same_size(name: str, eye: int, size: tuple[int, int], camera: Camera) -> None:
+    if size != (camera.width, camera.height):
+        raise DataError(
+            f"{name}: cam{eye}'s pictures are {size[0]}x{size[1]}, its calibration is of "
+            f"{camera.width}x{camera.height}; calibrate it as it records"
+        )
