@@ -31,7 +31,7 @@ def commands(group: click.Group, name: str = "share") -> dict[str, click.Command
 
 def documented() -> dict[str, str]:
     """The sections of docs/commands.md that are about one command, by its full name."""
-    parts = re.split(r"^## `(share [a-z ]+)`\n", COMMANDS, flags=re.MULTILINE)[1:]
+    parts = re.split(r"^## `(share [a-z -]+)`\n", COMMANDS, flags=re.MULTILINE)[1:]
     return dict(zip(parts[::2], parts[1::2], strict=True))
 
 
