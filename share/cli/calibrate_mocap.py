@@ -45,13 +45,7 @@ if TYPE_CHECKING:
     metavar="S",
     help="How far apart the clocks may be, s.",
 )
-@click.option(
-    "--sigma-mm",
-    type=click.FloatRange(min=0.01),
-    default=2.0,
-    show_default=True,
-    help="Noise of the motion capture.",
-)
+@options.sigma_mm
 @options.out_folder
 @options.as_json
 def mocap(

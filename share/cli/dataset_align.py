@@ -71,13 +71,7 @@ _LEFT = ("left mm", "left deg", "doubted %", "gaps", "truth s")
     metavar="S",
     help="How far apart the clocks may be, s.  [default: as far as they like]",
 )
-@click.option(
-    "--sigma-mm",
-    type=click.FloatRange(min=0.01),
-    default=2.0,
-    show_default=True,
-    help="Noise of the motion capture.",
-)
+@options.sigma_mm
 @click.option(
     "--bridge",
     type=click.FloatRange(0.1, 2),

@@ -32,6 +32,13 @@ target = click.option(
     "--target", "target_name", required=True, metavar="T",
     help="The board: aprilgrid or charuco of the usual sizes, or its YAML file.",
 )  # fmt: skip
+sigma_mm = click.option(
+    "--sigma-mm",
+    type=click.FloatRange(min=0.01),
+    default=2.0,
+    show_default=True,
+    help="Noise of the motion capture.",
+)
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from share.errors import MisfitError
 from share.geometry import se3
+from share.geometry.peak import between_steps
 from share.mocap.mocap import Mocap
 from share.mocap.preintegrate import preintegrate
 from share.types import F64, I64, ImuBatch
@@ -64,7 +65,7 @@ def find_offset(imu: ImuBatch, mocap: Mocap, within_s: float | None) -> Peak:
         )
     known = _evidence(score, count)
     best = int(np.where(score >= _LEAST_CORRELATION, known, -1.0).argmax())
-    offset_ns = int(offsets[best] + round(_peak(score, best) * _STEP_NS))
+    offset_ns = int(offsets[best] + round(between_steps(score, best) * _STEP_NS))
     rival = _rival(score, known, best)
     if rival is None:
         return Peak(offset_ns, float(score[best]), 0.0, float(known[best]))
@@ -129,12 +130,3 @@ def _masked_correlation(a: F64, a_ok: F64, b: F64, b_ok: F64) -> tuple[F64, F64]
     var_b = np.maximum(correlate(a_ok, b**2) - sum_b**2 / n, 1e-12)
     score = (correlate(a, b) - sum_a * sum_b / n) / np.sqrt(var_a * var_b)
     return np.where(enough, score, -1.0), n
-
-
-def _peak(score: F64, i: int) -> float:
-    """Top of the parabola through three scores, in steps from the middle one."""
-    if not 0 < i < len(score) - 1:
-        return 0.0
-    left, middle, right = score[i - 1 : i + 2]
-    bend = left - 2 * middle + right
-    return float(np.clip((left - right) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0

@@ -21,6 +21,7 @@ from share.errors import DataError, MisfitError
 from share.geometry import se3
 from share.geometry.align import rotation
 from share.geometry.camera import Camera
+from share.geometry.peak import between_steps
 from share.geometry.target import Target
 from share.types import F64, I64, ImuBatch
 
@@ -102,7 +103,7 @@ def align(stamps_ns: I64, T: F64, imu: ImuBatch, within_s: float) -> Alignment:
             f"camera and IMU turn nowhere alike (correlation {score[best]:.2f} of {_LEAST_CORRELATION} "
             f"needed, clocks up to {within_s:g} s apart): are both of one device, and the IMU in rad/s?"
         )
-    shift = float(lags[best] + _peak(score, best) * _LAG_S)
+    shift = float(lags[best] + between_steps(score, best) * _LAG_S)
     gyro = turned.rates(*ends, shift)
     correlation, R = _likeness(rates, gyro)
     return Alignment(shift, R, gyro.mean(axis=0) - R @ rates.mean(axis=0), correlation)
@@ -129,15 +130,6 @@ def _likeness(camera: F64, gyro: F64) -> tuple[float, F64]:
     a, b = camera - camera.mean(axis=0), gyro - gyro.mean(axis=0)
     R = rotation(b.T @ a)
     return float((b * (a @ R.T)).sum() / np.sqrt((a * a).sum() * (b * b).sum() + 1e-300)), R
-
-
-def _peak(score: F64, i: int) -> float:
-    """Top of the parabola through three scores, in steps from the middle one."""
-    if not 0 < i < len(score) - 1:
-        return 0.0
-    left, middle, right = score[i - 1 : i + 2]
-    bend = left - 2 * middle + right
-    return float(np.clip((left - right) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0
 
 
 def first_state(stamps_ns: I64, T: F64, imu: ImuBatch, found: Alignment) -> State:
