@@ -28,6 +28,13 @@ keys = click.option(
 out_folder = click.option(
     "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Where the files go."
 )
+rotations = click.option(
+    "--rotations",
+    type=click.Choice(["helical", "xyz"]),
+    default="helical",
+    show_default=True,
+    help="What RX, RY, RZ of Vicon's CSV are, where there is no RW.",
+)
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
 
 

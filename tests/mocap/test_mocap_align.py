@@ -65,6 +65,28 @@ def test_a_long_hole_stays_a_gap_and_a_short_one_is_left_to_the_imu(done) -> Non
     assert found.seconds == pytest.approx(20 - 0.6 - 1.5, abs=0.1)
 
 
+def test_nothing_is_made_up_at_the_edges_of_a_hole_that_breaks_the_path() -> None:
+    """12 s: too long even for the fit to integrate across."""
+    motion = Motion(3)
+    found = align(
+        record_imu(motion, 40), NOISE, record_mocap(motion, 40, AWAY_NS, gaps=((14, 26),)), ANYWHERE
+    )
+    t = (found.stamps_ns - START_NS) * 1e-9
+    assert not ((t > 14.05) & (t < 25.95)).any() and found.seconds == pytest.approx(40 - 0.6 - 12, abs=0.3)
+    off = found.truth(found.fit.R_mocap_world)[:, :3, 3] - motion.pose(t)[:, :3, 3]
+    assert np.linalg.norm(off, axis=1).max() < 0.008
+
+
+def test_the_motion_captures_z_need_not_be_up() -> None:
+    motion = Motion(3)
+    mocap = record_mocap(motion, 12, AWAY_NS)
+    lying = Mocap(mocap.stamps_ns, se3.exp(np.array([-np.pi / 2, 0, 0, 0, 0, 0])) @ mocap.T)
+    found = align(record_imu(motion, 12), NOISE, lying, ANYWHERE)
+    height = found.truth(found.fit.R_mocap_world)[:, 2, 3]
+    true = motion.pose((found.stamps_ns - START_NS) * 1e-9)[:, 2, 3]
+    assert np.abs(height - true).max() < 0.01
+
+
 def test_a_motion_that_repeats_itself_is_refused() -> None:
     imu, mocap = record_imu(Pacing(), 40), record_mocap(Pacing(), 40, AWAY_NS)
     part = mocap.between(int(mocap.stamps_ns[0]) + 12 * 10**9, int(mocap.stamps_ns[0]) + 24 * 10**9)
