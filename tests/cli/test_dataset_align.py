@@ -23,7 +23,7 @@ from share.io.source import open_source
 from share.io.trajectory import Trajectory, read_tum
 from share.metrics.ate import ate, joint_ate
 
-SECONDS = 14.0
+SECONDS = 12.0
 WATCHED = {
     "ann": Watched(se3.exp(np.array([0.3, -2.1, 0.7, 0.04, -0.09, 0.06])), 0, ((5.0, 5.3), (8.0, 9.5))),
     "bob": Watched(se3.exp(np.array([1.2, 0.4, -0.3, -0.08, 0.02, 0.1])), -123_456_789_012_345),
@@ -71,7 +71,7 @@ def made(share, room) -> Path:
             "dataset", "align", *room.recordings, "--mocap", room.folder / "vicon.csv", *told, "--out", out
         )
         assert done.code == 0
-        assert all("the motion tells the body to" in line for line in done.err.splitlines())  # 14 s are few
+        assert all("the motion tells the body to" in line for line in done.err.splitlines())  # 12 s are few
         assert json.loads(done.out) == read_json(out / "align.json")
     return out
 
@@ -136,7 +136,7 @@ def test_it_is_played_and_scored_as_with_the_real_truth(share, room, made, tmp_p
     agents = {one["agent"]: one for one in json.loads(done.out)["runs"][0]["agents"]}
     assert list(agents) == list(WATCHED)
     for name, one in agents.items():
-        assert one["frames"] == SECONDS * RATE_HZ and one["tracked"] > 80
+        assert one["frames"] == SECONDS * RATE_HZ and one["tracked"] > 60
         poses = read_tum(run / name / "odom.tum")
         real_cm = 100 * ate(poses, room.truth(name, poses)).rmse
         assert one["odom_ate_cm"] == pytest.approx(real_cm, abs=0.2)
