@@ -27,8 +27,10 @@ if TYPE_CHECKING:
     required=True,
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="What the motion capture saw: TUM, or CSV with t[ns], x y z, qw qx qy qz.",
+    help="What the motion capture saw: Vicon's CSV, TUM, or CSV with t[ns], x y z, qw qx qy qz.",
 )
+@click.option("--body", metavar="BODY", help="Which rigid body of Vicon's CSV.  [default: the only one]")
+@options.rotations
 @options.calib
 @click.option(
     "--track",
@@ -51,6 +53,8 @@ if TYPE_CHECKING:
 def mocap(
     source: str,
     truth: Path,
+    body: str | None,
+    rotations: str,
     calib: str | None,
     track: Path | None,
     one_clock: bool,
@@ -68,7 +72,7 @@ def mocap(
     from share.io.files import atomic_write, writable_dir
     from share.io.imu_table import read_imu
     from share.io.json_file import known
-    from share.io.mocap_file import read_mocap
+    from share.io.mocap_file import pick_body, read_bodies
     from share.io.mocap_report import mocap_json, mocap_text
     from share.io.stated_noise import stated_noise
     from share.mocap.fit import fit
@@ -78,7 +82,8 @@ def mocap(
     chosen = FitOptions(sigma_position=sigma_mm * 1e-3, within_s=within)
     if one_clock:
         chosen = replace(chosen, within_s=0.0, offset_sigma=1e-5, drift_sigma=1e-8)
-    noise, seen = stated_noise(source, calib, "--calib"), read_mocap(truth)
+    noise, bodies = stated_noise(source, calib, "--calib"), read_bodies(truth, rotations)
+    seen = bodies[pick_body(str(truth), list(bodies), body, Path(source).stem, "--body BODY")]
     writable_dir(out)
     with Stages() as stages:
         table = read_imu(source, lambda done, total: stages("reading", done, total))

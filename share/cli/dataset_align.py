@@ -38,7 +38,7 @@ _LEFT = ("left mm", "left deg", "doubted %", "gaps", "truth s")
     "--body",
     "bodies",
     multiple=True,
-    metavar="NAME=BODY",
+    metavar="[NAME=]BODY",
     help="Which rigid body a device is.  [default: the one of its name, or the only one]",
 )
 @click.option(
@@ -55,16 +55,10 @@ _LEFT = ("left mm", "left deg", "doubted %", "gaps", "truth s")
     "--mounting",
     "mountings",
     multiple=True,
-    metavar="NAME=DIR",
+    metavar="[NAME=]DIR",
     help="By share calibrate mocap: how a body sits on a device that turns about one axis only.",
 )
-@click.option(
-    "--rotations",
-    type=click.Choice(["helical", "xyz"]),
-    default="helical",
-    show_default=True,
-    help="What RX, RY, RZ of Vicon's CSV are, where there is no RW.",
-)
+@options.rotations
 @click.option(
     "--within",
     type=click.FloatRange(min=0.01),
@@ -165,7 +159,7 @@ def _bodies(
     names: dict[str, str], files: dict[str, str], bodies: dict[str, str], rotations: str
 ) -> dict[str, tuple[str, Mocap]]:
     """By device: file and body for a person, and what the motion capture saw of it."""
-    from share.io.mocap_file import read_bodies
+    from share.io.mocap_file import pick_body, read_bodies
 
     read = {file: read_bodies(Path(file), rotations) for file in dict.fromkeys(files.values())}
     out = {}
@@ -173,20 +167,10 @@ def _bodies(
         file = files.get(name, files.get("", ""))
         if not file:
             raise UsageError(f"{name}: has no motion capture; give --mocap {name}=FILE, or FILE for all")
-        body = _body(name, file, list(read[file]), bodies.get(name))
+        wanted = bodies.get(name, bodies.get(""))
+        body = pick_body(file, list(read[file]), wanted, name, f"--body {name}=BODY")
         out[name] = (f"{file} {body}".strip(), read[file][body])
     return out
-
-
-def _body(name: str, file: str, there: list[str], wanted: str | None) -> str:
-    alike = [body for body in there if body.lower() == (wanted or name).lower()]
-    if alike:
-        return alike[0]
-    if wanted is None and len(there) == 1:
-        return there[0]
-    listed = ", ".join(there) if any(there) else "one without a name"
-    what = f"body '{wanted}'" if wanted else f"body for '{name}' (give --body {name}=BODY)"
-    raise UsageError(f"{file}: has no {what}; it has {listed}")
 
 
 def _device(

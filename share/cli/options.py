@@ -39,6 +39,13 @@ sigma_mm = click.option(
     show_default=True,
     help="Noise of the motion capture.",
 )
+rotations = click.option(
+    "--rotations",
+    type=click.Choice(["helical", "xyz"]),
+    default="helical",
+    show_default=True,
+    help="What RX, RY, RZ of Vicon's CSV are, where there is no RW.",
+)
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
 
 

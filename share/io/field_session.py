@@ -54,9 +54,9 @@ def write_session(folder: Path, devices: Mapping[str, Device], told: Told) -> di
     for name, device in devices.items():
         _record(device, folder / f"{name}.mcap", told)
         atomic_write(folder / "truth" / f"{name}.tum", format_tum(truths[name]))
-    found = {name: found_of(device) for name, device in devices.items()}
+    found: dict[str, Any] = known({name: found_of(device) for name, device in devices.items()})
     draw_alignment(folder / PICTURE, {name: (d.aligned, truths[name]) for name, d in devices.items()})
-    atomic_write(folder / REPORT, json.dumps(known(found), indent=1) + "\n")
+    atomic_write(folder / REPORT, json.dumps(found, indent=1) + "\n")
     atomic_write(folder / SESSION, _description(devices, found))
     return found
 

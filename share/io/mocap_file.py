@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from share.errors import DataError, UsageError
@@ -37,3 +38,16 @@ def read_bodies(path: Path, rotations: str = "helical") -> dict[str, Mocap]:
     if path.is_file() and path.suffix.lower() == ".csv" and is_vicon(path):
         return read_vicon(path, rotations)
     return {"": read_mocap(path)}
+
+
+def pick_body(file: str, there: Sequence[str], wanted: str | None, device: str, option: str) -> str:
+    """Which of the bodies in a file a device is: the one wanted, else the one of the device's name, else the
+    only one. option: how a person may say which. Raises UsageError."""
+    alike = [body for body in there if body.lower() == (device if wanted is None else wanted).lower()]
+    if alike:
+        return alike[0]
+    if wanted is None and len(there) == 1:
+        return there[0]
+    listed = ", ".join(there) if any(there) else "one without a name"
+    what = f"body for '{device}' (give {option})" if wanted is None else f"body '{wanted}'"
+    raise UsageError(f"{file}: has no {what}; it has {listed}")

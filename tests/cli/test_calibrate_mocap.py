@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from field_sim import RATE_HZ, export
 from mocap_sim import BODY, NOISE, START_NS, TILT, Motion, record_imu, record_mocap, stamps
 
 from share.geometry import se3
@@ -76,6 +77,18 @@ def test_body_tilt_and_clock_are_found_and_the_track_agrees(share, room, tmp_pat
 def test_csv_and_tum_are_read_alike(room):
     tum, csv = read_mocap(room / "mocap.tum"), read_mocap(room / "mocap.csv")
     assert np.array_equal(tum.stamps_ns, csv.stamps_ns) and np.allclose(tum.T, csv.T, atol=1e-8)
+
+
+def test_a_body_of_vicons_export_is_found_by_another_clock(share, room, tmp_path):
+    """Its clock counts frames from nought; another body is in the file."""
+    mine, other = (record_mocap(Motion(seed), 14, LATE_NS, hz=RATE_HZ).T for seed in (1, 4))
+    export(tmp_path / "vicon.csv", {"Hat": other, "Mine": mine}, quaternions=True)
+    told = found(room, tmp_path / "vicon.csv", "--within", "1e10", "--out", tmp_path / "out")
+    refused = share(*told)
+    assert refused.code == 2 and "give --body BODY); it has Hat, Mine" in refused.err
+    assert share(*told, "--body", "Mine").code == 0
+    turned, shifted = error_of(read_yaml(tmp_path / "out" / "mocap.yaml").pose("T_body_mocap"))
+    assert turned < 0.05 and shifted < 0.0015
 
 
 def test_a_track_of_another_motion_does_not_agree(share, room, tmp_path):

@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from field_sim import Watched, export, offset_of, paths, reclocked, seen
-from small_session import small_profile, small_recipe
+from small_session import RATE_HZ, small_profile, small_recipe
 
 from share.emulate.session import make_session
 from share.geometry import se3
@@ -21,7 +23,7 @@ from share.io.source import open_source
 from share.io.trajectory import Trajectory, read_tum
 from share.metrics.ate import ate, joint_ate
 
-SECONDS = 14.0
+SECONDS = 12.0
 WATCHED = {
     "ann": Watched(se3.exp(np.array([0.3, -2.1, 0.7, 0.04, -0.09, 0.06])), 0, ((5.0, 5.3), (8.0, 9.5))),
     "bob": Watched(se3.exp(np.array([1.2, 0.4, -0.3, -0.08, 0.02, 0.1])), -123_456_789_012_345),
@@ -69,7 +71,7 @@ def made(share, room) -> Path:
             "dataset", "align", *room.recordings, "--mocap", room.folder / "vicon.csv", *told, "--out", out
         )
         assert done.code == 0
-        assert all("the motion tells the body to" in line for line in done.err.splitlines())  # 14 s are few
+        assert all("the motion tells the body to" in line for line in done.err.splitlines())  # 12 s are few
         assert json.loads(done.out) == read_json(out / "align.json")
     return out
 
@@ -121,15 +123,20 @@ def test_the_session_is_as_others_are(room, made):
 
 def test_it_is_played_and_scored_as_with_the_real_truth(share, room, made, tmp_path):
     """The errors that are told differ from those of the same poses against the real truth by what the truths
-    differ."""
-    run = tmp_path / "run"
-    assert share("evaluate", "run", made, "--virtual", "--out", run).code == 0
+    differ. bob comes 3 s later: it lasts until he is through."""
+    run, session = tmp_path / "run", tmp_path / "session"
+    shutil.copytree(made, session)
+    plain = yaml.safe_load((session / "session.yaml").read_text())
+    plain["agents"]["bob"]["clock_offset_ns"] -= 3 * 10**9
+    (session / "session.yaml").write_text(yaml.safe_dump(plain))
+    assert share("evaluate", "run", session, "--virtual", "--out", run).code == 0
+    assert read_json(run / "run.json")["seconds"] == pytest.approx(SECONDS + 3, abs=0.2)
     done = share("evaluate", "score", run, "--json")
     assert done.code == 0
     agents = {one["agent"]: one for one in json.loads(done.out)["runs"][0]["agents"]}
     assert list(agents) == list(WATCHED)
     for name, one in agents.items():
-        assert one["tracked"] > 80
+        assert one["frames"] == SECONDS * RATE_HZ and one["tracked"] > 60
         poses = read_tum(run / name / "odom.tum")
         real_cm = 100 * ate(poses, room.truth(name, poses)).rmse
         assert one["odom_ate_cm"] == pytest.approx(real_cm, abs=0.2)
@@ -151,6 +158,31 @@ def test_an_euroc_folder_is_written_anew(share, room, tmp_path):
     ]
     own = read_tum(tmp_path / "one" / "truth" / "bob.tum")
     assert np.abs(own.stamps_ns - read_tum(room.session / "truth" / "bob.tum").stamps_ns[0]).min() < 10**7
+
+
+@pytest.mark.slow
+def test_a_calibration_of_ones_own_and_a_known_mounting_are_used(share, room, tmp_path):
+    """The recording is written anew with the one, and the body stays where the other says."""
+    chains = yaml.safe_load((room.session / "session.yaml").read_text())["agents"]["bob"]["calibration"]
+    imu = {"imu0": chains.pop("imu0")}
+    chains["cam0"]["intrinsics"][0] = 97.0
+    (tmp_path / "kalibr_imucam_chain.yaml").write_text(yaml.safe_dump(chains))
+    (tmp_path / "kalibr_imu_chain.yaml").write_text(yaml.safe_dump(imu))
+    T = WATCHED["bob"].T_body_mocap
+    sigma = "{rotation_deg: [0.005, 0.005, 0.005], position_m: [0.0001, 0.0001, 0.0001]}"
+    (tmp_path / "mocap.yaml").write_text(f"T_body_mocap: {T.tolist()}\nsigma: {sigma}\n")
+    told = ("--mocap", room.folder / "vicon.csv", "--calib", tmp_path, "--mounting", f"bob={tmp_path}")
+    done = share("dataset", "align", room.recordings[1], *told, "--json", "--out", tmp_path / "made")
+    assert (done.code, done.err) == (0, "")
+    found = json.loads(done.out)["bob"]
+    np.testing.assert_allclose(found["T_body_mocap"], T, atol=5e-4)
+    assert found["body_shifted_sigma_mm"] < 0.5
+    made, was = tmp_path / "made" / "bob.mcap", room.folder / "bob.mcap"
+    assert not os.path.samefile(made, was) and open_source(str(made)).rig.cam0.fx == 97.0
+    assert all(
+        np.array_equal(stamps, open_source(str(was)).stamps()[stream])
+        for stream, stamps in open_source(str(made)).stamps().items()
+    )
 
 
 def test_wrong_use_is_one_line_and_leaves_nothing(share, room, tmp_path):
