@@ -15,7 +15,7 @@ install: .venv/installed
 demo: install
 	$(BIN)/share demo
 test: install
-	$(BIN)/pytest -n auto --dist loadfile --ignore tests/run
+	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile --ignore tests/run
 	$(BIN)/pytest tests/run  # real processes in real time: with the cores to themselves
 slow: install
 	$(BIN)/pytest -m slow || test $$? -eq 5  # 5: none selected
