@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from share.calibration import start
+from share.calibration.corners import spread
 from share.calibration.detect import Detection
 from share.calibration.projection import INTRINSICS, camera_of, intrinsics, moved, project
 from share.geometry import se3
@@ -24,7 +25,6 @@ from share.types import F64
 LEAST_VIEWS = 4
 _ROUNDS = 60
 _HUBER = 2.5  # times the residuals' own spread
-_LEAST_SPREAD = 0.01  # px: below this corners are not found, whatever the residuals say
 _STILL = 1e-9  # relative fall of the cost at which it has arrived
 
 
@@ -168,14 +168,9 @@ def _solve(views: Sequence[View], target: Target, state: State, cameras_fixed: b
     """Levenberg-Marquardt; the spread that Huber's weights go by is fixed in each of three runs."""
     for _ in range(3):
         blocks = [_block(state, view, k, target) for k, view in enumerate(views)]
-        spread = _spread(np.concatenate([r for r, _ in blocks]))
-        state = _descend(views, target, state, _HUBER * spread, cameras_fixed)
-    return _solution(views, target, state, _HUBER * spread)
-
-
-def _spread(residuals: F64) -> float:
-    """Of one coordinate, px, by the median distance: 1.1774 sigma of two normal ones."""
-    return max(float(np.median(np.linalg.norm(residuals, axis=1))) / 1.1774, _LEAST_SPREAD)
+        limit = _HUBER * spread(np.concatenate([r for r, _ in blocks]))
+        state = _descend(views, target, state, limit, cameras_fixed)
+    return _solution(views, target, state, limit)
 
 
 def _descend(views: Sequence[View], target: Target, state: State, limit: float, fixed: bool) -> State:
@@ -213,17 +208,30 @@ def _normal(block: tuple[F64, F64], limit: float) -> tuple[F64, F64]:
 
 def _step(blocks: list[tuple[F64, F64]], limit: float, damping: float, fixed: bool) -> tuple[F64, F64]:
     """Of the shared parameters (S,) and of the poses (V, 6)."""
-    H, g = (np.stack(parts) for parts in zip(*(_normal(b, limit) for b in blocks), strict=True))
+    H, g = _normals(blocks, limit)
     S = H.shape[1] - 6
-    Hss, gs = H[:, :S, :S].sum(axis=0), g[:, :S].sum(axis=0)
-    Hss = Hss + damping * np.diag(np.diag(Hss))
-    Hpp = H[:, S:, S:] + damping * H[:, S:, S:] * np.eye(6)
-    back = np.linalg.solve(Hpp, np.concatenate([H[:, S:, :S], g[:, S:, None]], axis=2))
+    told, back = _eliminated(H, g, damping)
     if fixed:
         return np.zeros(S), back[..., -1]
-    Y = np.einsum("vsp,vpk->sk", H[:, :S, S:], back)
-    shared = np.linalg.solve(Hss - Y[:, :S], gs - Y[:, S])
+    whole = told.sum(axis=0)
+    held = damping * np.diag(np.diag(H[:, :S, :S].sum(axis=0)))
+    shared = np.linalg.solve(whole[:, :S] + held, whole[:, S])
     return shared, back[..., -1] - back[..., :S] @ shared
+
+
+def _normals(blocks: list[tuple[F64, F64]], limit: float) -> tuple[F64, F64]:
+    """`_normal` of each view: H (V, S + 6, S + 6) and g (V, S + 6)."""
+    H, g = zip(*(_normal(block, limit) for block in blocks), strict=True)
+    return np.stack(H), np.stack(g)
+
+
+def _eliminated(H: F64, g: F64, damping: float) -> tuple[F64, F64]:
+    """What each view tells of the shared parameters, its pose left free: H and g beside it, (V, S, S + 1);
+    and by how much its pose follows them, with where it goes by itself, (V, 6, S + 1)."""
+    S = H.shape[1] - 6
+    Hpp = H[:, S:, S:] * (1 + damping * np.eye(6))
+    back = np.linalg.solve(Hpp, np.concatenate([H[:, S:, :S], g[:, S:, None]], axis=2))
+    return np.concatenate([H[:, :S, :S], g[:, :S, None]], axis=2) - H[:, :S, S:] @ back, back
 
 
 def _moved(state: State, shared: F64, poses: F64) -> State | None:
@@ -241,14 +249,11 @@ def _moved(state: State, shared: F64, poses: F64) -> State | None:
 
 def _solution(views: Sequence[View], target: Target, state: State, limit: float) -> Solution:
     blocks = [_block(state, view, k, target) for k, view in enumerate(views)]
-    H, g = (np.stack(parts) for parts in zip(*(_normal(b, limit) for b in blocks), strict=True))
-    S = _shared(len(state.cameras))
-    back = np.linalg.solve(H[:, S:, S:], np.concatenate([H[:, S:, :S], g[:, S:, None]], axis=2))
-    told = np.concatenate([H[:, :S, :S], g[:, :S, None]], axis=2) - H[:, :S, S:] @ back
-    spread = _spread(np.concatenate([r for r, _ in blocks]))
-    covariance = spread**2 * np.linalg.inv(told[:, :, :S].sum(axis=0))
-    by_views = _jackknife(told[:, :, :S], told[:, :, S])
-    return Solution(state, covariance, by_views, errors(state, views, target), spread)
+    told, _ = _eliminated(*_normals(blocks, limit), damping=0.0)
+    sigma_px = spread(np.concatenate([r for r, _ in blocks]))
+    H, g = told[..., :-1], told[..., -1]
+    covariance = sigma_px**2 * np.linalg.inv(H.sum(axis=0))
+    return Solution(state, covariance, _jackknife(H, g), errors(state, views, target), sigma_px)
 
 
 def _jackknife(H: F64, g: F64) -> F64:

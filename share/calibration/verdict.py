@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from share.calibration import corners
 from share.calibration.bundle import LEAST_VIEWS, Solution
 from share.calibration.coverage import Coverage
 from share.calibration.projection import INTRINSICS, intrinsics
 from share.types import F64
 
-_KEPT = 5.0  # sigmas beyond which a corner counts as found wrongly
 _WRONG_SHARE = 0.05
 _OUTLYING = 5.0  # times the spread of the views' RMS
 _MAD = 1.4826
@@ -50,11 +50,12 @@ class Verdict:
 def judge(solution: Solution, covers: Sequence[Coverage], limits: Limits = Limits()) -> Verdict:
     """Of a solution and what each camera's views cover."""
     eyes = range(len(solution.state.cameras))
-    view_rms = np.array([[_rms(view[eye]) for eye in eyes] for view in solution.residuals])
-    told = [(residuals(solution, eye), kept(solution, eye)) for eye in eyes]
-    rms = tuple(_rms(r[inside]) for r, inside in told)
-    rms_all = tuple(_rms(r) for r, _ in told)
-    wrong = tuple(int((~inside).sum()) for _, inside in told)
+    view_rms = np.array([[corners.rms(view[eye]) for eye in eyes] for view in solution.residuals])
+    told = [residuals(solution, eye) for eye in eyes]
+    inside = [corners.kept(r, solution.sigma_px) for r in told]
+    rms = tuple(corners.rms(r[k]) for r, k in zip(told, inside, strict=True))
+    rms_all = tuple(corners.rms(r) for r in told)
+    wrong = tuple(int((~k).sum()) for k in inside)
     reasons = [reason for eye in eyes for reason in _reasons(solution, eye, rms[eye], wrong[eye], limits)]
     for eye, cover in enumerate(covers):
         if cover.share < limits.covered:
@@ -89,16 +90,6 @@ def _reasons(solution: Solution, eye: int, rms: float, wrong: int, limits: Limit
 def residuals(solution: Solution, eye: int) -> F64:
     """(N, 2) px of a camera, over all views."""
     return np.concatenate([view[eye] for view in solution.residuals])
-
-
-def kept(solution: Solution, eye: int) -> np.ndarray:
-    """Which of these residuals (N,) are of corners that were not found wrongly."""
-    return np.asarray(np.linalg.norm(residuals(solution, eye), axis=1) <= _KEPT * solution.sigma_px)
-
-
-def _rms(residuals: F64) -> float:
-    """Of the distances, px."""
-    return float(np.sqrt((residuals**2).sum(axis=1).mean())) if len(residuals) else float("nan")
 
 
 def _outliers(view_rms: F64) -> tuple[int, ...]:

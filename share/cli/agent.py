@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import secrets
 from collections.abc import Callable
 from functools import partial
@@ -77,7 +78,6 @@ def agent(
     Example:  share agent rec/kitchen --name ann --kind ar --edge tcp://127.0.0.1:5555 --out out/ann
     """
     settings = options.load_config(config_file)
-    from share.io.transport import check_keys, connect, parse_address
     from share.run.agent import AgentRun
     from share.run.stop import on_stop
     from share.run.stream import StreamRun
@@ -86,31 +86,23 @@ def agent(
 
     if streamed and true_error:
         raise UsageError("--true-error: is of an agent that tracks itself; leave out --streamed, or this")
-    shaped = None if link is None else _shaped(link, link_seed)
-    with_keys = _keys(keys, server_key)
-    check_keys(parse_address(address), with_keys)
+    run_id = secrets.randbits(63)
+    dial = _dial(address, run_id, _keys(keys, server_key))
+    through = dial if link is None else _shaped(dial, link, link_seed)
     line = _LiveLine(streamed)
     opened = live.open_source(source, calib, frames, camera, settings, line.say)
     line.of(opened)
     options.say_notes(opened)
-    run_id = secrets.randbits(63)
     hello = Hello(options.agent_name(name), AgentKind(kind), run_id, opened.rig, streamed)
-    errors = _errors(opened, settings, true_error, line.say)
+    errors = None if streamed else _errors(opened, settings, true_error, line.say)
     folder = None if out is None else Path(out)
-    dial = partial(connect, address, run_id, with_keys)
-    through = dial if shaped is None else lambda: shaped(dial())
     run = (StreamRun if streamed else AgentRun)(
         opened, hello, settings, through, folder, line.say, line.show, verbose, errors
     )
     with on_stop(run.stop):
         run.go()
     line.end()
-    if as_json:
-        import json
-
-        click.echo(json.dumps(run.report))
-    else:
-        click.echo(_summary(run))
+    click.echo(json.dumps(run.report) if as_json else _summary(run))
     if not run.report["protocol"]["edge_sessions"]:
         raise ShareError(f"no edge ever answered at {address}; {run.trouble or _NOBODY}")
 
@@ -127,6 +119,14 @@ def _keys(folder: str | None, server_key: str | None) -> AgentKeys | None:
             raise UsageError("--keys: goes with --server-key, the public key of the edge")
         return None
     return agent_keys(None if folder is None else Path(folder), server_key)
+
+
+def _dial(address: str, run_id: int, keys: AgentKeys | None) -> Callable[[], AgentLink]:
+    """What connects to the edge. Raises UsageError for an address that is none, or wants keys."""
+    from share.io.transport import check_keys, connect, parse_address
+
+    check_keys(parse_address(address), keys)
+    return partial(connect, address, run_id, keys)
 
 
 def _errors(source: Source, settings: Config, true_error: bool, say: Callable[[str], None]) -> Errors | None:
@@ -154,12 +154,12 @@ def _by_truth(source: Source) -> Errors:
     return ByTruth(LocalError(truth))
 
 
-def _shaped(name: str, seed: int) -> Callable[[AgentLink], AgentLink]:
-    """What puts an emulated network around a link. Raises UsageError, ConfigError."""
+def _shaped(dial: Callable[[], AgentLink], name: str, seed: int) -> Callable[[], AgentLink]:
+    """`dial`, with an emulated network around the link. Raises UsageError, ConfigError."""
     from share.io.transport.shaped import ShapedLink, network
 
     found = network(name)
-    return lambda link: ShapedLink(link, found, seed)
+    return lambda: ShapedLink(dial(), found, seed)
 
 
 class _LiveLine(LiveLine):

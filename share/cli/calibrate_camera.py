@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -83,14 +84,7 @@ def _calibrated(source: str, pictures: Pictures, target: Target, every: int, mos
     from share.io.camera_report import Outcome
 
     with Stages() as stages:
-        done = 0
-
-        def told(more: int) -> None:
-            nonlocal done
-            done += more
-            stages("looking for the board", done, pictures.count)
-
-        views, sizes = find_views(pictures, target, every, told)
+        views, sizes = find_views(pictures, target, every, partial(stages, "looking for the board"))
         if len(set(sizes)) > 1:
             raise DataError(
                 f"{source}: pictures of {sizes[0]} and {sizes[1]}; calibrate one with --camera cam0"

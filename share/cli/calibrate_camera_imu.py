@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -106,15 +107,15 @@ def _calibrated(
 
     target = named_target(target_name)
     with Stages() as stages:
-        table = read_imu(source, lambda done, total: stages("reading the IMU", done, total))
+        table = read_imu(source, partial(stages, "reading the IMU"))
         if not len(table.imu):
             raise DataError(f"{source}: has no IMU")
         stamps, views, looked = find_stamped(
-            pictures, target, every, lambda done, total: stages("looking for the board", done, total)
+            pictures, target, every, partial(stages, "looking for the board")
         )
         found = fit(
             stamps, views, target, pictures.rig, table.imu, noise, within,
-            lambda done, total: stages("fitting", done, total),
+            partial(stages, "fitting"),
         )  # fmt: skip
     before = None if pictures.before is None else compare(found.T_imu_cam0, pictures.before)
     return Outcome(found, judge(found), pictures.rig, noise, before, looked, len(views))

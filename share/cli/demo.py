@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,6 +70,7 @@ def demo(
     from share.emulate.demo import AGENTS, recipe
     from share.emulate.session import cached_session
     from share.io.files import writable_dir
+    from share.io.machine import cores
     from share.io.session import read_session
     from share.io.transport.links import Links
     from share.run.play import Terms, play
@@ -86,9 +86,8 @@ def demo(
     live.end()
     result = score(session, folders)
     click.echo(_table(result, policy == STREAMED))
-    cores = len(os.sched_getaffinity(0))
-    if cores <= len(folders):
-        late = f"{len(folders)} agents and the edge shared {cores} cores, so frames waited for one another"
+    if cores() <= len(folders):
+        late = f"{len(folders)} agents and the edge shared {cores()} cores, so frames waited for one another"
         click.echo(f"{late}; on machines of their own they do not")
     if result.joint is not None:
         from share.io.picture import draw_trajectories

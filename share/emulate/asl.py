@@ -7,7 +7,7 @@ from pathlib import Path
 from share.emulate.progress import Progress
 from share.emulate.stage import Stage
 from share.errors import UsageError
-from share.io.convert import to_euroc
+from share.io.convert import counting, to_euroc
 from share.io.session import SESSION
 from share.io.source import open_source
 
@@ -26,13 +26,8 @@ def check_asl(stage: Stage) -> None:
 def to_asl(folder: Path, names: list[str], progress: Progress) -> None:
     """Each NAME.mcap of the session in `folder` to NAME/mav0; the truth is in there too."""
     for name in names:
-        source, done = open_source(str(folder / name)), 0
-
-        def count(more: int, name: str = name, total: int = source.images_count) -> None:
-            nonlocal done
-            done += more
-            progress(f"writing {name}/mav0", done, total)
-
+        source = open_source(str(folder / name))
+        count = counting(progress, f"writing {name}/mav0", source.images_count)
         to_euroc(source, folder / f"{name}.asl", count)
         (folder / f"{name}.asl").rename(folder / name)
         (folder / f"{name}.mcap").unlink()

@@ -74,15 +74,17 @@ def _folder(folder: Path, eyes: Sequence[str], rig: Rig | None) -> Pictures:
 
 
 def find_views(
-    pictures: Pictures, target: Target, every: int, told: Callable[[int], None]
+    pictures: Pictures, target: Target, every: int, told: Callable[[int, int], None]
 ) -> tuple[list[View], list[tuple[int, int]]]:
-    """Views of every `every`-th picture, also empty ones, and each camera's size. Raises DataError where
-    pictures of a camera differ in size."""
+    """Views of every `every`-th picture, also empty ones, and each camera's size.
+
+    told: how many are done, of how many. Raises DataError where pictures of a camera differ in size.
+    """
     find = detector(target)
     views: list[View] = []
     sizes: list[tuple[int, int]] = []
     for k, (name, images) in enumerate(pictures.read()):
-        told(1)
+        told(k + 1, pictures.count)
         if k % every:
             continue
         here = [(image.shape[1], image.shape[0]) for image in images]

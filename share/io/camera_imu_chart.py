@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from share.calibration.camera_imu.fit import Fit
-from share.calibration.camera_imu.verdict import kept
+from share.calibration.corners import kept
 from share.types import F64, I64
 
 _COLOURS = ("#00798c", "#d1495b", "#edae49")
@@ -42,7 +42,7 @@ def _seconds(fit: Fit, stamps_ns: I64) -> F64:
 def _draw_corners(panel: Any, fit: Fit) -> None:
     t = _seconds(fit, fit.sights.stamps_ns) + fit.shift_s
     for eye, (r, seen) in enumerate(zip(fit.corners, fit.sights.corners, strict=True)):
-        inside = kept(fit, r)
+        inside = kept(r, fit.sigmas.px)
         frames, size = seen.frame[inside], len(t)
         count = np.bincount(frames, minlength=size)
         rms = np.sqrt(np.bincount(frames, (r[inside] ** 2).sum(axis=1), size) / np.maximum(count, 1))

@@ -11,9 +11,10 @@ import numpy as np
 import yaml
 
 from share.calibration.bundle import Solution, View
+from share.calibration.corners import kept
 from share.calibration.coverage import Coverage
 from share.calibration.projection import INTRINSICS, intrinsics
-from share.calibration.verdict import Verdict, kept, residuals
+from share.calibration.verdict import Verdict, residuals
 from share.geometry import se3
 from share.geometry.camera import Rig
 from share.io.kalibr import to_kalibr
@@ -155,7 +156,8 @@ def _draw_where(panel: Any, outcome: Outcome, eye: int) -> None:
     extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
     panel.imshow(np.minimum(cover.cells, 40), cmap="YlGn", extent=extent, vmin=0, vmax=80, aspect="equal")
     px = np.concatenate([view.seen[eye].px for view in outcome.views])
-    r, inside = residuals(outcome.solution, eye), kept(outcome.solution, eye)
+    r = residuals(outcome.solution, eye)
+    inside = kept(r, outcome.solution.sigma_px)
     panel.quiver(*px[inside].T, *r[inside].T, angles="xy", scale_units="xy", scale=0.01, width=0.0015)
     panel.plot(*px[~inside].T, "x", color="#d1495b", markersize=4)
     panel.set(title=f"cam{eye}: {cover.share:.0%} of the image; residuals × 100, × left out")

@@ -20,6 +20,19 @@ from share.io.trajectory import Trajectory, format_tum
 from share.types import F64
 
 Progress = Callable[[int], None]
+Told = Callable[[str, int, int], None]  # stage, done, of how many
+
+
+def counting(told: Told, stage: str, total: int) -> Progress:
+    """What is told how much more is done, and tells how much is."""
+    done = 0
+
+    def more(count: int) -> None:
+        nonlocal done
+        done += count
+        told(stage, done, total)
+
+    return more
 
 
 def to_mcap(source: Source, out: Path, jpeg: int | None, progress: Progress) -> None:

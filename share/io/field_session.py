@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ import numpy as np
 from share import __version__
 from share.geometry import se3
 from share.io.align_picture import draw_alignment
-from share.io.convert import write_recording
+from share.io.convert import Told, counting, write_recording
 from share.io.files import atomic_write
 from share.io.json_file import known
 from share.io.kalibr import to_kalibr
@@ -31,7 +31,6 @@ from share.mocap.verdict import sigmas
 from share.types import AgentKind
 
 REPORT, PICTURE = "align.json", "align.png"
-Told = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,15 +96,9 @@ def _truth(aligned: Aligned, R_mocap_world: np.ndarray) -> Trajectory:
 
 def _record(device: Device, out: Path, told: Told) -> None:
     """The recording under its new name: the same file where the disk allows it, else a copy."""
-    stage, total, done = f"writing {out.stem}", device.source.images_count, 0
-
-    def more(count: int) -> None:
-        nonlocal done
-        done += count
-        told(stage, done, total)
-
+    stage = f"writing {out.stem}"
     if device.recording is None:
-        write_recording(device.source, out, None, more)
+        write_recording(device.source, out, None, counting(told, stage, device.source.images_count))
         return
     told(stage, 0, 1)
     try:

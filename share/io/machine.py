@@ -15,12 +15,17 @@ def describe_machine() -> dict[str, Any]:
     """Plain data. load: how many processes wanted a core over the last minute."""
     return {
         "cpu": _cpu() or platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)),
+        "cores": cores(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         **{name: version(name) for name in _LIBRARIES},
         "load": round(os.getloadavg()[0], 2),
     }
+
+
+def cores() -> int:
+    """That this process may run on."""
+    return len(os.sched_getaffinity(0))
 
 
 def _cpu() -> str | None:

@@ -63,14 +63,7 @@ def find_stamped(
 
     told: how many are done, of how many. Raises DataError.
     """
-    done = 0
-
-    def more(count: int) -> None:
-        nonlocal done
-        done += count
-        told(done, source.pictures.count)
-
-    views, sizes = find_views(source.pictures, target, every, more)
+    views, sizes = find_views(source.pictures, target, every, told)
     cameras = [camera for camera in (source.rig.cam0, source.rig.cam1) if camera is not None]
     for eye, (size, camera) in enumerate(zip(sizes, cameras, strict=False)):
         _same_size(source.name, eye, size, camera)

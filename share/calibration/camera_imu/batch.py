@@ -12,11 +12,11 @@ from share.calibration.camera_imu.sights import Sights, seen
 from share.calibration.camera_imu.solve import Arrow, arrow, solve
 from share.calibration.camera_imu.start import NODE_S
 from share.calibration.camera_imu.state import SHARED, State
+from share.calibration.corners import LEAST_SPREAD, spread
 from share.errors import DataError, MisfitError
 from share.geometry.camera import ImuNoise
 from share.types import F64, I64, ImuBatch
 
-_LEAST_PX = 0.01  # below this corners are not found, whatever the residuals say
 _BIAS_SIGMA = np.repeat([0.2, 1.0], 3)  # rad/s, m/s^2: no IMU is worse
 _LEAST_WALK = 1e-7
 _STEPS = 30
@@ -35,7 +35,7 @@ class Batch:
     def stated(self) -> Sigmas:
         """A sample's noise, by the density that the IMU's file has and the rate that the samples have."""
         root = float(np.sqrt(1e9 / np.median(np.diff(self.imu.stamps_ns))))
-        return Sigmas(_LEAST_PX, self.noise.gyro_density * root, self.noise.accel_density * root)
+        return Sigmas(LEAST_SPREAD, self.noise.gyro_density * root, self.noise.accel_density * root)
 
     def descend(self, state: State, sigmas: Sigmas) -> State:
         """Downhill until the cost stands still. Raises MisfitError where it never does."""
@@ -88,10 +88,9 @@ class Batch:
 
     def spread(self, state: State, stated: Sigmas) -> Sigmas:
         """What residuals show: of corners as it is, of the IMU where it is more than stated."""
-        corners = np.concatenate(self.corners(state))
-        px = float(np.median(np.linalg.norm(corners, axis=1))) / 1.1774
+        px = spread(np.concatenate(self.corners(state)))
         gyro, accel = (rough(self.imu.stamps_ns, part) for part in self.inertial(state))
-        return Sigmas(max(px, _LEAST_PX), max(gyro, stated.gyro), max(accel, stated.accel))
+        return Sigmas(px, max(gyro, stated.gyro), max(accel, stated.accel))
 
     def corners(self, state: State) -> tuple[F64, ...]:
         """Of each camera (C, 2) px, seen less predicted."""

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from share.calibration import corners
 from share.calibration.camera_imu.batch import rough
 from share.calibration.camera_imu.fit import Fit
 from share.geometry import se3
 from share.types import F64
 
-_KEPT = 5.0  # sigmas beyond which a corner counts as found wrongly
 _STANDARD_GRAVITY = 9.80665
 _NEAR_DEG, _NEAR_MM = 1.0, 5.0  # as one unit of distance between two mountings
 _FAR = 4.0  # of these: worth a word
@@ -55,9 +55,9 @@ class Verdict:
 
 def judge(fit: Fit, limits: Limits = Limits()) -> Verdict:
     """Of a fit."""
-    told = [(r, kept(fit, r)) for r in fit.corners]
-    rms = tuple(float(np.sqrt((r[k] ** 2).sum(axis=1).mean())) if k.any() else float("nan") for r, k in told)
-    wrong = tuple(int((~k).sum()) for _, k in told)
+    inside = [corners.kept(r, fit.sigmas.px) for r in fit.corners]
+    rms = tuple(corners.rms(r[k]) for r, k in zip(fit.corners, inside, strict=True))
+    wrong = tuple(int((~k).sum()) for k in inside)
     gyro = rough(fit.imu.stamps_ns, fit.gyro) / fit.stated.gyro
     accel = rough(fit.imu.stamps_ns, fit.accel) / fit.stated.accel
     turning, moving = _excitation(fit)
@@ -68,11 +68,6 @@ def judge(fit: Fit, limits: Limits = Limits()) -> Verdict:
         *_sigma_reasons(fit, limits),
     ]
     return Verdict(tuple(reasons), rms, wrong, turning, moving, gyro, accel)
-
-
-def kept(fit: Fit, residuals: F64) -> np.ndarray:
-    """Which residuals (C, 2) px are of corners that were not found wrongly."""
-    return np.asarray(np.linalg.norm(residuals, axis=1) <= _KEPT * fit.sigmas.px)
 
 
 def _excitation(fit: Fit) -> tuple[F64, F64]:
