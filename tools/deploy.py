@@ -27,8 +27,9 @@ NO_SETTINGS = "# Settings of SHARE on this device: docs/configuration.md\n{}\n"
 
 @dataclass(frozen=True)
 class Service:
-    """unit: systemd's name. name: of its files in /etc/share. given: settings asked for on the command line,
-    None where nothing was said. defaults: empty for a service without settings. more: further files."""
+    """unit: systemd's name; "" for the program alone. name: of its files in /etc/share. given: settings asked
+    for on the command line, None where nothing was said. defaults: empty for a service without settings.
+    more: further files."""
 
     unit: str
     name: str
@@ -57,10 +58,11 @@ def common(command: Callable[..., None]) -> Callable[..., None]:
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 def cli() -> None:
-    """Put SHARE onto a device, as a service that starts on boot: docs/deployment.md.
+    """Put SHARE onto a device, as a service that starts on boot, or the program alone: docs/deployment.md.
 
     \b
-    Example:  tools/deploy edge me@laptop
+    Example:  tools/deploy program pi@headset1
+              tools/deploy edge me@laptop
               tools/deploy agent pi@headset1 --name ann --edge tcp://192.168.1.10:5555
     """
 
@@ -113,6 +115,17 @@ def sync(**others: Any) -> None:
     deploy(Service("share-sync", "sync", {}, {}, {}), **others)
 
 
+@cli.command()
+@common
+def program(**others: Any) -> None:
+    """The program alone, for people who type `share`; services that run there go on with it.
+
+    \b
+    Example:  tools/deploy program pi@headset1
+    """
+    deploy(Service("", "program", {}, {}, {}), **others)
+
+
 def deploy(
     service: Service,
     host: str,
@@ -141,7 +154,8 @@ def deploy(
             device.send(release, partial(write_tar, release, wrote=done))
     for name, text in files.items():
         device.do("settings", name, data=text.encode())
-    click.echo(device.do("activate", release.name, service.unit, profile(service, files)), nl=False)
+    verb = ("activate", release.name, service.unit, profile(service, files))
+    click.echo(device.do(*(verb if service.unit else ("place", release.name))), nl=False)
 
 
 def settings_files(service: Service, there: Facts) -> dict[str, str]:
@@ -167,17 +181,20 @@ def plan(
     where = f"{device.host}:{device.root}"
     copied = release.name in there.releases
     size = "is there already" if copied else f"copy {release.size / 1e6:.0f} MB"
+    begin = [
+        f"{where}/etc/share/keys: a key pair, if there is none",
+        f"start {service.unit}, now and on boot; it must stay up for {device.settle_s:g} s, "
+        f"else back to {there.current or 'none'}",
+    ]
     return [
         f"{where}/opt/share/releases/{release.name}: {size}",
         *(
             f"{where}/etc/share/{name}:\n" + "".join(f"    {line}\n" for line in text.splitlines())[:-1]
             for name, text in files.items()
         ),
-        f"{where}/etc/share/keys: a key pair, if there is none",
         f"{where}/etc/systemd/system/share-*.service, /etc/udev/rules.d/99-share-realsense.rules",
         f"{where}/opt/share/current: {there.current or 'none'} -> {release.name}",
-        f"start {service.unit}, now and on boot; it must stay up for {device.settle_s:g} s, "
-        f"else back to {there.current or 'none'}",
+        *(begin if service.unit else []),
     ]
 
 

@@ -23,12 +23,15 @@ if TYPE_CHECKING:
     from share.io.transport import AgentLink
     from share.run.agent import AgentRun, Status
     from share.run.errors import Errors
+    from share.types import AgentKind
 
 
 @click.command()
 @click.argument("source")
 @click.option("--name", required=True, help="What this agent is called; unique at its edge.")
-@click.option("--kind", type=click.Choice(["ar", "robot"]), required=True, help="Who is served.")
+@click.option(
+    "--kind", type=click.Choice(["ar", "robot"]), help="Who is served.  [default: the role of --profile]"
+)
 @click.option("--edge", "address", metavar="tcp://H:P", required=True, help="Where the edge listens.")
 @options.keys
 @click.option(
@@ -52,7 +55,7 @@ if TYPE_CHECKING:
 def agent(
     source: str,
     name: str,
-    kind: str,
+    kind: str | None,
     address: str,
     keys: str | None,
     server_key: str | None,
@@ -81,11 +84,11 @@ def agent(
     from share.run.agent import AgentRun
     from share.run.stop import on_stop
     from share.run.stream import StreamRun
-    from share.types import AgentKind
     from share.wire.messages import Hello
 
     if streamed and true_error:
         raise UsageError("--true-error: is of an agent that tracks itself; leave out --streamed, or this")
+    served = _kind(kind, camera.profile_name)
     run_id = secrets.randbits(63)
     dial = _dial(address, run_id, _keys(keys, server_key))
     through = dial if link is None else _shaped(dial, link, link_seed)
@@ -93,7 +96,7 @@ def agent(
     opened = live.open_source(source, calib, frames, camera, settings, line.say)
     line.of(opened)
     options.say_notes(opened)
-    hello = Hello(options.agent_name(name), AgentKind(kind), run_id, opened.rig, streamed)
+    hello = Hello(options.agent_name(name), served, run_id, opened.rig, streamed)
     errors = None if streamed else _errors(opened, settings, true_error, line.say)
     folder = None if out is None else Path(out)
     run = (StreamRun if streamed else AgentRun)(
@@ -119,6 +122,19 @@ def _keys(folder: str | None, server_key: str | None) -> AgentKeys | None:
             raise UsageError("--keys: goes with --server-key, the public key of the edge")
         return None
     return agent_keys(None if folder is None else Path(folder), server_key)
+
+
+def _kind(given: str | None, profile_name: str | None) -> AgentKind:
+    """As given, or what the computer of that profile is for. Raises UsageError, ConfigError."""
+    from share.io.profile import host_profile
+    from share.types import AgentKind
+
+    role = given or ("" if profile_name is None else host_profile(profile_name).role)
+    if role not in set(AgentKind):
+        raise UsageError(
+            "--kind: who is served, ar or robot? Say it, or name a --profile that does: d435i-n100-headset"
+        )
+    return AgentKind(role)
 
 
 def _dial(address: str, run_id: int, keys: AgentKeys | None) -> Callable[[], AgentLink]:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     help="Use the N views that together tell most.",
 )  # fmt: skip
 @options.calib
+@options.workers
 @options.out_folder
 @options.as_json
 def camera(
@@ -42,6 +43,7 @@ def camera(
     every: int,
     most: int,
     calib: str | None,
+    workers: int,
     out: Path,
     as_json: bool,
 ) -> None:
@@ -63,7 +65,7 @@ def camera(
     target = named_target(target_name)
     pictures = open_pictures(source, ("cam0", "cam1") if camera == "both" else ("cam0",), calib)
     writable_dir(out)
-    outcome = _calibrated(source, pictures, target, every, most)
+    outcome = _calibrated(source, pictures, target, every, most, workers)
     text = json.dumps(known(camera_report.to_json(outcome)), indent=1)
     atomic_write(out / "kalibr_imucam_chain.yaml", camera_report.kalibr_text(outcome, source))
     atomic_write(out / "camera-report.json", text + "\n")
@@ -75,7 +77,9 @@ def camera(
         )
 
 
-def _calibrated(source: str, pictures: Pictures, target: Target, every: int, most: int) -> Outcome:
+def _calibrated(
+    source: str, pictures: Pictures, target: Target, every: int, most: int, workers: int
+) -> Outcome:
     from share.calibration.bundle import calibrate
     from share.calibration.coverage import choose, coverage
     from share.calibration.start import enough
@@ -84,7 +88,7 @@ def _calibrated(source: str, pictures: Pictures, target: Target, every: int, mos
     from share.io.camera_report import Outcome
 
     with Stages() as stages:
-        views, sizes = find_views(pictures, target, every, partial(stages, "looking for the board"))
+        views, sizes = find_views(pictures, target, every, partial(stages, "looking for the board"), workers)
         if len(set(sizes)) > 1:
             raise DataError(
                 f"{source}: pictures of {sizes[0]} and {sizes[1]}; calibrate one with --camera cam0"

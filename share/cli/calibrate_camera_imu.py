@@ -43,6 +43,7 @@ _WORTH = 2.0  # times the stated noise: worth a word
     "--within", type=click.FloatRange(0.01, 1.0), default=0.5, show_default=True, metavar="S",
     help="How far apart the clocks may be, s.",
 )  # fmt: skip
+@options.workers
 @options.out_folder
 @options.as_json
 def camera_imu(
@@ -52,6 +53,7 @@ def camera_imu(
     imu: str | None,
     every: int,
     within: float,
+    workers: int,
     out: Path,
     as_json: bool,
 ) -> None:
@@ -74,7 +76,7 @@ def camera_imu(
     pictures = open_rig_pictures(source, camera)
     noise = stated_noise(source, imu, "--imu")
     writable_dir(out)
-    outcome = _calibrated(source, pictures, noise, target_name, every, within)
+    outcome = _calibrated(source, pictures, noise, target_name, every, within, workers)
     text = json.dumps(known(report.to_json(outcome)), indent=1)
     verdict = "passed" if outcome.verdict.passed else "FAILED"
     atomic_write(out / "kalibr_imucam_chain.yaml", report.camchain_text(outcome, source))
@@ -96,7 +98,13 @@ def _files(given: str) -> tuple[Path, Path]:
 
 
 def _calibrated(
-    source: str, pictures: RigPictures, noise: ImuNoise, target_name: str, every: int, within: float
+    source: str,
+    pictures: RigPictures,
+    noise: ImuNoise,
+    target_name: str,
+    every: int,
+    within: float,
+    workers: int,
 ) -> Outcome:
     from share.calibration.camera_imu.fit import fit
     from share.calibration.camera_imu.verdict import compare, judge
@@ -111,7 +119,7 @@ def _calibrated(
         if not len(table.imu):
             raise DataError(f"{source}: has no IMU")
         stamps, views, looked = find_stamped(
-            pictures, target, every, partial(stages, "looking for the board")
+            pictures, target, every, partial(stages, "looking for the board"), workers
         )
         found = fit(
             stamps, views, target, pictures.rig, table.imu, noise, within,

@@ -32,6 +32,17 @@ target = click.option(
     "--target", "target_name", required=True, metavar="T",
     help="The board: aprilgrid or charuco of the usual sizes, or its YAML file.",
 )  # fmt: skip
+
+
+def _cores() -> int:
+    from share.io.machine import cores
+
+    return cores()
+
+
+workers = click.option(
+    "--workers", type=click.IntRange(1, 64), default=_cores, show_default="one a core", help="Processes."
+)
 sigma_mm = click.option(
     "--sigma-mm",
     type=click.FloatRange(min=0.01),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import shutil
+import socket
 from pathlib import Path
 
 from share.core.checkup.camera import UsbCamera
@@ -59,6 +60,18 @@ def free_bytes(folder: Path) -> tuple[Path, int]:
     """Of the disk of `folder`, by the nearest folder above that is there."""
     there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     return there, shutil.disk_usage(there).free
+
+
+def port_free(port: int) -> bool:
+    """Whether a TCP port can be listened at, on all addresses."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as asked:
+        asked.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # what has ended does not count
+        try:
+            asked.bind(("", port))
+            asked.listen()
+        except OSError:
+            return False
+    return True
 
 
 def native_libraries(names: tuple[str, ...] = _NATIVE) -> dict[str, str | None]:

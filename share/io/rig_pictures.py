@@ -57,13 +57,13 @@ def _given(chain: Path) -> F64 | None:
 
 
 def find_stamped(
-    source: RigPictures, target: Target, every: int, told: Callable[[int, int], None]
+    source: RigPictures, target: Target, every: int, told: Callable[[int, int], None], workers: int = 1
 ) -> tuple[I64, list[View], int]:
     """Stamps (F,) ns rising and views with at least one corner; how many pictures were looked at.
 
     told: how many are done, of how many. Raises DataError.
     """
-    views, sizes = find_views(source.pictures, target, every, told)
+    views, sizes = find_views(source.pictures, target, every, told, workers)
     cameras = [camera for camera in (source.rig.cam0, source.rig.cam1) if camera is not None]
     for eye, (size, camera) in enumerate(zip(sizes, cameras, strict=False)):
         _same_size(source.name, eye, size, camera)

@@ -20,6 +20,7 @@ from share.run.clocks import of_chrony
 from share.run.edge_probe import probe
 
 _REALSENSE = "RealSense"
+_PORT = 5555  # of `share edge`
 
 
 def of_host(profile: HostProfile, out: Path) -> list[Finding]:
@@ -62,6 +63,11 @@ def of_calibration(profile: HostProfile, folder: Path | None) -> Finding:
     except (ShareError, OSError) as error:
         return fail("calibration", str(error))
     return calibration(found.rig, age_days, profile.sensor.device.T_imu_cam0, profile.sensor.baseline_m)
+
+
+def of_port(profile: HostProfile) -> list[Finding]:
+    """Only of a computer that is to be an edge."""
+    return [host.port(_PORT, facts.port_free(_PORT))] if profile.role == "edge" else []
 
 
 def of_edge(address: str | None, keys: Path | None, server_key: str | None) -> list[Finding]:

@@ -612,6 +612,14 @@ def test_an_agent_whose_disk_is_full_tracks_on(room, tmp_path):
     assert ann["poses"] > 10
 
 
+@pytest.mark.parametrize("more", [(), ("--profile", "d435i"), ("--profile", "laptop-edge")])
+def test_an_agent_of_no_kind(share, more):
+    done = share("agent", "realsense", "--name", "a", "--edge", NOBODY, *more)
+    assert (done.code, done.out) == (2, "")
+    assert done.err.startswith("share: --kind: who is served, ar or robot?")
+    assert done.err.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     "command", [("demo",), ("agent", "x", "--name", "a", "--kind", "ar", "--edge", "tcp://127.0.0.1:1")]
 )

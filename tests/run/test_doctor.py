@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ from shell import Done
 
 from share.io.host import governors, throttles, usb_memory_mb
 from share.io.realsense import asked
-from share.run import edge_probe
+from share.run import doctor, edge_probe
 
 Share = Callable[..., Done]
 LAPTOP = ("--profile", "laptop-edge")
@@ -51,6 +52,18 @@ def of_edge(done: Done) -> dict[str, object]:
     (found,) = [one for one in told["findings"] if one["name"] == "edge"]
     assert told["ok"] == (done.code == 0) == all(one["state"] != "FAIL" for one in told["findings"])
     return dict(found)
+
+
+def test_a_port_that_is_taken_is_said(share: Share, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        monkeypatch.setattr(doctor, "_PORT", other.getsockname()[1])
+        taken = json.loads(share("doctor", *LAPTOP, "--json").out)
+    free = json.loads(share("doctor", *LAPTOP, "--json").out)
+    of_agent = json.loads(share("doctor", "--json").out)
+    state = [{one["name"]: one["state"] for one in told["findings"]} for told in (taken, free, of_agent)]
+    assert [found.get("port") for found in state] == ["WARN", "OK", None]
 
 
 def test_a_machine_without_a_camera_is_fine_where_none_is_wanted(share: Share, tmp_path: Path) -> None:

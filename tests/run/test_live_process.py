@@ -82,7 +82,7 @@ def test_a_person_ends_tracking_and_finds_the_poses_and_what_the_camera_did(
 
 
 def test_a_person_ends_an_agent_and_its_files_are_whole(tmp_path: Path, plain_session: Path) -> None:
-    who = ("agent", "realsense", *MODE, "--name", "ann", "--kind", "ar")
+    who = ("agent", "realsense", *MODE, "--name", "ann", "--profile", "d435i-n100-headset")
     with running(plain_session / "ar1", *who, "--edge", "tcp://127.0.0.1:9", "--out", tmp_path) as (child, t):
         live = shown(t)
         told, after = ended(child, t)

@@ -58,6 +58,33 @@ def test_a_first_agent_is_copied_set_up_and_started(device):
     assert asked.index("systemctl daemon-reload") < asked.index("systemctl restart share-agent@ann")
 
 
+def test_the_program_alone_is_there_and_no_service(device):
+    program = device.program("1.0")
+    done = device.deploy("program", dist=program)
+    assert (done.code, done.err) == (0, "")
+    assert done.out.splitlines()[-1].endswith(" is there")
+    assert device.current == "1.0"
+    assert (device.root / "usr/local/bin/share").is_symlink()
+    assert (device.root / "etc/udev/rules.d/99-share-realsense.rules").read_text() == f"{RULE}\n"
+    assert not (device.root / "etc/share/keys").exists()
+    assert not [line for line in device.asked() if "enable" in line or "restart" in line]
+    assert "is there already" in device.deploy("program", dist=program).out
+    assert device.agent(program).code == 0
+
+
+def test_a_newer_program_alone_takes_the_services_with_it_or_comes_not(device):
+    device.agent(device.program("1.0"))
+    device.asked()
+    assert device.deploy("program", dist=device.program("1.1")).code == 0
+    assert device.current == "1.1"
+    assert "systemctl restart share-agent@ann" in device.asked()
+    done = device.deploy("program", dist=device.program("1.2", "broken"))
+    assert done.err.rstrip().endswith("is back and runs")
+    assert (done.code, device.current) == (1, "1.1")
+    assert device.deploy("program", "--rollback").code == 0
+    assert device.current == "1.0"
+
+
 def test_the_rule_that_is_installed_is_one_that_the_doctor_finds(device):
     from share.io.host import camera_rules
 

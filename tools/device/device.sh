@@ -58,9 +58,8 @@ activate() { # RELEASE UNIT PROFILE
     systemctl enable "$2" >/dev/null 2>&1 || die "systemctl enable $2 failed"
     restart_all
     if healthy; then
-        [ "$old" = "$1" ] || [ -z "$old" ] || point previous "$old"
         rm -rf "$ETC/.before"
-        prune
+        settled "$1" "$old"
         say "$1 runs"
         show_key
     else
@@ -68,6 +67,34 @@ activate() { # RELEASE UNIT PROFILE
         [ -n "$known" ] || stop_for_good "$2"
         go_back "$1" "$old"
     fi
+}
+
+place() { # RELEASE: the program alone; services that are here go on with it
+    old=$(release current)
+    make_user
+    let_in
+    [ -f "$ETC/profile" ] || echo d435i >"$ETC/profile"
+    if [ "$old" = "$1" ]; then
+        say "$1 is there already"
+        return
+    fi
+    switch "$1"
+    restart_all
+    if healthy; then
+        settled "$1" "$old"
+        say "$1 is there"
+    else
+        go_back "$1" "$old"
+    fi
+}
+
+settled() { # RELEASE OLD: it stays
+    [ "$2" = "$1" ] || [ -z "$2" ] || point previous "$2"
+    prune
+}
+
+let_in() { # who became root for this may open the camera, from the next login on
+    [ -z "${SUDO_USER:-}" ] || id -nG "$SUDO_USER" | grep -qw plugdev || usermod -aG plugdev "$SUDO_USER"
 }
 
 go_back() { # RELEASE OLD: to OLD and what ran with it
@@ -119,7 +146,7 @@ restart_all() {
 
 healthy() { # all services stay up, and what is made of machine code loads here
     before=$(restarts)
-    sleep "$SETTLE"
+    [ -z "$(services)" ] || sleep "$SETTLE"
     fine=yes
     for unit in $(services); do
         systemctl is-active --quiet "$unit" || complain "$unit"
@@ -190,6 +217,6 @@ put_back_settings() {
 }
 
 case ${1:-} in
-probe | receive | settings | activate | rollback) "$@" ;;
-*) die "usage: device.sh probe UNIT | receive RELEASE | settings FILE | activate RELEASE UNIT PROFILE | rollback" ;;
+probe | receive | settings | activate | place | rollback) "$@" ;;
+*) die "usage: device.sh probe UNIT | receive RELEASE | settings FILE | activate RELEASE UNIT PROFILE | place RELEASE | rollback" ;;
 esac

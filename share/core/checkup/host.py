@@ -84,3 +84,11 @@ def libraries(found: Mapping[str, str | None]) -> Finding:
         return ok("libraries", f"{', '.join(found)} load")
     what = "; ".join(f"{name}: {why}" for name, why in broken.items())
     return fail("libraries", what, "pip install --force-reinstall share-slam, for this Python and processor")
+
+
+def port(number: int, free: bool) -> Finding:
+    """Where an edge listens unless it is told otherwise."""
+    if free:
+        return ok("port", f"{number} is free for the edge")
+    look = f"ss -ltnp 'sport = :{number}'  # an edge that runs? else: share edge --bind tcp://0.0.0.0:PORT"
+    return warn("port", f"something listens at {number} already", look)

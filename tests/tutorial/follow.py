@@ -1,0 +1,98 @@
+"""Follows docs/tutorial.md word by word, with cameras of software, and can write back what was shown.
+
+python tests/tutorial/follow.py --write
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import click
+import field_trip
+from machines import Machine
+from page import MACHINES, Block, Step, blocks, renewed
+
+from share.cli.progress import Stages
+
+PAGE = Path(__file__).parents[2] / "docs" / "tutorial.md"
+LIMIT_S = 1500.0  # of one command
+ADDRESS = ("192.168.1.10", "127.0.0.1")  # the laptop's, on the page and here
+FAILS_HERE = ("share doctor",)  # without USB, a camera on it, and clocks that somebody corrects
+
+Walked = list[tuple[Block, list[Step]]]
+
+
+class OffTrackError(Exception):
+    """Something that the page tells to type does not do what it should."""
+
+
+def follow(
+    text: str, folder: Path, say: Callable[[str], None], first: int = 0, last: int | None = None
+) -> Walked:
+    """Types what the page says, from block `first` to before block `last`. Raises OffTrackError.
+
+    folder: of the machines; what they had from blocks before `first` must be there."""
+    field_trip.exports(folder / "laptop", lambda *_: None)
+    machines = {name: Machine(name, folder) for name in MACHINES}
+    walked: Walked = []
+    try:
+        for block in blocks(text)[first:last]:
+            walked.append((block, _together(block.steps, machines, say, folder)))
+    finally:
+        for machine in machines.values():
+            machine.close()
+    return walked
+
+
+def _together(
+    steps: Sequence[Step], machines: dict[str, Machine], say: Callable[[str], None], folder: Path
+) -> list[Step]:
+    """The steps of a block as they went. Each machine goes on by itself."""
+
+    def one(name: str) -> list[tuple[int, Step]]:
+        own = [(k, step) for k, step in enumerate(steps) if step.machine == name]
+        return [(k, _typed(step, machines[name], say, folder)) for k, step in own]
+
+    with ThreadPoolExecutor() as pool:
+        done = [pair for pairs in pool.map(one, {step.machine for step in steps}) for pair in pairs]
+    return [step for _, step in sorted(done, key=lambda pair: pair[0])]
+
+
+def _typed(step: Step, machine: Machine, say: Callable[[str], None], folder: Path) -> Step:
+    code, shown = machine.run(step.command.replace(*ADDRESS), LIMIT_S)
+    went = replace(step, shown=tuple(_elsewhere(line, folder) for line in shown))
+    say("\n".join(went.lines))
+    if code and not step.command.startswith(FAILS_HERE):
+        raise OffTrackError("\n".join([*went.lines, f"exit code {code}"]))
+    return went
+
+
+def _elsewhere(line: str, folder: Path) -> str:
+    """As it would be on the machines of the page."""
+    return line.replace(*reversed(ADDRESS)).replace(str(folder), "/home").rstrip()
+
+
+@click.command()
+@click.option("--write", is_flag=True, help="Put what was shown into the page.")
+@click.option("--at", "folder", type=click.Path(path_type=Path), required=True, help="Of the machines.")
+@click.option("--first", default=0, help="The block to begin with, counted from 0.")
+@click.option("--last", type=int, help="The block to end before.")
+def main(write: bool, folder: Path, first: int, last: int | None) -> None:
+    with Stages() as stages:
+        for name in field_trip.RECIPES:
+            field_trip.session(name, stages)
+    text = PAGE.read_text()
+    walked = follow(text, folder.resolve(), click.echo, first, last)
+    if write:
+        PAGE.write_text(renewed(text, walked))
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except OffTrackError as error:
+        sys.exit(f"follow: off the track:\n{error}")
