@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.calibration import corners
-from share.calibration.bundle import LEAST_VIEWS, Solution
+from share.calibration.bundle import LEAST_VIEWS, Solution, View
 from share.calibration.coverage import Coverage
+from share.calibration.epipolar import typical_miss
 from share.calibration.projection import INTRINSICS, intrinsics
 from share.types import F64
 
@@ -21,9 +22,10 @@ _MAD = 1.4826
 @dataclass(frozen=True)
 class Limits:
     """What passes. rms_px: of the corners that are kept; focal: sigma over focal length; covered: of the
-    image's cells; views: at least."""
+    image's cells; views: at least; pair_px: from epipolar lines."""
 
     rms_px: float = 0.5
+    pair_px: float = 0.3
     focal: float = 2e-3
     covered: float = 0.6
     views: int = 12
@@ -33,7 +35,7 @@ class Limits:
 class Verdict:
     """reasons: what fails, none where it passes; rms_px: of each camera, of the corners kept; rms_all_px: of
     all; wrong: how many were not kept; view_rms (V, cameras) px, NaN where a camera saw nothing; outliers:
-    rows of views."""
+    rows of views; pair_px: that half of what both cameras saw lies from its epipolar lines, None of one."""
 
     reasons: tuple[str, ...]
     rms_px: tuple[float, ...]
@@ -41,14 +43,21 @@ class Verdict:
     wrong: tuple[int, ...]
     view_rms: F64
     outliers: tuple[int, ...]
+    pair_px: float | None
 
     @property
     def passed(self) -> bool:
         return not self.reasons
 
 
-def judge(solution: Solution, covers: Sequence[Coverage], limits: Limits = Limits()) -> Verdict:
-    """Of a solution and what each camera's views cover."""
+def judge(
+    solution: Solution,
+    covers: Sequence[Coverage],
+    pairs: Sequence[View] = (),
+    limits: Limits = Limits(),
+) -> Verdict:
+    """Of a solution and what each camera's views cover. pairs: all views in which two cameras saw the board,
+    also those that had no part in the solution."""
     eyes = range(len(solution.state.cameras))
     view_rms = np.array([[corners.rms(view[eye]) for eye in eyes] for view in solution.residuals])
     told = [residuals(solution, eye) for eye in eyes]
@@ -63,7 +72,15 @@ def judge(solution: Solution, covers: Sequence[Coverage], limits: Limits = Limit
                 f"cam{eye}: corners in {cover.share:.0%} of the image, {limits.covered:.0%} needed; "
                 + "; ".join(cover.missing)
             )
-    return Verdict(tuple(reasons), rms, rms_all, wrong, view_rms, _outliers(view_rms))
+    state = solution.state
+    two = len(eyes) == 2
+    pair = typical_miss(state.cameras[0], state.cameras[1], state.T_cam1_cam0, pairs) if two else None
+    if pair is not None and not pair <= limits.pair_px:
+        reasons.append(
+            f"the pair: half of the corners are {pair:.2f} px or more off their epipolar lines, at most "
+            f"{limits.pair_px:g}: do both cameras expose at once, is one loose?"
+        )
+    return Verdict(tuple(reasons), rms, rms_all, wrong, view_rms, _outliers(view_rms), pair)
 
 
 def _reasons(solution: Solution, eye: int, rms: float, wrong: int, limits: Limits) -> list[str]:

@@ -82,6 +82,7 @@ def _calibrated(
 ) -> Outcome:
     from share.calibration.bundle import calibrate
     from share.calibration.coverage import choose, coverage
+    from share.calibration.epipolar import typical_miss
     from share.calibration.start import enough
     from share.calibration.verdict import judge
     from share.io.board_views import find_views
@@ -105,12 +106,15 @@ def _calibrated(
         except ValueError as error:
             raise DataError(f"{source}: {error}") from None
         stages("calibrating", 1, 1)
-    state = solution.state
+    state, rig = solution.state, pictures.rig
+    before = None
+    if len(sizes) == 2 and rig is not None and rig.cam1 is not None and rig.T_cam1_cam0 is not None:
+        before = typical_miss(rig.cam0, rig.cam1, rig.T_cam1_cam0, seen)
     covers = tuple(
         coverage([view.seen[eye].px for view in used], T, target, sizes[0])
         for eye, T in enumerate((state.T_cam0_target, state.T_cam1_cam0 @ state.T_cam0_target)[: len(sizes)])
     )
-    return Outcome(used, solution, covers, judge(solution, covers), pictures.rig, len(seen))
+    return Outcome(used, solution, covers, judge(solution, covers, seen), pictures.rig, len(seen), before)
 
 
 def _summary(outcome: Outcome, out: Path) -> str:
@@ -130,6 +134,13 @@ def _summary(outcome: Outcome, out: Path) -> str:
             f"corners in {cover.share:.0%} of the image"
         )
         lines += [f"  {what}" for what in cover.missing]
+    if verdict.pair_px is not None:
+        was = (
+            "" if outcome.pair_before_px is None else f" ({outcome.pair_before_px:.3f} px by the one before)"
+        )
+        lines.append(
+            f"the pair: half of the corners within {verdict.pair_px:.3f} px of their epipolar line{was}"
+        )
     if verdict.outliers:
         names = ", ".join(outcome.views[k].name for k in verdict.outliers[:6])
         lines.append(f"{len(verdict.outliers)} views fit worse than the rest: {names}")

@@ -25,7 +25,7 @@ NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """All that is told of one calibration. before: the calibration that the source came with; seen: views
-    with the target among all pictures looked at."""
+    with the target among all pictures looked at; pair_before_px: as the verdict's, by `before`."""
 
     views: Sequence[View]
     solution: Solution
@@ -33,6 +33,7 @@ class Outcome:
     verdict: Verdict
     before: Rig | None
     seen: int
+    pair_before_px: float | None = None
 
     @property
     def rig(self) -> Rig:
@@ -76,6 +77,7 @@ def to_json(outcome: Outcome) -> dict[str, Any]:
     if len(outcome.covers) == 2:
         state, sigmas = outcome.solution.state, outcome.solution.sigmas[-6:]
         out["T_cam1_cam0"] = state.T_cam1_cam0.tolist()
+        out["epipolar_median_px"] = {"found": verdict.pair_px, "before": outcome.pair_before_px}
         out["baseline_m"] = float(np.linalg.norm(state.T_cam1_cam0[:3, 3]))
         out["T_cam1_cam0_sigmas"] = {"rad": sigmas[:3].tolist(), "m": sigmas[3:].tolist()}
     return out

@@ -6,10 +6,13 @@ import pytest
 
 from share.calibration import bundle
 from share.calibration.bundle import View, calibrate
-from share.calibration.coverage import choose, coverage
+from share.calibration.coverage import GRID as COVER_GRID
+from share.calibration.coverage import Coverage, choose, coverage
 from share.calibration.detect import Detection
+from share.calibration.epipolar import off_line, typical_miss
 from share.calibration.projection import camera_of, intrinsics, moved, project
 from share.calibration.start import enough
+from share.calibration.verdict import judge
 from share.geometry import se3
 from share.geometry.camera import Camera
 from share.geometry.target import AprilGrid, CharucoBoard
@@ -135,6 +138,23 @@ def test_corners_that_were_found_wrongly_do_little_harm(rng: np.random.Generator
     solution = calibrate(_views(rng, 0.1, wrong=0.03), GRID, SIZE)
     assert solution.state.cameras[0].fx == pytest.approx(LEFT.fx, rel=1e-3)
     assert solution.state.cameras[1].cx == pytest.approx(RIGHT.cx, abs=0.5)
+
+
+def test_epipolar_lines_tell_a_pair_that_sits_otherwise(rng: np.random.Generator) -> None:
+    """0.2 px of noise on both corners, across the line: a median of 0.6745 sqrt(2) 0.2, and up to half as
+    much again where the lens draws together what lies outside. Then a pitch, and a camera that is late."""
+    views = _views(rng, 0.2, wrong=0.03)
+    assert np.abs(off_line(LEFT, RIGHT, _mount(), _views(rng, 0.0))).max() < 1e-6
+    assert 1.0 < typical_miss(LEFT, RIGHT, _mount(), views) / (0.6745 * np.sqrt(2) * 0.2) < 1.3
+    pitched = se3.exp(np.array([0.002, 0, 0, 0, 0, 0])) @ _mount()
+    assert typical_miss(LEFT, RIGHT, pitched, views) == pytest.approx(0.002 * RIGHT.fy, rel=0.15)
+    lower = np.array([0.0, 3.0])
+    late = [View(v.name, (v.seen[0], Detection(v.seen[1].ids, v.seen[1].px + lower))) for v in views]
+    solution = calibrate(views, GRID, SIZE)
+    covers = [Coverage(np.full(COVER_GRID, 5), np.zeros((20, 2)), np.linspace(0.5, 1.0, 20))] * 2
+    assert judge(solution, covers, views).passed
+    (reason,) = judge(solution, covers, late).reasons
+    assert reason.startswith("the pair: half of the corners are 3.")
 
 
 def test_a_board_that_never_leans_is_refused(rng: np.random.Generator) -> None:
