@@ -48,7 +48,11 @@ def read_target(path: Path) -> Target:
 
 def named_target(name: str) -> Target:
     """`aprilgrid` or `charuco` of the usual sizes, or a YAML file. Raises ConfigError."""
-    return _KEYS[name][0]() if name in _KEYS else read_target(Path(name))
+    if name in _KEYS:
+        return _KEYS[name][0]()
+    if not Path(name).is_file():
+        raise ConfigError(f"--target {name}: no such file, and none of {', '.join(_KEYS)}")
+    return read_target(Path(name))
 
 
 def target_of(section: Section) -> Target:

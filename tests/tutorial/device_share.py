@@ -58,13 +58,17 @@ def recorded(words: list[str]) -> str:
     return "live" if words[:2] in (["agent", "realsense"], ["calibrate", "realsense"]) else ""
 
 
-machine, words = sys.argv[1], sys.argv[2:]
-name = recorded(words)
-if not name:
-    command_line.main(words)
-elif name == field_trip.REST:
-    lying = SoftwareCamera(rs, serial=f"{machine}-1")
-    share(words, lying, lambda ended: play_rest(lying, ended))
-else:
-    moving = RoomCamera(rs, field_trip.world(machine, name))
-    share(words, moving.camera, lambda ended: play_room(moving, ended))
+def main(machine: str, words: list[str]) -> None:
+    name = recorded(words)
+    if not name:
+        command_line.main(words)
+    elif name == field_trip.REST:
+        lying = SoftwareCamera(rs, serial=f"{machine}-1")
+        share(words, lying, lambda ended: play_rest(lying, ended))
+    else:
+        moving = RoomCamera(rs, field_trip.world(machine, name))
+        share(words, moving.camera, lambda ended: play_room(moving, ended))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2:])

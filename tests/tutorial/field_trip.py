@@ -59,7 +59,7 @@ def world(machine: str, name: str) -> Source:
     return open_source(str(session(name, lambda *_: None) / machine))
 
 
-def exports(folder: Path, progress: Progress) -> None:
+def exports(folder: Path) -> None:
     """The motion capture's files: carried.csv and field.csv."""
     for k, name in enumerate(("carried", "field")):
         recipe = RECIPES[name]

@@ -11,12 +11,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-import click
-import field_trip
-from machines import Machine
-from page import MACHINES, Block, Step, blocks, renewed
+from share import process
 
-from share.cli.progress import Stages
+process.prepare()  # before numpy: walkers are planned as `share emulate` would, to the last digit
+
+import click  # noqa: E402
+import field_trip  # noqa: E402
+from machines import Machine  # noqa: E402
+from page import MACHINES, Block, Step, blocks, renewed  # noqa: E402
+
+from share.cli.progress import Stages  # noqa: E402
 
 PAGE = Path(__file__).parents[2] / "docs" / "tutorial.md"
 LIMIT_S = 1500.0  # of one command
@@ -36,8 +40,8 @@ def follow(
     """Types what the page says, from block `first` to before block `last`. Raises OffTrackError.
 
     folder: of the machines; what they had from blocks before `first` must be there."""
-    field_trip.exports(folder / "laptop", lambda *_: None)
     machines = {name: Machine(name, folder) for name in MACHINES}
+    field_trip.exports(folder / "laptop")
     walked: Walked = []
     try:
         for block in blocks(text)[first:last]:

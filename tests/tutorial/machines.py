@@ -56,12 +56,13 @@ class Machine:
             text=True,
         )
         self._lines: queue.Queue[str] = queue.Queue()
-        threading.Thread(target=self._read, daemon=True).start()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
         self._type("set -m")
 
     def run(self, command: str, limit_s: float) -> tuple[int, list[str]]:
         """Exit code and what was shown meanwhile. Raises TimeoutError."""
-        self._type(f"{command}\necho; echo @@done $?")
+        self._type(f"{command}\ncame_to=$?; echo; echo @@done $came_to")
         shown, end = [], time.monotonic() + limit_s
         while True:
             try:
@@ -79,6 +80,10 @@ class Machine:
             self._shell.wait(20)
         finally:
             self._shell.kill()
+            self._reader.join(5)
+            for pipe in (self._shell.stdin, self._shell.stdout):
+                assert pipe is not None
+                pipe.close()
 
     def _type(self, text: str) -> None:
         assert self._shell.stdin is not None

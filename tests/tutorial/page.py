@@ -54,8 +54,9 @@ def _blocks(lines: Sequence[str]) -> Iterator[Block]:
         end = k
         while end < len(lines) and (lines[end].startswith(_INDENT) or (end > k and _goes_on(lines, end))):
             end += 1
-        if end > k and _TYPED.match(lines[k].removeprefix(_INDENT)):
-            yield Block(k, end, tuple(_steps([line.removeprefix(_INDENT) for line in lines[k:end]])))
+        inside = [line.removeprefix(_INDENT) for line in lines[k:end]]
+        if any(map(_TYPED.match, inside)):
+            yield Block(k, end, tuple(_steps(inside)))
         k = max(end, k + 1)
 
 
