@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import field_trip
@@ -18,8 +19,29 @@ from software_share import share
 
 from share.cli import main as command_line
 from share.core.intake import GYRO
+from share.core.measurement import Measurement
+from share.io.images import ArrayImage
+from share.io.source import Source
+from share.types import I64
 
 PATIENCE_S = 1.0  # of the person who ends what runs until Ctrl-C
+
+
+class InMemory:
+    """A recording whose images are decoded already: a camera takes none of its computer's time for that."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self._all = [
+            replace(m, payload=ArrayImage(m.payload.load())) if m.stream in ("cam0", "cam1") else m
+            for m in source.measurements()
+        ]
+
+    def measurements(self) -> list[Measurement]:
+        return self._all
+
+    def stamps(self) -> dict[str, I64]:
+        return self._source.stamps()
 
 
 class Pace:
@@ -66,7 +88,7 @@ def main(machine: str, words: list[str]) -> None:
         lying = SoftwareCamera(rs, serial=f"{machine}-1")
         share(words, lying, lambda ended: play_rest(lying, ended))
     else:
-        moving = RoomCamera(rs, field_trip.world(machine, name))
+        moving = RoomCamera(rs, InMemory(field_trip.world(machine, name)))
         share(words, moving.camera, lambda ended: play_room(moving, ended))
 
 
