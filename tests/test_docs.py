@@ -103,10 +103,10 @@ def test_commands_page_has_every_option_and_no_other(name: str) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_examples_use_options_that_exist(page: Path) -> None:
-    """Every indented line that begins with a command."""
+    """Every indented line that begins with a command or, after a prompt, has one; `share agent: …` answers."""
     known = commands(cli)
     text = page.read_text().replace("\\\n", " ")
-    for line in re.findall(r"^ {4}(?:\$ )?(share .+)$", text, flags=re.MULTILINE):
+    for line in re.findall(r"^ {4}(?:\w*\$ )?(share (?!\w+: ).+)$", text, flags=re.MULTILINE):
         line = re.split(r"\s{2,}#|\s&", line)[0]
         name = max((n for n in known if f"{line} ".startswith(f"{n} ")), key=len, default=None)
         assert name or re.match(r"share (--|[a-z]+ --help)", line), f"{page.name}: {line}"
