@@ -103,7 +103,7 @@ def test_commands_page_has_every_option_and_no_other(name: str) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_examples_use_options_that_exist(page: Path) -> None:
-    """Every indented line that begins with a command or, after a prompt, has one; `share agent: …` answers."""
+    """Every indented line that is a command, after a prompt or not; `share agent: …` is one that answers."""
     known = commands(cli)
     text = page.read_text().replace("\\\n", " ")
     for line in re.findall(r"^ {4}(?:\w*\$ )?(share (?!\w+: ).+)$", text, flags=re.MULTILINE):
