@@ -85,7 +85,7 @@ def read_yaml(path: Path) -> Section:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
+        raise ConfigError(f"{path}: no such file; give the calibration with --calib") from None
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: is not a text file") from None
     except OSError as error:

@@ -37,8 +37,6 @@ def open_tum(path: Path, calibration: Calibration | None, frames: slice | None) 
     """The recording in `path`. Raises DataError, ConfigError, UsageError."""
     own = path / CAMERA
     if calibration is None:
-        if not own.exists():
-            raise ConfigError(f"{own}: no such file; give the calibration with --calib")
         calibration = read_camera_yaml(own)
     rig, scale = calibration.rig, calibration.depth_scale
     if rig.depth is None:
