@@ -11,7 +11,7 @@ import numpy as np
 from field_sim import Watched, export, paths, seen
 
 from share.core.intake import ACCEL, GYRO
-from share.emulate.progress import Progress
+from share.emulate.progress import Progress, silent
 from share.emulate.recipe import Recipe
 from share.emulate.sensor.effects import Effects
 from share.emulate.sensor.imu import measured
@@ -56,7 +56,7 @@ def session(name: str, progress: Progress) -> Path:
 
 def world(machine: str, name: str) -> Source:
     """What the camera of `machine` is in while it records `name`."""
-    return open_source(str(session(name, lambda *_: None) / machine))
+    return open_source(str(session(name, silent) / machine))
 
 
 def exports(folder: Path) -> None:
