@@ -1,6 +1,6 @@
 """Follows docs/tutorial.md word by word, with cameras of software, and can write back what was shown.
 
-    PYTHONPATH=tests python tests/tutorial/follow.py --at DIR --write
+PYTHONPATH=tests python tests/tutorial/follow.py --at DIR --write
 """
 
 from __future__ import annotations
