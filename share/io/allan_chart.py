@@ -31,6 +31,9 @@ def allan_png(nature: ImuNature, profile: Profile | None, title: str) -> bytes:
         )
         panel.set_xscale("log")
         panel.set_yscale("log")
+        for axis in (panel.xaxis, panel.yaxis):  # in plain digits: the frozen program has no fonts for powers
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter("")
         panel.grid(which="both", alpha=0.25)
         panel.text(0.03, 0.03, _figures(sensor, UNITS[name]), transform=panel.transAxes, fontsize=9)
         panel.legend(fontsize=8, loc="upper right")

@@ -43,6 +43,15 @@ def test_files_and_table(share, table, tmp_path):
     assert (tmp_path / "mine" / "imu-report.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_the_picture_wants_no_fonts_for_formulas(share, table, tmp_path, monkeypatch):
+    """The frozen program has one font."""
+    from matplotlib.mathtext import MathTextParser
+
+    monkeypatch.setattr(MathTextParser, "parse", None)
+    assert share("calibrate", "imu", table, "--out", tmp_path).code == 0
+    assert (tmp_path / "imu-report.png").exists()
+
+
 def test_what_five_minutes_do_not_tell_is_said(share, table, tmp_path):
     done = share("calibrate", "imu", table, "--out", tmp_path, "--json")
     report = json.loads(done.out)

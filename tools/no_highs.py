@@ -1,0 +1,27 @@
+"""In the frozen program, in place of SciPy's linear programming (HiGHS).
+
+Every import of scipy.optimize loads its 7 MB and makes tables of its names. SHARE never calls it.
+"""
+
+from __future__ import annotations
+
+from typing import NoReturn
+
+
+class _Name:
+    """Of whatever is asked for: it has more names in it, and cannot be called."""
+
+    def __getattr__(self, name: str) -> _Name:
+        return _named(name)
+
+    def __call__(self, *_: object) -> NoReturn:
+        raise NotImplementedError("this frozen program has no linear programming")
+
+
+def _named(name: str) -> _Name:
+    if name.startswith("__"):
+        raise AttributeError(name)  # Python's own questions
+    return _Name()
+
+
+__getattr__ = _named

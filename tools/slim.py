@@ -1,0 +1,126 @@
+"""The frozen program without what its libraries bring and SHARE never uses. Figures: docs/freezing.md."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import struct
+import subprocess
+from collections.abc import Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+
+from stub_library import exported, needed, wanted, write_forward, write_hollow
+
+# Who asks for them, and what is hollowed out: video for cv2's VideoCapture, pictures that Pillow knows
+# beside PNG (matplotlib writes no other). They say so and abort.
+HOLLOW = (
+    (["cv2/cv2*.so"], ("libavcodec", "libavformat", "libavutil", "libswscale")),
+    (["PIL/_imaging.*.so", "pillow.libs/libtiff-*"], ("libjpeg", "libzstd", "liblzma", "libxcb")),
+)
+# cv2 tries AVIF on whatever it is to decode. Without libaom it finds no picture there, and says so.
+SILENT = ((["opencv_python_headless.libs/libavif-*"], ("libaom",)),)
+_HASH = re.compile(r"(-[0-9a-f]{8})+(?=\.so)")  # auditwheel's
+_ELF = b"\x7fELF"
+
+
+def slim(inside: Path) -> None:
+    """inside: the `_internal` of a frozen program.
+
+    Raises subprocess.CalledProcessError where a tool fails, and what `one_blas` does.
+    """
+    for table, answers in ((HOLLOW, False), (SILENT, True)):
+        for patterns, names in table:
+            users = [user for pattern in patterns for user in inside.glob(pattern)]
+            for library in _bundled(inside, names):
+                write_hollow(library, wanted(users, library), answers)
+    one_blas(inside)
+    remove_orphans(inside)
+    for binary in binaries(inside):
+        strip(binary)
+    link_twins(inside)
+    remove_dangling(inside)
+
+
+def one_blas(inside: Path) -> None:
+    """cv2's LAPACK, an OpenBLAS of 39 MB that it takes for large matrices only, led to SciPy's.
+
+    Raises KeyError where SciPy's lacks a function, ValueError where there is not one of each.
+    """
+    (ours,), (theirs,) = _bundled(inside, ("libopenblasp",)), _bundled(inside, ("libscipy_openblas-",))
+    symbols = wanted(inside.glob("cv2/cv2*.so"), ours)
+    prefix = "scipy_"
+    if missing := [name for name in symbols if prefix + name not in exported(theirs)]:
+        raise KeyError(f"{theirs.name} has no {', '.join(missing)}; leave cv2 its own OpenBLAS")
+    write_forward(ours, symbols, prefix, theirs)
+
+
+def remove_orphans(inside: Path) -> None:
+    """What only those asked for that are hollow now."""
+    while True:
+        asked = {name for binary in binaries(inside) for name in needed(binary)}
+        orphans = [path for path in _bundled(inside, ("lib",)) if path.name not in asked]
+        if not orphans:
+            return
+        for path in orphans:
+            path.unlink()
+
+
+def strip(binary: Path) -> None:
+    """Without symbols for debugging, if the loader takes it then.
+
+    Of some that auditwheel has patched, `strip` makes files that the loader refuses.
+    """
+    trial = binary.with_name(binary.name + ".stripped")
+    subprocess.run(["strip", "--strip-unneeded", "-o", trial, binary], check=True, stderr=subprocess.DEVNULL)
+    if loadable(trial) and trial.stat().st_size < binary.stat().st_size:
+        shutil.copymode(binary, trial)
+        trial.replace(binary)
+    else:
+        trial.unlink()
+
+
+def loadable(binary: Path) -> bool:
+    """Does every segment of a 64-bit ELF file lie in the file as it shall lie in memory, to a page? elf(5)"""
+    data = binary.read_bytes()
+    (table,), (entries,) = struct.unpack_from("<Q", data, 32), struct.unpack_from("<H", data, 56)
+    for k in range(entries):
+        kind, _, offset, address, _, _, _, align = struct.unpack_from("<IIQQQQQQ", data, table + 56 * k)
+        if kind == 1 and (address - offset) % align:  # PT_LOAD
+            return False
+    return True
+
+
+def link_twins(inside: Path) -> None:
+    """Of what several wheels bring (the same name but for the hash, the same symbols) one, and links."""
+    first: dict[tuple[str, frozenset[tuple[str, str]]], Path] = {}
+    for path in _bundled(inside, ("lib",)):
+        key = _HASH.sub("", path.name), frozenset(exported(path).items())
+        if (known := first.setdefault(key, path)) is not path:
+            path.unlink()
+            path.symlink_to(os.path.relpath(known, path.parent))
+
+
+def remove_dangling(inside: Path) -> None:
+    for path in inside.iterdir():
+        if path.is_symlink() and not path.exists():
+            path.unlink()
+
+
+def binaries(inside: Path) -> Iterator[Path]:
+    """Every ELF file."""
+    for path in sorted(inside.rglob("*.so*")):
+        if path.is_file() and not path.is_symlink():
+            with path.open("rb") as file:
+                if file.read(4) == _ELF:
+                    yield path
+
+
+def _bundled(inside: Path, begin: tuple[str, ...]) -> list[Path]:
+    """Libraries that wheels bring along (NAME.libs) whose names begin so."""
+    return sorted(
+        path
+        for path in inside.glob("*.libs/*")
+        if path.name.startswith(begin) and fnmatch(path.name, "*.so*") and not path.is_symlink()
+    )
