@@ -151,6 +151,7 @@ class AgentConfig:
     blend_s: float = 0.5  # over this time
     finish_s: float = 5.0  # how long the end of a run waits for acknowledgements
     error_model: str = "shipped"  # how wrong the tracker is: this, a file, or "" for odometry's sigma
+    tell_placement: bool = False  # the edge is told, too, how unsurely the map placed this agent
 
     def __post_init__(self) -> None:
         _require_positive(self, "keep_keyframes", "blend_s")

@@ -6,6 +6,7 @@ give the same effects. Odometry passes through untouched: the edge only moves th
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from typing import Any
 
@@ -151,8 +152,13 @@ class Agent:
         self._drift.sent(keyframe, frame.arrived_ns)
         if self._connected and self._clock.rtt_ms is not None:
             delay_ms = self._clock.rtt_ms + max(0.0, frame.track_ms)
-            error_cm = self._drift.expected_cm(frame.error_cm, now_ns)
-            self._send(m.Evaluation(keyframe.id, delay_ms, error_cm))
+            self._send(m.Evaluation(keyframe.id, delay_ms, self._expected_cm(frame.error_cm, now_ns)))
+
+    def _expected_cm(self, local_cm: float | None, now_ns: int) -> float | None:
+        drift_cm = self._drift.expected_cm(local_cm, now_ns)
+        if drift_cm is None or self._T_odom_body is None or not self._config.agent.tell_placement:
+            return drift_cm
+        return math.hypot(drift_cm, self._map.spread_cm(self._T_odom_body))
 
     def _localised(self, frame: ev.FrameTracked, T_odom_body: F64, now_ns: int) -> None:
         self._T_odom_body = T_odom_body
@@ -253,7 +259,7 @@ class Agent:
         self._revision = correction.revision
         self._counts["corrections"] += 1
         T_odom_body = correction.T_map_odom if self._T_odom_body is None else self._T_odom_body
-        new_map = self._map.correct(correction.T_map_odom, correction.map_id, T_odom_body, now_ns)
+        new_map = self._map.correct(correction, T_odom_body, now_ns)
         self._drift.answered(correction.answers)
         entry = self._ledger.find(correction.answers)
         corrected_ms = None

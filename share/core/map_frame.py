@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from share.config import AgentConfig
 from share.core.rate import SECOND_NS
 from share.geometry import se3
-from share.types import F64
+from share.types import F64, Correction
 
 
 class MapFrame:
@@ -21,6 +23,7 @@ class MapFrame:
         self.map_id: str | None = None
         self._config = config
         self._target: F64 | None = None
+        self._cov: F64 = np.zeros((6, 6))  # of the target
         self._xi: F64 = np.zeros(6)  # from the target back to what was in force when the blend began
         self._began_ns = 0
 
@@ -33,12 +36,21 @@ class MapFrame:
             return self._target
         return self._target @ se3.exp(min(left, 1.0) * self._xi)
 
-    def correct(self, T_map_odom: F64, map_id: str, T_odom_body: F64, now_ns: int) -> bool:
+    def spread_cm(self, T_odom_body: F64) -> float:
+        """cm, how unsure the body's place in the map is because that of odometry is; 0 without one."""
+        if self._target is None:
+            return 0.0
+        cov = se3.compose_cov(T_odom_body, self._cov, np.zeros((6, 6)))
+        return 100 * math.sqrt(np.trace(cov[3:, 3:]))
+
+    def correct(self, correction: Correction, T_odom_body: F64, now_ns: int) -> bool:
         """A new target from now on. Returns whether it lies in another map."""
+        T_map_odom, map_id = correction.T_map_odom, correction.map_id
         now, same_map = self.at(now_ns), map_id == self.map_id
         blend = now is not None and same_map and self._is_large(now, T_map_odom, T_odom_body)
         self._xi = se3.log(se3.inverse(T_map_odom) @ now) if blend and now is not None else np.zeros(6)
         self._target, self._began_ns, self.map_id = T_map_odom, now_ns, map_id
+        self._cov = correction.cov
         return not same_map
 
     def forget(self) -> None:

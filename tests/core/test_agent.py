@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from model_edge import COV, HELLO, MS, S, handle, tracked
 
-from share.config import ClockConfig, Config
+from share.config import AgentConfig, ClockConfig, Config
 from share.core import events as ev
 from share.core.agent import Agent
 from share.errors import UsageError
@@ -434,3 +434,15 @@ def test_the_report_is_plain_data() -> None:
     assert all(value is None or type(value) in (int, float, str, bool) for value in report.values())
     assert (report["sent"], report["acknowledged"], report["open"]) == (1, 1, 0)
     assert report["bytes_up"] > report["bytes_down"] > 0
+
+
+def test_an_agent_may_tell_how_unsurely_the_map_placed_it() -> None:
+    agent = welcomed(Config(agent=AgentConfig(tell_placement=True)))
+    [ping] = only(m.Ping, handle(agent, ev.Tick(), 500 * MS), messages=True)
+    tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
+    handle(agent, tracked(10, pose(3), candidate=True), 510 * MS)
+    tell(agent, correction(pose(), 1, answers=0), 520 * MS)
+    effects = handle(agent, tracked(11, pose(3), candidate=True), 560 * MS)
+    [told] = only(m.Evaluation, effects, messages=True)
+    since = se3.compose_cov(pose(3), COV, COV)  # of odometry in the map, then of one motion
+    assert told.error_cm == pytest.approx(100 * np.sqrt(np.trace(since[3:, 3:])))
