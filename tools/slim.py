@@ -8,19 +8,18 @@ import shutil
 import struct
 import subprocess
 from collections.abc import Iterator
-from fnmatch import fnmatch
 from pathlib import Path
 
 from stub_library import exported, needed, wanted, write_forward, write_hollow
 
 # Who asks for them, and what is hollowed out: video for cv2's VideoCapture, pictures that Pillow knows
 # beside PNG (matplotlib writes no other). They say so and abort.
+# But cv2 tries AVIF on whatever it is to decode: a libaom that answers finds no picture there.
 HOLLOW = (
-    (["cv2/cv2*.so"], ("libavcodec", "libavformat", "libavutil", "libswscale")),
-    (["PIL/_imaging.*.so", "pillow.libs/libtiff-*"], ("libjpeg", "libzstd", "liblzma", "libxcb")),
+    (["cv2/cv2*.so"], ("libavcodec", "libavformat", "libavutil", "libswscale"), False),
+    (["PIL/_imaging.*.so", "pillow.libs/libtiff-*"], ("libjpeg", "libzstd", "liblzma", "libxcb"), False),
+    (["opencv_python_headless.libs/libavif-*"], ("libaom",), True),
 )
-# cv2 tries AVIF on whatever it is to decode. Without libaom it finds no picture there, and says so.
-SILENT = ((["opencv_python_headless.libs/libavif-*"], ("libaom",)),)
 _HASH = re.compile(r"(-[0-9a-f]{8})+(?=\.so)")  # auditwheel's
 _ELF = b"\x7fELF"
 
@@ -30,11 +29,10 @@ def slim(inside: Path) -> None:
 
     Raises subprocess.CalledProcessError where a tool fails, and what `one_blas` does.
     """
-    for table, answers in ((HOLLOW, False), (SILENT, True)):
-        for patterns, names in table:
-            users = [user for pattern in patterns for user in inside.glob(pattern)]
-            for library in _bundled(inside, names):
-                write_hollow(library, wanted(users, library), answers)
+    for patterns, names, answers in HOLLOW:
+        users = [user for pattern in patterns for user in inside.glob(pattern)]
+        for library in _bundled(inside, names):
+            write_hollow(library, wanted(users, library), answers)
     one_blas(inside)
     remove_orphans(inside)
     for binary in binaries(inside):
@@ -50,8 +48,8 @@ def one_blas(inside: Path) -> None:
     """
     (ours,), (theirs,) = _bundled(inside, ("libopenblasp",)), _bundled(inside, ("libscipy_openblas-",))
     symbols = wanted(inside.glob("cv2/cv2*.so"), ours)
-    prefix = "scipy_"
-    if missing := [name for name in symbols if prefix + name not in exported(theirs)]:
+    prefix, there = "scipy_", exported(theirs)
+    if missing := [name for name in symbols if prefix + name not in there]:
         raise KeyError(f"{theirs.name} has no {', '.join(missing)}; leave cv2 its own OpenBLAS")
     write_forward(ours, symbols, prefix, theirs)
 
@@ -120,7 +118,5 @@ def binaries(inside: Path) -> Iterator[Path]:
 def _bundled(inside: Path, begin: tuple[str, ...]) -> list[Path]:
     """Libraries that wheels bring along (NAME.libs) whose names begin so."""
     return sorted(
-        path
-        for path in inside.glob("*.libs/*")
-        if path.name.startswith(begin) and fnmatch(path.name, "*.so*") and not path.is_symlink()
+        path for path in inside.glob("*.libs/*.so*") if path.name.startswith(begin) and not path.is_symlink()
     )

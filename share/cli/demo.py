@@ -65,7 +65,7 @@ def demo(
     options.load_config(config_file)  # what is wrong with this and the link is said before anything is made
     if policy == STREAMED and true_error:
         raise UsageError("--true-error: is of agents that track themselves; leave it out by policy streamed")
-    from share.emulate.demo import AGENTS, recipe
+    from share.emulate.demo import AGENTS, meeting_seed, recipe
     from share.emulate.session import cached_session
     from share.io.files import writable_dir
     from share.io.machine import cores
@@ -76,10 +76,12 @@ def demo(
 
     Links.parse(link).check(AGENTS)
     writable_dir(folder)
+    room = _drawable(scene)
+    seed = meeting_seed(room) if seed is None else seed
     with Stages() as stages:
-        session = read_session(cached_session(recipe(_drawable(scene), seconds, seed), progress=stages))
+        session = read_session(cached_session(recipe(room, seconds, seed), progress=stages))
     live = LiveLine()
-    terms = Terms(policy, link, seed or 0, true_error, config=config_file, agents_first=True)
+    terms = Terms(policy, link, seed, true_error, config=config_file, agents_first=True)
     folders = play(session, seconds, terms, folder, lambda now: live.write(str(now)))
     live.end()
     result = score(session, folders)
