@@ -29,8 +29,8 @@ class Health(Enum):
 
 
 class Watchdog:
-    """Silence of the IMU: one reset, then vision only. Silence of the images, or a device that is
-    gone: reconnect, again and again. Silence is not counted in the first warm_up_ms after a connection.
+    """Silence of the IMU while images come: one reset, then vision only. Silence of the images, or a device
+    that is gone: reconnect, again and again. Silence is not counted in the first warm_up_ms after a connection.
     `resets` and `reconnections` are counted.
     """
 
@@ -86,7 +86,8 @@ class Watchdog:
             self.lost(now_ns)
             return Action.RECONNECT
         if self._has_imu:
-            return self._watch_imu(now_ns, now_ns - self._imu_ns > self._silent_ns)
+            latest_ns = self._image_ns if self._has_images else now_ns  # all fall silent: it is gone
+            return self._watch_imu(now_ns, latest_ns - self._imu_ns > self._silent_ns)
         return Action.NOTHING
 
     def _retry(self, now_ns: int) -> Action:

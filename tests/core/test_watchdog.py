@@ -48,6 +48,14 @@ def test_a_lost_camera_is_looked_for_once_a_second_until_it_is_there() -> None:
     assert dog.resets == 0
 
 
+def test_an_unplugged_camera_is_lost_and_not_reset_though_its_last_image_came_after_the_imu() -> None:
+    dog = Watchdog(0)
+    run(dog, 0, 5000, "cam0", "imu")
+    run(dog, 5000, 5300, "cam0")  # what was still under way
+    assert run(dog, 5300, 6400) == [Action.RECONNECT]
+    assert (dog.health, dog.resets) == (Health.AWAY, 0)
+
+
 def test_without_images_a_silent_imu_is_a_lost_camera_after_its_reset() -> None:
     dog = Watchdog(0, has_images=False)
     assert run(dog, 0, 5000) == [Action.RESET]
