@@ -151,7 +151,7 @@ class AgentConfig:
     blend_s: float = 0.5  # over this time
     finish_s: float = 5.0  # how long the end of a run waits for acknowledgements
     error_model: str = "shipped"  # how wrong the tracker is: this, a file, or "" for odometry's sigma
-    tell_placement: bool = False  # the edge is told, too, how unsurely the map placed this agent
+    tell_placement: bool = True  # the edge is told how unsurely the map placed this agent, too
 
     def __post_init__(self) -> None:
         _require_positive(self, "keep_keyframes", "blend_s")
@@ -298,7 +298,7 @@ class ControlConfig:
     """How agents are rated, what they may send, what is merged (docs/scheduling.md)."""
 
     ar_beta: float = 0.015  # 1/ms, of delay beyond 20 ms
-    ar_gamma: float = 1.2  # cm, of accuracy
+    ar_gamma: float = 3.6  # cm, of accuracy
     ar_target: float = 0.93  # QoE that is aimed at
     robot_beta: float = 3.0  # cm, of accuracy short of 1/cm
     robot_gamma: float = 400.0  # ms, of 1 / (delay + theta)

@@ -282,7 +282,10 @@ class ModelledMapper:
     def _correction(self, run: _Run, answer: int) -> Correction:
         run.told = run.map_of
         at = self._stored[run.numbers[answer]]  # -1: the newest
-        xi = self._rng.standard_normal(6) * ([0.0, 0.0, self._odds.sigma_rad] + [self._odds.sigma_m] * 3)
+        sigma = np.array([0.0, 0.0, self._odds.sigma_rad] + [self._odds.sigma_m] * 3)
+        xi = self._rng.standard_normal(6) * sigma
         T_map_body = self._T_map_world[run.map_of] @ at.T_world_body @ se3.exp(xi)
-        T_map_odom = T_map_body @ se3.inverse(at.keyframe.T_odom_body)
-        return Correction(se3.orthonormal(T_map_odom), np.zeros((6, 6)), run.map_of, 0, answer)
+        T_odom_body = at.keyframe.T_odom_body
+        T_map_odom = se3.orthonormal(T_map_body @ se3.inverse(T_odom_body))
+        cov = se3.inverse_cov(T_odom_body, np.diag(sigma**2))
+        return Correction(T_map_odom, cov, run.map_of, 0, answer)

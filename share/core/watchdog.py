@@ -30,8 +30,8 @@ class Health(Enum):
 
 class Watchdog:
     """Silence of the IMU while images come: one reset, then vision only. Silence of the images, or a device
-    that is gone: reconnect, again and again. Silence is not counted in the first warm_up_ms after a connection.
-    `resets` and `reconnections` are counted.
+    that is gone: reconnect, again and again. Silence is not counted in the first warm_up_ms after a
+    connection. `resets` and `reconnections` are counted.
     """
 
     def __init__(

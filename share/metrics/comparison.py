@@ -49,6 +49,8 @@ MEASURES = (
     Measure("merges a metre", "1/m", lambda run: run.merges_per_metre),
     Measure("AR ATE in the map", "cm", _mean("ar", lambda a: a.ate_cm)),
     Measure("robot ATE in the map", "cm", _mean("robot", lambda a: a.ate_cm)),
+    Measure("AR error told", "cm", _mean("ar", lambda a: a.told_cm)),
+    Measure("robot error told", "cm", _mean("robot", lambda a: a.told_cm)),
     Measure("joint ATE", "cm", lambda run: run.joint_ate_cm),
     Measure("AR RPE over 1 s", "cm", _mean("ar", lambda a: a.rpe_1s_cm)),
     Measure("AR until in a shared map", "s", _mean("ar", lambda a: a.joined_s)),

@@ -23,7 +23,8 @@ class AgentFigures:
     latency_ms and its parts: docs/evaluation.md. odom_ate_cm: alone, SE3-aligned. ate_cm: of
     the in_map frames that have a pose in the shared map, one alignment for all who are in it; NaN for who
     did not come into it. rpe_*: of poses in the map, rms, from frame to frame and over 1 s. metres: how far
-    it went. joined_s: since the first agent came, until it shared a map. qoe: mean over evaluations.
+    it went. joined_s: since the first agent came, until it shared a map. qoe: mean over evaluations;
+    told_cm: rms of the errors that they told.
     """
 
     agent: str
@@ -55,6 +56,7 @@ class AgentFigures:
     kb_down_s: float
     cpu_ms_per_frame: float
     qoe: float
+    told_cm: float
 
 
 @dataclass(frozen=True)

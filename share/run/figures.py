@@ -15,7 +15,9 @@ from share.metrics.figures import AgentFigures, Conditions, RunFigures
 from share.metrics.rpe import Rpe, rpe_frames, rpe_time
 from share.metrics.together import Together
 from share.run.score import AgentScore, SessionScore, score
+from share.run.traces import Trace
 from share.run.trial import Trial
+from share.types import F64
 
 
 def figures(trial: Trial) -> RunFigures:
@@ -47,7 +49,7 @@ def _of_agent(
     track, corrected = report["track_ms"], report["corrected_ms"]
     frame, second = _rpe(one, rpe_frames), _rpe(one, rpe_time)
     span_s = float(one.truth.stamps_ns[-1] - one.truth.stamps_ns[0]) / 1e9
-    qoe = [value for value in edge["series"].get(name, {}).get("qoe", []) if value is not None]
+    trace = Trace.of(edge["series"].get(name, {}))
     return AgentFigures(
         agent=name,
         kind=kind,
@@ -77,7 +79,8 @@ def _of_agent(
         kb_up_s=report["bytes_up"] / 1e3 / span_s,
         kb_down_s=report["bytes_down"] / 1e3 / span_s,
         cpu_ms_per_frame=_number(report["cpu_ms_per_frame"]),
-        qoe=float(np.mean(qoe)) if qoe else math.nan,
+        qoe=_mean(trace.qoe),
+        told_cm=math.sqrt(_mean(trace.error_cm**2)),
     )
 
 
@@ -109,6 +112,12 @@ def _joined(events: Path) -> dict[str, float]:
 
 def _cm(ate: Ate | None) -> float:
     return math.nan if ate is None else 100 * ate.rmse
+
+
+def _mean(values: F64) -> float:
+    """Of those that are known."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) else math.nan
 
 
 def _number(value: float | None) -> float:

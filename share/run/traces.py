@@ -17,20 +17,23 @@ _MERGES = ("loop accepted", "maps joined")
 @dataclass(frozen=True, eq=False)
 class Trace:
     """Of one agent, at its E evaluations: seconds (E,) since the edge began, qoe (E,), rate_hz (E,), NaN
-    where there was no limit."""
+    where there was no limit, error_cm (E,) as it told it, NaN where it had no estimate."""
 
     seconds: F64
     qoe: F64
     rate_hz: F64
+    error_cm: F64
+
+    @classmethod
+    def of(cls, series: dict[str, list[float | None]]) -> Trace:
+        """From an agent's part of the `series` in edge.json."""
+        return cls(*(_numbers(series.get(key, [])) for key in ("t_s", "qoe", "rate_hz", "error_cm")))
 
 
 def traces(trial: Trial) -> dict[str, Trace]:
     """By agent. Raises DataError on damaged files."""
     series = read_json(trial.folder / "edge" / "edge.json")["series"]
-    return {
-        name: Trace(*(_numbers(series.get(name, {}).get(key, [])) for key in ("t_s", "qoe", "rate_hz")))
-        for name in trial.session.agents
-    }
+    return {name: Trace.of(series.get(name, {})) for name in trial.session.agents}
 
 
 def merges(trial: Trial) -> F64:

@@ -297,7 +297,7 @@ def test_views_that_see_far_are_preferred_and_the_rate_is_kept() -> None:
 
 
 def test_a_correction_sets_back_what_odometry_may_have_lost() -> None:
-    agent, errors_cm = welcomed(), []
+    agent, errors_cm = welcomed(Config(agent=AgentConfig(tell_placement=False))), []
     [ping] = only(m.Ping, handle(agent, ev.Tick(), 500 * MS), messages=True)
     tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
     for k in range(12):
@@ -436,13 +436,15 @@ def test_the_report_is_plain_data() -> None:
     assert report["bytes_up"] > report["bytes_down"] > 0
 
 
-def test_an_agent_may_tell_how_unsurely_the_map_placed_it() -> None:
-    agent = welcomed(Config(agent=AgentConfig(tell_placement=True)))
+@pytest.mark.parametrize("placement", [True, False])
+def test_an_agent_tells_how_unsurely_the_map_placed_it(placement: bool) -> None:
+    agent = welcomed(Config(agent=AgentConfig(tell_placement=placement)))
     [ping] = only(m.Ping, handle(agent, ev.Tick(), 500 * MS), messages=True)
     tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
     handle(agent, tracked(10, pose(3), candidate=True), 510 * MS)
     tell(agent, correction(pose(), 1, answers=0), 520 * MS)
     effects = handle(agent, tracked(11, pose(3), candidate=True), 560 * MS)
     [told] = only(m.Evaluation, effects, messages=True)
-    since = se3.compose_cov(pose(3), COV, COV)  # of odometry in the map, then of one motion
-    assert told.error_cm == pytest.approx(100 * np.sqrt(np.trace(since[3:, 3:])))
+    # of one motion, after that of odometry in the map
+    cov = se3.compose_cov(pose(3), COV, COV) if placement else COV
+    assert told.error_cm == pytest.approx(100 * np.sqrt(np.trace(cov[3:, 3:])))

@@ -69,6 +69,13 @@ def test_a_placed_agent_is_where_it_is_but_for_the_drawn_error() -> None:
         assert bool(abs(apart - true) > 0.03) is (odds is not sure)
 
 
+def test_an_agent_is_told_how_sure_its_place_is_as_it_was_drawn() -> None:
+    for sigma_m in (0.006, 0.02):
+        told = played(odds=Odds(sigma_m=sigma_m, sigma_rad=0.0)).edge.series()["ann"]["error_cm"][-1]
+        sure = played(odds=Odds(sigma_m=0.0, sigma_rad=0.0)).edge.series()["ann"]["error_cm"][-1]
+        assert told == pytest.approx(np.hypot(100 * sigma_m * np.sqrt(3), sure), rel=0.05)
+
+
 def test_views_that_share_nothing_are_never_merged() -> None:
     room = played(odds=Odds(half=5.0, width=0.01))
     report = room.edge.report(room.mapper.report())
