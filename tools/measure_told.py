@@ -1,6 +1,6 @@
 """Whether agents know how far they are off: the errors that they tell the edge, against the truth.
 
-    python tools/measure_told.py RUN… [--by SECTION.NAME] [--picture FILE]
+    python tools/measure_told.py RUN… [--by policy|SECTION.NAME] [--picture FILE]
 
 A RUN is a folder by `share evaluate run`, or one by `sweep` or `ablation` with its runs. Prints a Markdown
 table, a row for each kind of agent (and each value of the setting): of N evaluations while an agent is in the
@@ -51,7 +51,7 @@ class Pairs:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
-    parser.add_argument("--by", metavar="SECTION.NAME", help="rows of their own for each value of a setting")
+    parser.add_argument("--by", metavar="WHAT", help="rows of their own for each value")
     parser.add_argument("--picture", type=Path, help="true errors over those told")
     options = parser.parse_args()
     return exit_code("measure_told", lambda: measure(options))
@@ -60,8 +60,9 @@ def main() -> int:
 def measure(options: argparse.Namespace) -> None:
     rows: dict[str, list[Pairs]] = defaultdict(list)
     for folder in (one for top in options.runs for one in _runs(top)):
-        value = _setting(folder, options.by) if options.by else ""
-        for pairs in told_and_true(read_trial(folder)):
+        trial = read_trial(folder)
+        value = _setting(trial, options.by) if options.by else ""
+        for pairs in told_and_true(trial):
             rows[f"{pairs.kind} {value}".strip()].append(pairs)
     if not rows:
         raise UsageError("nobody told an error while in a map; is there a run with an error model?")
@@ -100,13 +101,15 @@ def _runs(top: Path) -> list[Path]:
     return found
 
 
-def _setting(folder: Path, name: str) -> str:
+def _setting(trial: Trial, name: str) -> str:
     import yaml
 
-    value: Any = yaml.safe_load((folder / SETTINGS).read_text())
+    if name == "policy":
+        return trial.terms.policy
+    value: Any = yaml.safe_load((trial.folder / SETTINGS).read_text())
     for part in name.split("."):
         if not isinstance(value, dict) or part not in value:
-            raise UsageError(f"--by {name}: is not a setting in {folder / SETTINGS}")
+            raise UsageError(f"--by {name}: is not a setting in {trial.folder / SETTINGS}")
         value = value[part]
     return str(value)
 
