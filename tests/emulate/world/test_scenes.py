@@ -113,7 +113,7 @@ def test_one_can_walk_round(name: str, size: tuple[float, float, float] | None, 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["warehouse", "firestation"])
 def test_one_can_walk_round_in_every_small_room(name: str) -> None:
-    """The fullest of 60 has 0.346 of its floor free on one machine; which room that is may differ by machine."""
+    """The fullest of 60 has 0.346 of its floor free on one machine; which it is may differ by machine."""
     for seed in range(60):
         share, connected = free_share(layout(name, seed, SMALL))
         assert share >= 0.33, seed
