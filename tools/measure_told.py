@@ -31,8 +31,9 @@ from share.errors import UsageError  # noqa: E402
 from share.geometry.se3 import transform  # noqa: E402
 from share.io.json_file import read_json_lines  # noqa: E402
 from share.metrics.association import associate  # noqa: E402
+from share.metrics.spread import spread  # noqa: E402
 from share.run.score import score  # noqa: E402
-from share.run.traces import traces  # noqa: E402
+from share.run.traces import began_s, traces  # noqa: E402
 from share.run.trial import RUN, SETTINGS, Trial, read_trial  # noqa: E402
 from share.types import F64  # noqa: E402
 
@@ -78,8 +79,7 @@ def told_and_true(trial: Trial) -> Iterator[Pairs]:
     found = score(trial.session, trial.folders)
     if found.joint is None:
         return
-    events = read_json_lines(trial.folder / "edge" / "events.jsonl")
-    began_s = next((e["t_s"] for e in events if e["event"] == "joined the edge"), 0.0)
+    began = began_s(read_json_lines(trial.folder / "edge" / "events.jsonl"))
     first_ns = min(int(agent.truth.stamps_ns[0]) for agent in found.agents.values())
     for name, trace in traces(trial).items():
         estimate, truth = found.agents[name].map, found.agents[name].truth
@@ -88,7 +88,7 @@ def told_and_true(trial: Trial) -> Iterator[Pairs]:
         stamps_ns, T_est, T_truth = associate(estimate, truth)
         placed = transform(found.joint.joint.T_truth_est, T_est[:, :3, 3])
         error_cm = 100 * np.linalg.norm(placed - T_truth[:, :3, 3], axis=1)
-        frames_s, at_s = (stamps_ns - first_ns) * 1e-9, trace.seconds - began_s
+        frames_s, at_s = (stamps_ns - first_ns) * 1e-9, trace.seconds - began
         then = (frames_s[0] <= at_s) & (at_s <= frames_s[-1]) & (trace.error_cm > 0)  # NaN: not told
         true_cm = np.interp(at_s[then], frames_s, error_cm)
         yield Pairs(str(trial.session.agents[name].kind), trace.error_cm[then], true_cm)
@@ -116,14 +116,12 @@ def _setting(trial: Trial, name: str) -> str:
 
 def _figures(of: list[Pairs]) -> list[str]:
     told, true = (np.concatenate([getattr(pairs, what) for pairs in of]) for what in ("told_cm", "true_cm"))
-    runs = np.array([[_rms(pairs.told_cm), _rms(pairs.true_cm)] for pairs in of if len(pairs.told_cm)])
-    cells = [f"{_rms(told):.2f}", f"{_rms(true):.2f}", f"{np.median(true / told):.2f}"]
+    runs = np.array(
+        [[spread(pairs.told_cm).rmse, spread(pairs.true_cm).rmse] for pairs in of if len(pairs.told_cm)]
+    )
+    cells = [f"{spread(told).rmse:.2f}", f"{spread(true).rmse:.2f}", f"{np.median(true / told):.2f}"]
     cells += f"{100 * np.mean(true <= 2 * told):.0f}", f"{_rank(told, true):.2f}", f"{_rank(*runs.T):.2f}"
     return [str(len(runs)), str(len(told)), *cells]
-
-
-def _rms(values: F64) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _rank(a: F64, b: F64) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -36,10 +37,15 @@ def traces(trial: Trial) -> dict[str, Trace]:
     return {name: Trace.of(series.get(name, {})) for name in trial.session.agents}
 
 
+def began_s(events: list[dict[str, Any]]) -> float:
+    """When the first agent joined the edge, by the edge's clock: where the truth begins. 0 if none did."""
+    return next((e["t_s"] for e in events if e["event"] == "joined the edge"), 0.0)
+
+
 def merges(trial: Trial) -> F64:
     """How far all agents together had gone by each merge, m (M,). Raises DataError on damaged files."""
     events = read_json_lines(trial.folder / "edge" / "events.jsonl")
-    began = next((e["t_s"] for e in events if e["event"] == "joined the edge"), 0.0)
+    began = began_s(events)
     done_s = np.array([e["t_s"] - began for e in events if e["event"] in _MERGES], float)
     gone = np.zeros(len(done_s))
     for name in trial.session.agents:

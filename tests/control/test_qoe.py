@@ -64,8 +64,12 @@ def test_default_needs_are_about_met_where_they_should_be() -> None:
     ar, robot = (Needs.of(ControlConfig(), kind) for kind in (AgentKind.AR, AgentKind.ROBOT))
     assert abs(qoe(20, 1.35, ar) - ar.target) < 0.02
     assert qoe(200, 0.5, robot) < robot.target < qoe(100, 0.5, robot)
-    for needs, delay_ms in ((ar, 200), (robot, 1000)):
-        assert qoe(10, 0.1, needs) > 0.98 and qoe(delay_ms, 0.5, needs) < 0.35 and qoe(10, 30, needs) < 0.15
+    for needs, delay_ms, wrong_cm in ((ar, 200, 30), (robot, 1000, 10)):
+        assert (
+            qoe(10, 0.1, needs) > 0.98
+            and qoe(delay_ms, 0.5, needs) < 0.35
+            and qoe(10, wrong_cm, needs) < 0.15
+        )
 
 
 def test_the_table_of_the_documentation_is_so() -> None:

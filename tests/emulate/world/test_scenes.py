@@ -113,10 +113,9 @@ def test_one_can_walk_round(name: str, size: tuple[float, float, float] | None, 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["warehouse", "firestation"])
 def test_one_can_walk_round_in_every_small_room(name: str) -> None:
-    """The fullest of 60 has 0.346 of its floor free on one machine; which it is may differ by machine."""
     for seed in range(60):
         share, connected = free_share(layout(name, seed, SMALL))
-        assert share >= 0.33, seed
+        assert share >= 0.35, seed
         assert connected > 0.97, seed
 
 
