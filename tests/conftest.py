@@ -4,6 +4,7 @@ from share import process
 
 process.prepare()
 
+import signal  # noqa: E402
 from collections.abc import Callable  # noqa: E402
 from pathlib import Path  # noqa: E402
 
@@ -12,6 +13,9 @@ import pytest  # noqa: E402
 from shell import Done  # noqa: E402
 
 from share.cli.main import main  # noqa: E402
+
+# Where tests run in the background of a shell, Ctrl-C is ignored, by all that they start too.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

@@ -19,12 +19,13 @@ from share.emulate.world.furniture import (
 )
 from share.emulate.world.layout import Layout
 from share.emulate.world.materials import Material
-from share.emulate.world.scenes import fill
+from share.emulate.world.scenes import fill, floor
 from share.emulate.world.scenes.fill import Maker
 from share.emulate.world.scenes.plan import Plan, Size, Wall, outer_walls
 from share.emulate.world.scenes.shell import enclose, joints, skirting
 
 _AISLE = 1.75  # m; round the vehicles
+_WALK = 0.3  # of the floor, at least, is left to walk on
 
 
 def firestation(seed: int, size: Size) -> Layout:
@@ -41,6 +42,7 @@ def firestation(seed: int, size: Size) -> Layout:
         fill.along(plan, wall, _GEAR, (0.4, 1.7))
         fill.hang(plan, wall, _HANGINGS, max(1, int(0.45 * wall.length)), 2.4)
     _light(plan, walls)
+    floor.clear(plan, _WALK, _GEAR)
     return plan.done(ambient=0.3)
 
 
