@@ -28,9 +28,9 @@ import numpy as np  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share.errors import UsageError  # noqa: E402
-from share.geometry.se3 import transform  # noqa: E402
 from share.io.json_file import read_json_lines  # noqa: E402
 from share.metrics.association import associate  # noqa: E402
+from share.metrics.ate import position_errors  # noqa: E402
 from share.metrics.spread import spread  # noqa: E402
 from share.run.score import score  # noqa: E402
 from share.run.traces import began_s, traces  # noqa: E402
@@ -86,8 +86,7 @@ def told_and_true(trial: Trial) -> Iterator[Pairs]:
         if estimate is None or name not in found.joint.agents:
             continue
         stamps_ns, T_est, T_truth = associate(estimate, truth)
-        placed = transform(found.joint.joint.T_truth_est, T_est[:, :3, 3])
-        error_cm = 100 * np.linalg.norm(placed - T_truth[:, :3, 3], axis=1)
+        error_cm = 100 * position_errors(found.joint.joint.T_truth_est, T_est, T_truth)
         frames_s, at_s = (stamps_ns - first_ns) * 1e-9, trace.seconds - began
         then = (frames_s[0] <= at_s) & (at_s <= frames_s[-1]) & (trace.error_cm > 0)  # NaN: not told
         true_cm = np.interp(at_s[then], frames_s, error_cm)

@@ -55,7 +55,7 @@ def ate(
     _, T_est, T_truth = associate(estimate, truth, max_gap_ns)
     require(len(T_est), _LEAST[alignment], "ATE")
     T = _align(T_est, T_truth, alignment)
-    return _ate(spread(_errors(T, T_est, T_truth)), T)
+    return _ate(spread(position_errors(T, T_est, T_truth)), T)
 
 
 def joint_ate(
@@ -73,8 +73,14 @@ def joint_ate(
     require(sum(len(T) for T, _ in associated.values()), _LEAST[alignment], "joint ATE")
     all_est, all_truth = (np.concatenate(side) for side in zip(*associated.values(), strict=True))
     T = _align(all_est, all_truth, alignment)
-    agents = {name: _ate(spread(_errors(T, *pair)), T) for name, pair in associated.items()}
-    return JointAte(_ate(spread(_errors(T, all_est, all_truth)), T), agents)
+    agents = {name: _ate(spread(position_errors(T, *pair)), T) for name, pair in associated.items()}
+    return JointAte(_ate(spread(position_errors(T, all_est, all_truth)), T), agents)
+
+
+def position_errors(T_truth_est: F64, T_est: F64, T_truth: F64) -> F64:
+    """Distances (N,) m of associated poses (N, 4, 4) under an alignment (4, 4)."""
+    out: F64 = np.linalg.norm(transform(T_truth_est, T_est[:, :3, 3]) - T_truth[:, :3, 3], axis=1)
+    return out
 
 
 def _align(T_est: F64, T_truth: F64, alignment: Alignment) -> F64:
@@ -84,11 +90,6 @@ def _align(T_est: F64, T_truth: F64, alignment: Alignment) -> F64:
         T: F64 = T_truth[0] @ inverse(T_est[0])
         return T
     return np.eye(4)
-
-
-def _errors(T: F64, T_est: F64, T_truth: F64) -> F64:
-    out: F64 = np.linalg.norm(transform(T, T_est[:, :3, 3]) - T_truth[:, :3, 3], axis=1)
-    return out
 
 
 def _ate(s: Spread, T: F64) -> Ate:
