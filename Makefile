@@ -17,8 +17,10 @@ demo: install
 test: install
 	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile --ignore tests/run
 	$(BIN)/pytest tests/run  # real processes in real time: with the cores to themselves
+SLOW_ALONE := tests/run tests/frozen tests/tutorial  # in real time, or with their own processes
 slow: install
-	$(BIN)/pytest -m slow || test $$? -eq 5  # 5: none selected
+	$(BIN)/pytest -m slow -n auto --maxprocesses 4 --dist loadfile $(SLOW_ALONE:%=--ignore %)
+	$(BIN)/pytest -m slow $(SLOW_ALONE)
 train-test: install  # brings torch
 	$(PIP) -e '.[train]'
 	$(BIN)/pytest tests/train -m "slow or not slow"

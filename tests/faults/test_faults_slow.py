@@ -1,4 +1,4 @@
-"""How the inertial tracker bears each fault on its own, on 20 s of two walks. See tools/measure_faults.py.
+"""How the inertial tracker bears each fault on its own, on 20 s of a walk. See tools/measure_faults.py.
 
 What is not good enough yet is in `FAR` and `WRONG`, with the figure: once it is, it fails here
 until it is taken out.
@@ -23,10 +23,20 @@ TOOLS = Path(__file__).resolve().parents[2] / "tools"
 SESSIONS = {
     "warehouse": Recipe("warehouse", ("a=walk:",), 20.0, seed=7, profiles={"": "d435i:640x480@30"}),
     "firestation": Recipe("firestation", ("a=walk:",), 20.0, seed=3),
+    "firestation 11": Recipe("firestation", ("a=walk:",), 20.0, seed=11),
 }
+BORNE = [(session, fault) for session in ("warehouse", "firestation") for fault in FAULTS]
+# What goes along with a wearer does harm in one walk of three: 1.0, 5.5, 0.6 cm by seeds 3, 11, 12.
+BORNE[BORNE.index(("firestation", "mover_along"))] = ("firestation 11", "mover_along")
 TIMES, LEAST_CM = 2.0, 0.5  # as far off as without the fault; below LEAST_CM chance decides
-FAR = {("firestation", "imu_silent_1s"): "1.4 cm: 15 to 23 features in a turn"}
-WRONG = {("firestation", "imu_silent_1s"): "0.5 % of the frames"}
+FAR = {
+    ("firestation", "imu_silent_1s"): "1.4 cm: 15 to 23 features in a turn",
+    ("firestation 11", "mover_along"): "5.5 cm: half of the view goes along, before bare walls",
+}
+WRONG = {
+    ("firestation", "imu_silent_1s"): "0.5 % of the frames",
+    ("firestation 11", "mover_along"): "40 % of the frames",
+}
 
 
 @pytest.fixture(scope="module")
@@ -57,9 +67,8 @@ def each(not_yet):
             else ()
         )
 
-    keys = [(session, fault) for session in SESSIONS for fault in FAULTS]
     return pytest.mark.parametrize(
-        ("session", "fault"), [pytest.param(*key, marks=marks(key)) for key in keys]
+        ("session", "fault"), [pytest.param(*key, marks=marks(key)) for key in BORNE]
     )
 
 
