@@ -36,6 +36,10 @@ class Sought:
     error: F32
     along: F64
 
+    def due(self, camera: Camera) -> int:
+        """How many should be in view."""
+        return int(camera.inside(np.nan_to_num(self.expected, nan=-1e6), 0.0).sum())
+
 
 def seek(
     image: U8,

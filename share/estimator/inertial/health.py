@@ -1,4 +1,4 @@
-"""Whether images and IMU tell of one and the same motion."""
+"""Whether images and IMU tell of one motion, and whether the filter is where it takes itself to be."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from share.types import F64
 _OVER_S, _LEAST_S = 5.0, 1.0  # averaged over; of frames, before anything is said
 _BEGIN_S = 1.0  # in which a filter that has just begun finds its bearings
 _FEWEST = 25  # features that say something
+_ASTRAY, _REFUSED_S = 3, 1.0  # frames with nothing of what should be there; time with nothing believed
+_LONGEST_S = 0.2  # that one frame counts for
 _SURPRISED = 0.8  # of the median squared Mahalanobis distance, which is 0.05 to 0.6 where all is well
 
 
@@ -35,3 +37,31 @@ class Agreement:
     def sound(self) -> bool:
         """False where they contradict each other."""
         return self._seconds < _BEGIN_S + _LEAST_S or self._mean < _SURPRISED
+
+
+class Straying:
+    """Frames that show something and nothing of what they should, or for long nothing that is believed: then
+    the filter is wrong, and not the light. What has left the view tells nothing."""
+
+    def __init__(self, weak: int, blind: int) -> None:
+        """So many features are little to go by; with fewer than `blind` there is no seeing."""
+        self._weak, self._blind = weak, blind
+        self._frames, self._refused_s = 0, 0.0
+
+    def add(self, textured: bool, due: int, found: int, seen: int, seconds: float) -> None:
+        """A frame, `seconds` after the one before. textured: it shows something. Of the filter's features
+        `due` should be in view, `found` look as they should, `seen` were believed as well."""
+        if textured and due >= self._weak:
+            self._frames = self._frames + 1 if found < self._blind else 0
+        refused = textured and due >= self._blind and seen < self._blind
+        self._refused_s = self._refused_s + min(seconds, _LONGEST_S) if refused else 0.0
+
+    @property
+    def suspected(self) -> bool:
+        """True from the first such frame on."""
+        return self._frames > 0 or self._refused_s > 0
+
+    @property
+    def certain(self) -> bool:
+        """True where it has gone on for too long."""
+        return self._frames >= _ASTRAY or self._refused_s > _REFUSED_S

@@ -92,12 +92,11 @@ class Scene:
         if self._last is None:
             return Footing(np.zeros((0, 2), np.float32), np.zeros(0, bool), np.zeros(0), 0, int(sure.sum()))
         left, seen, ids = self._last
-        due = int(self._rig.cam0.inside(np.nan_to_num(left.expected, nan=-1e6), 0.0).sum())
         depth = np.full(len(seen), np.nan)
         _, was, now = np.intersect1d(ids, self.state.ids, return_indices=True)  # it may be a keyframe by now
         depth[np.flatnonzero(seen)[was]] = np.where(sure, self._distance(), np.nan)[now]
         found = left.found | seen
-        return Footing(left.px[found], seen[found], depth[found], due, int(sure.sum()))
+        return Footing(left.px[found], seen[found], depth[found], left.due(self._rig.cam0), int(sure.sum()))
 
     def _distance(self) -> F64:
         """z (N,) m in cam0 of the features."""

@@ -18,7 +18,7 @@ from share.estimator import relocalise
 from share.estimator.inertial import ekf, find, parsac
 from share.estimator.inertial.beginning import first_state, state_by_camera
 from share.estimator.inertial.features import Looks
-from share.estimator.inertial.health import Agreement
+from share.estimator.inertial.health import Agreement, Straying
 from share.estimator.inertial.imu import integrate
 from share.estimator.inertial.noise import louder, without
 from share.estimator.inertial.pivot import Pivot
@@ -40,8 +40,6 @@ _FAR_OFF_PX = 1.0  # median residual, from which derivatives are taken anew
 _MINORITY, _MAJORITY = 0.3, 0.7  # of what is found: believed by the filter; agreeing among itself
 _GAP_NS = 250_000_000  # between frames: more than an IMU of this sort is modelled for,
 _DOUBT = 0.02, 0.1, 0.3  # rad, m, m/s: how wrong the filter may be after it that believes nobody
-_LONGEST_S = 0.2  # that one frame counts for
-_ASTRAY, _REFUSED_S = 3, 1.0  # frames with nothing of what should be there; time with nothing believed
 _REST_RATE, _REST_M_S = 0.03, 0.02  # rad/s of a body at rest; m/s of its velocity
 _SLOW_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to a filter that knows it moves
 _PATIENCE = 10  # frames without a sample of the IMU, after which we begin without
@@ -64,7 +62,7 @@ class InertialTracker:
         self._image: U8 | None = None
         self._stamp_ns = self._keyframe_ns = self._keyframe_count = 0
         self._rate = np.zeros(3)
-        self._astray, self._refused_s = 0, 0.0  # see `_stray`
+        self._straying = Straying(config.weak, config.blind)
         self._agreement, self._surprise = Agreement(), np.zeros(0)  # of the frame
         self._waited = 0  # frames, for the IMU
         self._ready = False
@@ -102,7 +100,7 @@ class InertialTracker:
         new_stretch, self._new_stretch = self._new_stretch, False
         s = scene.state
         view = make_view(frame, self._rig, self._places_config.view_features, scene.depths(frame))
-        if not self._astray and not self._refused_s:
+        if not self._straying.suspected:
             self._places.add_keyframe(frame.image0, s.T @ s.T_body_cam)
             self._places.set_view(view)
         tilt = self._tilt(s)
@@ -146,9 +144,9 @@ class InertialTracker:
             self._rate = mean_rate(before, scene.state.T, frame.stamp_ns - self._stamp_ns)
         count = int(seen.sum())
         textured = count >= self._config.blind or corners.count(frame.image0) >= self._config.weak
-        self._stray(frame, textured, left, count)
+        self._straying.add(textured, left.due(self._rig.cam0), int(left.found.sum()), count, since_s)
         state = self._judge(scene.state, count, heard)
-        if not self._trusted(scene.state) or self._gone_astray:
+        if not self._trusted(scene.state) or self._straying.certain:
             return self._lose(frame)
         if state is TrackState.LOST:
             return TrackResult(state, None)
@@ -295,21 +293,6 @@ class InertialTracker:
             return TrackState.VISION_ONLY
         return TrackState.OK if count >= config.weak else TrackState.WEAK
 
-    def _stray(self, frame: Frame, textured: bool, left: find.Sought, seen: int) -> None:
-        """Frames that show something and nothing of what they should, or for long nothing that is believed:
-        then the filter is wrong, and not the light. What has left the view tells nothing."""
-        config = self._config
-        due = int(self._rig.cam0.inside(np.nan_to_num(left.expected, nan=-1e6), 0.0).sum())
-        if textured and due >= config.weak:
-            self._astray = self._astray + 1 if left.found.sum() < config.blind else 0
-        refused = textured and due >= config.blind and seen < config.blind
-        lasted = min((frame.stamp_ns - self._stamp_ns) * 1e-9, _LONGEST_S)
-        self._refused_s = self._refused_s + lasted if refused else 0.0
-
-    @property
-    def _gone_astray(self) -> bool:
-        return self._astray >= _ASTRAY or self._refused_s > _REFUSED_S
-
     def _trusted(self, s: State) -> bool:
         """Finite, no faster than a person or robot can be, and not gone too far unseen."""
         finite = np.isfinite(s.T).all() and np.isfinite(s.v).all() and np.isfinite(s.cov).all()
@@ -389,7 +372,7 @@ class InertialTracker:
 
     def _lose(self, frame: Frame) -> TrackResult:
         """What is left of the filter is worth nothing."""
-        self._scene, self._astray, self._refused_s = None, 0, 0.0
+        self._scene, self._straying = None, Straying(self._config.weak, self._config.blind)
         self._shown.forget()
         if self._window is not None:  # there was nothing to lose
             return TrackResult(TrackState.INITIALISING, None, waits=Wait.SCALE)
