@@ -6,6 +6,7 @@ new, `apply` takes the solution in.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from share.merge.join import Key, Loop
 from share.merge.judge import Decision, Judge, that_waited
 from share.merge.promising import promising_first
 from share.merge.solving import SolveJob
+from share.merge.surety import Found, Surety
 from share.merge.survey import Survey
 from share.merge.thinning import TakenOut, redundant, take_out
 from share.place.verify import Sight
@@ -60,7 +62,7 @@ class Atlas:
         self._chart = Chart()
         self._judge = Judge(config, self._chart, Survey(self._chart, {} if sights is None else sights))
         self._answers: dict[str, int] = {}  # agent -> its newest keyframe that a loop came from
-        self._surety: dict[int, tuple[int, F64]] = {}  # of a stretch: its map's founder, cov of T_map_odom
+        self._surety = Surety(config.enter_m, config.enter_patience)
 
     # ------------------------------------------------------------ what is known
 
@@ -249,12 +251,12 @@ class Atlas:
 
     def _asked(self, founder: int, stretches: Sequence[int]) -> tuple[int, ...]:
         """Whose covariance is worth its time: who is answered, or never heard how sure he is in this map."""
-        trails, known = self._chart.trails, self._surety
+        trails = self._chart.trails
         return tuple(
             s
             for s in stretches
             if trails.current(agent := trails.stretches[s].agent) == s
-            and (agent in self._answers or s not in known or known[s][0] != founder)
+            and (agent in self._answers or self._surety.told(s, founder) is None)
         )
 
     def solver_lost(self) -> None:
@@ -280,9 +282,13 @@ class Atlas:
         odd = solution.loop_ids[solution.loop_chi2 > self._config.drop_chi2].tolist()
         dropped = chart.drop([n for n in odd if n in chart.ties.loops]) if odd else ()
         tied = self._judge.settle()
-        corrections = self._corrections(job, solution)
+        unsure = self._take_surety(job, solution)
+        corrections = self._corrections(job)
         counts = f"{len(solution.numbers)} poses, {len(solution.loop_ids)} loops solved"
         reason = f"map {job.map_id}: {counts}, corrects {', '.join(corrections) or 'nobody'}"
+        if unsure:
+            told = (f"{self._chart.trails.stretches[s].agent} ({100 * m:.0f} cm)" for s, m in unsure.items())
+            reason += f"; not yet sure enough of {', '.join(told)}"
         if dropped:
             reason += f"; dropped loops at odds with it: {', '.join(map(str, dropped))}"
         return Applied(corrections, reason + that_waited(tied), tied, dropped)
@@ -295,23 +301,28 @@ class Atlas:
         for stretch, last in zip(job.stretches, job.last, strict=True):
             chart.follow(n for n in chart.trails.stretches[stretch].nodes if n > last)
 
-    def _corrections(self, job: SolveJob, solution: Solution) -> dict[str, Correction]:
-        trails, answers, out = self._chart.trails, dict(job.answers), {}
-        told = dict(zip(job.wanted, solution.covariances, strict=True))
-        for stretch, last in zip(job.stretches, job.last, strict=True):
-            agent = trails.stretches[stretch].agent
-            if trails.current(agent) != stretch or last not in trails.nodes:
-                continue  # that odometry has ended: nothing is left to correct
-            if last in told:  # those after it hang on it rigidly
-                cov = se3.inverse_cov(trails.nodes[last].T_odom_body, told[last])
-                self._surety[stretch] = job.stretches[0], cov
-            if stretch not in self._surety:
-                continue
-            out[agent] = Correction(
-                self._chart.placement(last),
-                self._surety[stretch][1],
-                self._chart.name(stretch),
-                0,
-                answers.get(agent, -1),
+    def _take_surety(self, job: SolveJob, solution: Solution) -> dict[int, float]:
+        """Of those who were asked for. Returns which stretches wait to hear of this map: their spread, m."""
+        trails, told = self._chart.trails, dict(zip(job.wanted, solution.covariances, strict=True))
+        nodes, answered = trails.nodes, dict(job.answers)
+        found = {
+            stretch: Found(
+                se3.inverse_cov(nodes[last].T_odom_body, told[last]),
+                math.sqrt(np.trace(told[last][3:, 3:])),
+                trails.stretches[stretch].agent in answered,
             )
+            for stretch, last in zip(job.stretches, job.last, strict=True)
+            if last in told and last in nodes
+        }
+        return self._surety.take(job.stretches[0], found)
+
+    def _corrections(self, job: SolveJob) -> dict[str, Correction]:
+        """For whom the map knows surely enough; those after the newest that was solved hang on it rigidly."""
+        trails, answers, out = self._chart.trails, dict(job.answers), {}
+        for stretch, last in zip(job.stretches, job.last, strict=True):
+            agent, cov = trails.stretches[stretch].agent, self._surety.told(stretch, job.stretches[0])
+            if cov is None or trails.current(agent) != stretch or last not in trails.nodes:
+                continue  # he waits, or that odometry has ended: nothing is left to correct
+            placement, name = self._chart.placement(last), self._chart.name(stretch)
+            out[agent] = Correction(placement, cov, name, 0, answers.get(agent, -1))
         return out

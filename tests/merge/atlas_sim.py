@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from share.config import GraphConfig
 from share.geometry import se3
+from share.graph.change import Solution
+from share.graph.solver import Solver
+from share.merge.atlas import Applied, Atlas
 from share.merge.join import Key, Loop
+from share.merge.solving import SolveJob
 from share.types import F64, Keyframe, View
 
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
@@ -65,6 +70,21 @@ def near_loops(a: Walker, b: Walker, rng: np.random.Generator, every: int = 4) -
         if away[i] < 1.0:
             out.append(loop(a, i, b, j, rng))
     return out
+
+
+def answer(atlas: Atlas, map_id: str) -> tuple[SolveJob, Solution]:
+    """By a solver that knows nothing before."""
+    atlas.solver_lost()
+    job, solver = atlas.snapshot(map_id), Solver(GraphConfig())
+    solver.update(job.change)
+    return job, solver.solve(job.anchor, job.wanted)
+
+
+def settle(atlas: Atlas) -> list[Applied]:
+    done = []
+    while atlas.due():
+        done.append(atlas.apply(*answer(atlas, atlas.due()[0])))
+    return done
 
 
 def error(poses: F64, truth: F64) -> float:

@@ -2,20 +2,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from atlas_sim import Walker, error, loop, near_loops
+from atlas_sim import Walker, answer, error, loop, near_loops, settle
 
-from share.config import GraphConfig, MergeConfig
+from share.config import MergeConfig
 from share.geometry import se3
-from share.graph.change import Solution
-from share.graph.solver import Solver
-from share.merge.atlas import Applied, Atlas
+from share.merge.atlas import Atlas
 from share.merge.join import Key, Loop
-from share.merge.solving import SolveJob
 from share.types import F64
 
 # as careful as where copies of whole corridors are to be expected
 CONFIG = MergeConfig(join_places=5, near_m=1.0, near_rad=0.52, join_found=0.45, place_m=0.7, place_rad=0.5)
-GRAPH = GraphConfig()
 WRONG = se3.exp(np.array([0.0, 0.0, 0.5, 1.0, -0.7, 0.1]))
 
 
@@ -27,21 +23,6 @@ def atlas_of(*walkers: Walker, config: MergeConfig = CONFIG) -> Atlas:
             if i < len(w.keyframes):
                 atlas.add_keyframe(w.name, w.keyframes[i])
     return atlas
-
-
-def answer(atlas: Atlas, map_id: str) -> tuple[SolveJob, Solution]:
-    """By a solver that knows nothing before."""
-    atlas.solver_lost()
-    job, solver = atlas.snapshot(map_id), Solver(GRAPH)
-    solver.update(job.change)
-    return job, solver.solve(job.anchor, job.wanted)
-
-
-def settle(atlas: Atlas) -> list[Applied]:
-    done = []
-    while atlas.due():
-        done.append(atlas.apply(*answer(atlas, atlas.due()[0])))
-    return done
 
 
 def poses(atlas: Atlas, *walkers: Walker) -> F64:

@@ -1,0 +1,98 @@
+"""Who hears of the map that he has come into, and who waits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from atlas_sim import Walker, loop, settle
+
+from share.config import MergeConfig
+from share.merge.atlas import Atlas
+from share.merge.join import Loop
+from share.merge.surety import Found, Surety
+
+ANN, BOB, EVE, ROBOT = range(4)  # stretches, the oldest first
+
+
+def known(cm: float, value: float = 1.0, answered: bool = True) -> Found:
+    return Found(value * np.eye(6), cm / 100, answered)
+
+
+@pytest.fixture
+def surety() -> Surety:
+    return Surety(enter_m=0.05, patience=3)
+
+
+def test_in_his_own_map_everybody_hears_at_once(surety: Surety) -> None:
+    assert surety.take(BOB, {BOB: known(80.0)}) == {}
+    assert surety.told(BOB, BOB) is not None
+    assert surety.told(BOB, ANN) is None
+
+
+def test_who_is_surely_known_hears_at_once_and_then_always(surety: Surety) -> None:
+    assert surety.take(ANN, {BOB: known(4.9)}) == {}
+    assert surety.take(ANN, {BOB: known(90.0, 2.0)}) == {}
+    told = surety.told(BOB, ANN)
+    assert told is not None and (told == 2 * np.eye(6)).all()
+
+
+def test_who_is_not_waits_and_his_own_map_goes_on(surety: Surety) -> None:
+    surety.take(BOB, {BOB: known(0.0)})
+    assert surety.take(ANN, {BOB: known(7.0)}) == {BOB: pytest.approx(0.07)}
+    assert surety.told(BOB, ANN) is None
+    assert surety.told(BOB, BOB) is not None
+    assert surety.take(ANN, {BOB: known(4.0)}) == {}
+    assert surety.told(BOB, ANN) is not None
+
+
+def test_who_were_in_one_map_hear_together(surety: Surety) -> None:
+    surety.take(BOB, {BOB: known(0.0), EVE: known(1.0)})
+    found = {BOB: known(2.0), EVE: known(7.0), ROBOT: known(1.0)}
+    assert surety.take(ANN, found).keys() == {BOB, EVE}  # the robot comes from a map of its own
+    assert surety.take(ANN, {BOB: known(2.0), EVE: known(3.0)}) == {}
+
+
+def test_nobody_waits_for_more_than_so_many_loops_of_his_own(surety: Surety) -> None:
+    for _ in range(3):
+        for _ in range(20):
+            assert surety.take(ANN, {BOB: known(20.0, answered=False)})
+        assert surety.take(ANN, {BOB: known(20.0)})
+    assert not surety.take(ANN, {BOB: known(20.0)})
+    assert surety.told(BOB, ANN) is not None
+
+
+def test_another_map_is_waited_for_anew(surety: Surety) -> None:
+    for _ in range(2):
+        assert surety.take(EVE, {ROBOT: known(20.0)})
+    for _ in range(3):
+        assert surety.take(ANN, {ROBOT: known(20.0)})
+
+
+# ---------------------------------------------------------------- in the atlas
+
+
+def faint(ann: Walker, bob: Walker, at: int) -> Loop:
+    """What a few inliers give: turned by who knows how much."""
+    rng = np.random.default_rng(at)
+    sigma = np.diag([0.03**2] * 3 + [0.02**2] * 3)
+    seen = loop(ann, at, bob, at, rng)
+    return Loop(seen.a, seen.b, seen.T_a_b, sigma, 20)
+
+
+def test_a_correction_waits_until_the_map_knows_where_he_is() -> None:
+    ann, bob = Walker("ann", 0), Walker("bob", 1, n=12, turn=3.5 * np.pi / 59 * 11)
+    config = MergeConfig(join_places=1, near_m=1.0, near_rad=0.52, place_m=0.7, place_rad=0.5)
+    atlas = Atlas(config)
+    for walker in (ann, bob):
+        for keyframe in walker.keyframes:
+            atlas.add_keyframe(walker.name, keyframe)
+    settle(atlas)
+    assert atlas.propose(faint(ann, bob, 0)).joined is None
+    assert atlas.propose(faint(ann, bob, 1)).joined == ("ann/0", "bob/0")
+    (applied,) = settle(atlas)
+    assert list(applied.corrections) == ["ann"]
+    assert "not yet sure enough of bob (" in applied.reason
+    atlas.propose(loop(ann, 11, bob, 11, np.random.default_rng(0)))
+    (applied,) = settle(atlas)
+    assert applied.corrections["bob"].map_id == "ann/0"
+    assert "not yet" not in applied.reason
