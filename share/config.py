@@ -248,7 +248,7 @@ class MergeConfig:
     undo_doubt: float = 0.6  # what is gone beyond that, summed over views: more forbids or undoes a join
     rival_weight: float = 0.5  # no contradicting story may weigh more than this part of the one that joins
     enter_m: float = 0.05  # who is known worse than this (1 sigma) waits to hear of another's map,
-    enter_patience: int = 8  # but for so many loops of his own at most
+    enter_patience: int = 20  # but for so many of his keyframes that found loops at most
     rebel_places: int = 4  # so many places at least, that weigh more than what stands, take a map apart
     rebel_weight: float = 1.4  # by how many times they have to weigh more
     drop_chi2: float = 1000.0  # a solved graph at odds with a loop by more than this drops it

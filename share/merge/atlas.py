@@ -304,12 +304,12 @@ class Atlas:
     def _take_surety(self, job: SolveJob, solution: Solution) -> dict[int, float]:
         """Of those who were asked for. Returns which stretches wait to hear of this map: their spread, m."""
         trails, told = self._chart.trails, dict(zip(job.wanted, solution.covariances, strict=True))
-        nodes, answered = trails.nodes, dict(job.answers)
+        nodes, answers = trails.nodes, dict(job.answers)
         found = {
             stretch: Found(
                 se3.inverse_cov(nodes[last].T_odom_body, told[last]),
                 math.sqrt(np.trace(told[last][3:, 3:])),
-                trails.stretches[stretch].agent in answered,
+                answers.get(trails.stretches[stretch].agent),
             )
             for stretch, last in zip(job.stretches, job.last, strict=True)
             if last in told and last in nodes

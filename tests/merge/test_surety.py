@@ -14,8 +14,8 @@ from share.merge.surety import Found, Surety
 ANN, BOB, EVE, ROBOT = range(4)  # stretches, the oldest first
 
 
-def known(cm: float, value: float = 1.0, answered: bool = True) -> Found:
-    return Found(value * np.eye(6), cm / 100, answered)
+def known(cm: float, value: float = 1.0, answers: int | None = None) -> Found:
+    return Found(value * np.eye(6), cm / 100, answers)
 
 
 @pytest.fixture
@@ -52,20 +52,18 @@ def test_who_were_in_one_map_hear_together(surety: Surety) -> None:
     assert surety.take(ANN, {BOB: known(2.0), EVE: known(3.0)}) == {}
 
 
-def test_nobody_waits_for_more_than_so_many_loops_of_his_own(surety: Surety) -> None:
-    for _ in range(3):
-        for _ in range(20):
-            assert surety.take(ANN, {BOB: known(20.0, answered=False)})
-        assert surety.take(ANN, {BOB: known(20.0)})
-    assert not surety.take(ANN, {BOB: known(20.0)})
+def test_nobody_waits_for_more_than_so_many_keyframes_of_his_own(surety: Surety) -> None:
+    for keyframe in (2, 5, 9):
+        for answers in (keyframe, keyframe, None):
+            assert surety.take(ANN, {BOB: known(20.0, answers=answers)})
+    assert not surety.take(ANN, {BOB: known(20.0, answers=11)})
     assert surety.told(BOB, ANN) is not None
 
 
 def test_another_map_is_waited_for_anew(surety: Surety) -> None:
-    for _ in range(2):
-        assert surety.take(EVE, {ROBOT: known(20.0)})
-    for _ in range(3):
-        assert surety.take(ANN, {ROBOT: known(20.0)})
+    for founder in (EVE, ANN):
+        for keyframe in range(3):
+            assert surety.take(founder, {ROBOT: known(20.0, answers=keyframe)})
 
 
 # ---------------------------------------------------------------- in the atlas
