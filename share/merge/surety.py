@@ -28,7 +28,7 @@ class Surety:
     """Of stretches, by their numbers; maps by their founders'."""
 
     def __init__(self, enter_m: float, patience: int) -> None:
-        """enter_m: who is known worse waits before another's map, for at most so many keyframes with loops."""
+        """enter_m: who is known worse waits before another map, for at most so many keyframes with loops."""
         self._enter_m, self._patience = enter_m, patience
         self._told: dict[int, tuple[int, F64]] = {}  # the founder of the map he was told of, and cov there
         self._waited: dict[tuple[int, int], set[tuple[int, int]]] = {}  # keyframes, by map left and entered
