@@ -258,11 +258,18 @@ class Mapper:
     def _solved(self, step: Solve, solution: Solution) -> list[Finding]:
         applied = self._atlas.apply(step.job, solution)
         self._note(applied)
-        return [
+        told = [
             Finding(agent, "correction", applied.reason, correction)
             for agent, correction in applied.corrections.items()
             if self._concern.concerns(agent, correction)
         ]
+        untold = [
+            Finding(
+                agent, "not told yet", f"map {step.job.map_id} knows where it is to {100 * m:.0f} cm only"
+            )
+            for agent, m in applied.waiting.items()
+        ]
+        return told + untold
 
     def _note(self, made: Decision | Applied) -> None:
         """The loops that are believed since, and those that are no longer, are to be kept so."""

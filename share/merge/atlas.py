@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -31,12 +31,14 @@ from share.types import F64, Correction, Keyframe
 @dataclass(frozen=True, eq=False)
 class Applied:
     """What a solution changed. corrections: by agent. reason: for events.jsonl. tied, dropped: loops that
-    are believed since, and those that are no longer."""
+    are believed since, and those that are no longer. waiting: agents who do not hear of it yet, since it
+    knows them to so many m only."""
 
     corrections: dict[str, Correction]
     reason: str
     tied: tuple[Loop, ...] = ()
     dropped: tuple[Loop, ...] = ()
+    waiting: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,16 +284,13 @@ class Atlas:
         odd = solution.loop_ids[solution.loop_chi2 > self._config.drop_chi2].tolist()
         dropped = chart.drop([n for n in odd if n in chart.ties.loops]) if odd else ()
         tied = self._judge.settle()
-        unsure = self._take_surety(job, solution)
+        waiting = self._take_surety(job, solution)
         corrections = self._corrections(job)
         counts = f"{len(solution.numbers)} poses, {len(solution.loop_ids)} loops solved"
         reason = f"map {job.map_id}: {counts}, corrects {', '.join(corrections) or 'nobody'}"
-        if unsure:
-            told = (f"{self._chart.trails.stretches[s].agent} ({100 * m:.0f} cm)" for s, m in unsure.items())
-            reason += f"; not yet sure enough of {', '.join(told)}"
         if dropped:
             reason += f"; dropped loops at odds with it: {', '.join(map(str, dropped))}"
-        return Applied(corrections, reason + that_waited(tied), tied, dropped)
+        return Applied(corrections, reason + that_waited(tied), tied, dropped, waiting)
 
     def _take_in(self, job: SolveJob, solution: Solution) -> None:
         chart = self._chart
@@ -301,8 +300,8 @@ class Atlas:
         for stretch, last in zip(job.stretches, job.last, strict=True):
             chart.follow(n for n in chart.trails.stretches[stretch].nodes if n > last)
 
-    def _take_surety(self, job: SolveJob, solution: Solution) -> dict[int, float]:
-        """Of those who were asked for. Returns which stretches wait to hear of this map: their spread, m."""
+    def _take_surety(self, job: SolveJob, solution: Solution) -> dict[str, float]:
+        """Of those who were asked for. Returns which agents wait to hear of this map: their spread, m."""
         trails, told = self._chart.trails, dict(zip(job.wanted, solution.covariances, strict=True))
         nodes, answers = trails.nodes, dict(job.answers)
         found = {
@@ -314,7 +313,8 @@ class Atlas:
             for stretch, last in zip(job.stretches, job.last, strict=True)
             if last in told and last in nodes
         }
-        return self._surety.take(job.stretches[0], found)
+        waiting = self._surety.take(job.stretches[0], found)
+        return {trails.stretches[s].agent: spread for s, spread in waiting.items()}
 
     def _corrections(self, job: SolveJob) -> dict[str, Correction]:
         """For whom the map knows surely enough; those after the newest that was solved hang on it rigidly."""

@@ -89,8 +89,9 @@ def test_a_correction_waits_until_the_map_knows_where_he_is() -> None:
     assert atlas.propose(faint(ann, bob, 1)).joined == ("ann/0", "bob/0")
     (applied,) = settle(atlas)
     assert list(applied.corrections) == ["ann"]
-    assert "not yet sure enough of bob (" in applied.reason
+    assert applied.waiting.keys() == {"bob"}
+    assert 0.05 < applied.waiting["bob"] < 0.5
     atlas.propose(loop(ann, 11, bob, 11, np.random.default_rng(0)))
     (applied,) = settle(atlas)
     assert applied.corrections["bob"].map_id == "ann/0"
-    assert "not yet" not in applied.reason
+    assert not applied.waiting
