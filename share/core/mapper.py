@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from share.config import Config
+from share.control.qoe import Needs
 from share.core.concern import Concern
 from share.core.finding import Finding, in_map
 from share.core.gating import Gating
@@ -37,7 +38,7 @@ from share.merge.thinning import TakenOut
 from share.metrics.latency import summary
 from share.place.index import PlaceIndex
 from share.place.verify import Refusal, Sight, Verified
-from share.types import Keyframe
+from share.types import AgentKind, Keyframe
 from share.wire.messages import Hello
 
 _TIMES = 5000  # of each kind of step that a report is about: the newest
@@ -84,7 +85,7 @@ class Mapper:
 
     def add(self, agent: str, keyframe: Keyframe) -> list[Finding]:
         """A keyframe, in order, each once."""
-        number = self._atlas.add_keyframe(agent, keyframe)
+        number = self._atlas.add_keyframe(agent, keyframe, leads=self._leads(agent))
         self._see(number, agent, keyframe)
         self._lookups.add(agent, served_as(self._config, self._hellos[agent]), number)
         findings = [] if keyframe.reference >= 0 else [self._founding(agent)]
@@ -92,16 +93,21 @@ class Mapper:
         return findings
 
     def restore(self, kept: Kept) -> None:
-        """What an earlier life of the edge knew, before anything else comes. The views are gone through when
-        one is first looked up."""
+        """What an earlier life of the edge knew, before anything else comes. Maps keep their founders, also
+        before headsets that come now. The views are gone through when one is first looked up."""
         for run in kept.runs:
             self.join(run.key, run.hello)
         poses = {} if kept.poses is None else dict(zip(kept.poses.keys, kept.poses.T_map_body, strict=True))
-        agents = [name.rpartition("/")[0] for name in kept.stretches]
+        founders = () if kept.poses is None else kept.poses.maps
+        stretches = [
+            (agent, name in founders or (not founders and self._leads(agent)))
+            for name in kept.stretches
+            for agent in [name.rpartition("/")[0]]
+        ]
         placed = [
             _placed(found, edge_to(found, kept.links), found.at in kept.links) for found in kept.keyframes
         ]
-        numbers = self._atlas.restore(agents, placed, kept.loops, poses)
+        numbers = self._atlas.restore(stretches, placed, kept.loops, poses)
         self._unseen = list(zip(numbers, kept.keyframes, strict=True))
 
     def _see_restored(self) -> None:
@@ -113,6 +119,11 @@ class Mapper:
         hello = self._hellos[agent]
         self._sights[number] = Sight(keyframe.view, hello.rig.cam0.focal, hello.rig.T_body_cam0, keyframe.up)
         self._index.add(number, keyframe.view.descriptors)
+
+    def _leads(self, agent: str) -> bool:
+        """Who wears a headset sees a map move, so it is the others' maps that come to his."""
+        hello = self._hellos[agent]
+        return Needs.of(self._config.control, hello.kind, hello.name).form is AgentKind.AR
 
     def _founding(self, agent: str) -> Finding:
         T, map_id = self._atlas.T_map_odom(agent), self._atlas.current_map(agent)

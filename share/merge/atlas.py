@@ -133,27 +133,30 @@ class Atlas:
 
     # ------------------------------------------------------------ what arrives
 
-    def add_keyframe(self, agent: str, keyframe: Keyframe) -> int:
-        """Its number here. A keyframe without a reference founds a map of its own.
+    def add_keyframe(self, agent: str, keyframe: Keyframe, leads: bool = True) -> int:
+        """Its number here. A keyframe without a reference founds a map of its own; of maps that are joined,
+        the oldest of those that lead keeps its name and place, or the oldest of all where none does.
 
         Raises ValueError for a keyframe known already or whose reference is unknown.
         """
-        return self._chart.add(agent, keyframe, self._believed(keyframe.cov), self._plumb(keyframe))
+        cov, plumb = self._believed(keyframe.cov), self._plumb(keyframe)
+        return self._chart.add(agent, keyframe, cov, plumb, leads)
 
     def restore(
         self,
-        agents: Sequence[str],
+        stretches: Sequence[tuple[str, bool]],
         keyframes: Iterable[Placed],
         loops: Iterable[Loop],
         T_map_body: Mapping[Key, F64],
     ) -> list[int]:
-        """What an earlier life knew; this one must be empty. agents: of every stretch there was, in order.
+        """What an earlier life knew; this one must be empty. stretches: of every one there was, in order, the
+        agent and whether it leads.
 
         Returns the keyframes' numbers. All maps are due.
         """
         chart, at = self._chart, {}
-        for agent in agents:
-            stretch = chart.trails.begin(agent)
+        for agent, leads in stretches:
+            stretch = chart.trails.begin(agent, leads)
             at[chart.trails.stretches[stretch].name] = stretch
         numbers = []
         for found in keyframes:

@@ -1,8 +1,8 @@
 """Where everything lies: poses by map, the edges between them, and which stretches are one map.
 
-A map is a set of stretches that loops connect; it is named after the first of them to have come,
-its founder, whose oldest keyframe stays where the founder's odometry says: that is the gauge. Maps
-are derived from the loops alone, so taking a loop back takes its join back.
+A map is a set of stretches that loops connect; it is named after its founder, the first to have come of
+those that lead, or of all where none does. The founder's oldest keyframe stays where its odometry says: that
+is the gauge. Maps are derived from the loops alone, so taking a loop back takes its join back.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ class Chart:
         self.bonds: Counter[tuple[int, int]] = Counter()  # loops by the two stretches that they tie
         self.unsolved: dict[int, None] = {}  # founders of maps with news, the oldest first
 
-    def add(self, agent: str, keyframe: Keyframe, cov: F64, plumb: F64) -> int:
+    def add(self, agent: str, keyframe: Keyframe, cov: F64, plumb: F64, leads: bool = True) -> int:
         """The number of the new node. cov (6, 6): of its step from the one before, as it is believed; so is
-        plumb (3,)."""
-        number = self.trails.add(agent, keyframe)
+        plumb (3,). leads: a stretch that it begins."""
+        number = self.trails.add(agent, keyframe, leads)
         self.place(number, keyframe.T_ref_body, cov, plumb)
         return number
 
@@ -98,8 +98,8 @@ class Chart:
         return dropped
 
     def lay_beside(self, loop: Loop) -> None:
-        """Move the younger of the two maps that it would tie rigidly to where it says."""
-        if self.founder_of(loop.a) > self.founder_of(loop.b):
+        """Of the two maps that it would tie, move that of the lesser founder rigidly to where it says."""
+        if self.rank(self.founder_of(loop.a)) > self.rank(self.founder_of(loop.b)):
             loop = loop.reverse()
         a, b = self.ends(loop)
         self.move(self.founder_of(loop.b), self.poses[a] @ loop.T_a_b @ se3.inverse(self.poses[b]))
@@ -154,9 +154,14 @@ class Chart:
                 return founder
         raise ValueError(f"there is no map {map_id}")
 
+    def rank(self, stretch: int) -> tuple[bool, int]:
+        """Of the stretches of a map, the least founds it."""
+        return not self.trails.stretches[stretch].leads, stretch
+
     def stretches_of(self, founder: int) -> list[int]:
-        """Those of a map that have keyframes, oldest first."""
-        return [s for s, f in enumerate(self.founder) if f == founder and self.trails.stretches[s].nodes]
+        """Those of a map that have keyframes, its founder first, if that has any."""
+        mine = (s for s, f in enumerate(self.founder) if f == founder and self.trails.stretches[s].nodes)
+        return sorted(mine, key=self.rank)
 
     def nodes_of(self, founder: int) -> list[int]:
         return [n for s in self.stretches_of(founder) for n in self.trails.stretches[s].nodes]
@@ -197,6 +202,6 @@ class Chart:
             return i
 
         for pair in self.bonds:
-            low, high = sorted(map(find, pair))
+            low, high = sorted(map(find, pair), key=self.rank)
             root[high] = low
         self.founder = [find(i) for i in range(len(root))]

@@ -284,7 +284,7 @@ class Judge:
 
     def _accept(self, loops: list[Loop], reason: str) -> Decision:
         chart = self._chart
-        before = sorted({chart.founder_of(key) for key in (loops[-1].a, loops[-1].b)})
+        before = sorted({chart.founder_of(key) for key in (loops[-1].a, loops[-1].b)}, key=chart.rank)
         if len(before) > 1:
             chart.lay_beside(min(loops, key=lambda loop: float(loop.cov.trace())))
         self._believe(loops)
