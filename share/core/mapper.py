@@ -98,7 +98,7 @@ class Mapper:
         for run in kept.runs:
             self.join(run.key, run.hello)
         poses = {} if kept.poses is None else dict(zip(kept.poses.keys, kept.poses.T_map_body, strict=True))
-        founders = () if kept.poses is None else kept.poses.maps
+        founders = set[str]() if kept.poses is None else set(kept.poses.maps)
         stretches = [
             (agent, name in founders or (not founders and self._leads(agent)))
             for name in kept.stretches

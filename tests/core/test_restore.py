@@ -16,7 +16,7 @@ from share.core.peer import known_runs
 from share.geometry import se3
 from share.graph.solver import Solver
 from share.io.map_store import MapStore
-from share.types import Keyframe
+from share.types import AgentKind, Keyframe
 
 ROOM = walls(1)
 STEPS = 36
@@ -52,8 +52,8 @@ class Life:
         self.changes += self.mapper.take_changes()
 
 
-def walked(config: Config) -> tuple[Life, list[Person]]:
-    people = [Person("ann", ROOM, 0.0, 11), Person("bob", ROOM, 0.3, 22)]
+def walked(config: Config, first: AgentKind = AgentKind.AR) -> tuple[Life, list[Person]]:
+    people = [Person("ann", ROOM, 0.0, 11, first), Person("bob", ROOM, 0.3, 22)]
     life = Life(config)
     for person in people:
         life.join(person)
@@ -99,6 +99,22 @@ def test_it_has_the_same_maps_and_goes_on(tmp_path: Path, most: int) -> None:
             second.step(person)
     assert len(second.mapper.report()["maps"]) == len(before["maps"])
     assert second.mapper.report()["loops"]["accepted"] > 0
+
+
+@pytest.mark.parametrize(("first", "founder"), [(AgentKind.AR, "ann/0"), (AgentKind.ROBOT, "bob/0")])
+def test_a_headset_keeps_its_place_and_a_map_its_founder(
+    tmp_path: Path, first: AgentKind, founder: str
+) -> None:
+    """In a second life too, and whoever comes then."""
+    life, _ = walked(Config(), first)
+    assert list(life.mapper.report()["maps"]) == [founder]
+    second = again(life, tmp_path / "room.sqlite", Config())
+    assert list(second.mapper.report()["maps"]) == [founder]
+    eve = Person("eve", ROOM, 0.6, 33)
+    second.join(eve)
+    for _ in range(STEPS):
+        second.step(eve)
+    assert list(second.mapper.report()["maps"]) == [founder]
 
 
 def test_a_run_of_which_nothing_is_left_is_no_obstacle(tmp_path: Path) -> None:

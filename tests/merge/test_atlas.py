@@ -86,6 +86,26 @@ def test_the_founders_gauge_never_moves(ann: Walker, bob: Walker) -> None:
         assert atlas.map_of(Key("ann", 5)) == "ann/0"
 
 
+def test_a_map_that_leads_stays_where_it_is_however_old_the_other_is() -> None:
+    """A robot came first, then two headsets; they join each other, then him."""
+    robot, ann, bob = Walker("robot", 1), Walker("ann", 0), Walker("bob", 2)
+    atlas, rng = Atlas(CONFIG), np.random.default_rng(0)
+    for walker in (robot, ann, bob):
+        for keyframe in walker.keyframes:
+            atlas.add_keyframe(walker.name, keyframe, leads=walker is not robot)
+    joined = [d.joined for x in near_loops(ann, bob, rng) if (d := atlas.propose(x)).joined]
+    settle(atlas)
+    before = atlas.T_map_odom("ann")
+    joined += [d.joined for x in near_loops(robot, bob, rng) if (d := atlas.propose(x)).joined]
+    applied = settle(atlas)[-1]
+    assert joined == [("ann/0", "bob/0"), ("ann/0", "robot/0")]
+    assert {c.map_id for c in applied.corrections.values()} == {"ann/0"}
+    assert np.array_equal(atlas.pose(Key("ann", 0))[:3, 3], ann.T_odom_body[0][:3, 3])
+    moved = se3.log(se3.inverse(before) @ atlas.T_map_odom("ann"))
+    assert np.abs(moved).max() < 0.05
+    assert error(poses(atlas, robot, ann, bob), truth(robot, ann, bob)) < 0.08
+
+
 def test_correction_brings_odometry_into_the_map(ann: Walker, bob: Walker) -> None:
     atlas = atlas_of(ann, bob)
     rng = np.random.default_rng(0)
