@@ -15,11 +15,16 @@ _WEIGHT = {AgentKind.AR: 4, AgentKind.ROBOT: 1}  # a robot waits four times as m
 _LATE = 100  # passed over, the newest: those that may still be looked up when nothing else waits
 
 
+def form_of(config: Config, hello: Hello) -> AgentKind:
+    """By its needs, not by what it is."""
+    return Needs.of(config.control, hello.kind, hello.name).form
+
+
 def served_as(config: Config, hello: Hello) -> AgentKind:
-    """By its needs, not by what it is; by a policy that takes agents alike, as anybody."""
+    """By its form; by a policy that takes agents alike, as anybody."""
     if POLICIES[config.edge.policy].alike:
         return AgentKind.AR
-    return Needs.of(config.control, hello.kind, hello.name).form
+    return form_of(config, hello)
 
 
 class Lookups:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from share.config import Config
-from share.control.qoe import Needs
 from share.core.concern import Concern
 from share.core.finding import Finding, in_map
 from share.core.gating import Gating
@@ -27,7 +26,7 @@ from share.core.keeping import (
     Retire,
     edge_to,
 )
-from share.core.lookups import Lookups, served_as
+from share.core.lookups import Lookups, form_of, served_as
 from share.core.search import Effort, Search
 from share.core.steps import Look, Query, Solve, Step, Verify
 from share.graph.change import Solution
@@ -99,11 +98,9 @@ class Mapper:
             self.join(run.key, run.hello)
         poses = {} if kept.poses is None else dict(zip(kept.poses.keys, kept.poses.T_map_body, strict=True))
         founders = set[str]() if kept.poses is None else set(kept.poses.maps)
-        stretches = [
-            (agent, name in founders or (not founders and self._leads(agent)))
-            for name in kept.stretches
-            for agent in [name.rpartition("/")[0]]
-        ]
+        agents = [name.rpartition("/")[0] for name in kept.stretches]
+        leads = [name in founders for name in kept.stretches] if founders else map(self._leads, agents)
+        stretches = list(zip(agents, leads, strict=True))
         placed = [
             _placed(found, edge_to(found, kept.links), found.at in kept.links) for found in kept.keyframes
         ]
@@ -122,8 +119,7 @@ class Mapper:
 
     def _leads(self, agent: str) -> bool:
         """Who wears a headset sees a map move, so it is the others' maps that come to his."""
-        hello = self._hellos[agent]
-        return Needs.of(self._config.control, hello.kind, hello.name).form is AgentKind.AR
+        return form_of(self._config, self._hellos[agent]) is AgentKind.AR
 
     def _founding(self, agent: str) -> Finding:
         T, map_id = self._atlas.T_map_odom(agent), self._atlas.current_map(agent)
@@ -275,9 +271,7 @@ class Mapper:
             if self._concern.concerns(agent, correction)
         ]
         untold = [
-            Finding(
-                agent, "not told yet", f"map {step.job.map_id} knows where it is to {100 * m:.0f} cm only"
-            )
+            Finding(agent, "not told yet", f"map {step.job.map_id} knows it to {100 * m:.0f} cm only")
             for agent, m in applied.waiting.items()
         ]
         return told + untold
