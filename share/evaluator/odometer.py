@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from typing import NamedTuple
 
 import numpy as np
 
-from share.geometry.se3 import angle, compose_cov
+from share.geometry.se3 import angle, compose_cov, spread
 from share.metrics.local_error import WINDOW_S
 from share.types import F64, Candidate, TrackState
 
@@ -73,5 +72,5 @@ class Odometer:
             way += float(np.linalg.norm(T[:3, 3]))
             turn += float(angle(T[:3, :3]))
             cov = compose_cov(T, cov, more)
-        self._sigmas.append((stamp_ns, 100 * math.sqrt(max(0.0, float(np.trace(cov[3:, 3:]))))))
+        self._sigmas.append((stamp_ns, 100 * spread(cov)))
         return Lately(tuple(self._frames), way, turn, tuple(sigma for _, sigma in self._sigmas))

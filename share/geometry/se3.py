@@ -148,6 +148,14 @@ def inverse_cov(T_a_b: F64, cov: F64) -> F64:
     return Ad @ cov @ np.swapaxes(Ad, -1, -2)
 
 
+def spread(cov: F64) -> float:
+    """One sigma of a position, m: the root of the trace of the translation in cov (6, 6).
+
+    What rounding took below 0 is 0; NaN stays NaN.
+    """
+    return float(np.sqrt(np.maximum(cov[3:, 3:].trace(), 0.0)))
+
+
 def transform(T: F64, points: F64) -> F64:
     """Points (..., 3) in frame b -> frame a by T_a_b (4, 4)."""
     return points @ T[:3, :3].T + T[:3, 3]

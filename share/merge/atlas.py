@@ -6,7 +6,6 @@ new, `apply` takes the solution in.
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -310,7 +309,7 @@ class Atlas:
         found = {
             stretch: Found(
                 se3.inverse_cov(nodes[last].T_odom_body, told[last]),
-                math.sqrt(np.trace(told[last][3:, 3:])),
+                se3.spread(told[last]),
                 answers.get(trails.stretches[stretch].agent),
             )
             for stretch, last in zip(job.stretches, job.last, strict=True)

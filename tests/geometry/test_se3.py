@@ -84,3 +84,10 @@ def test_angle_is_that_of_the_logarithm_from_nothing_to_half_a_turn() -> None:
     axis = np.array([0.6, -0.48, 0.64])
     for radians in (0.0, 1e-9, 1e-4, 0.5, 2.0, 3.0, np.pi - 1e-7, np.pi):
         assert abs(se3.angle(se3.so3_exp(radians * axis)) - radians) < 1e-8
+
+
+def test_the_spread_of_a_position_is_of_its_translation_alone():
+    cov = np.diag([100.0, 100.0, 100.0, 0.04, 0.05, 0.07])
+    assert se3.spread(cov) == pytest.approx(0.4)
+    assert se3.spread(-1e-20 * cov) == 0
+    assert np.isnan(se3.spread(cov * np.nan))
