@@ -8,7 +8,7 @@ from collections import deque
 import numpy as np
 
 from share.core.rate import seconds
-from share.geometry.se3 import compose_cov, spread
+from share.geometry.se3 import compose_cov, position_sigma
 from share.metrics.local_error import WINDOW_S
 from share.types import F64, Keyframe
 
@@ -51,4 +51,4 @@ class Drift:
         cov = np.zeros((6, 6))
         for _, _, T, more in self._motions:
             cov = compose_cov(T, cov, more)
-        return 100 * spread(cov)
+        return 100 * position_sigma(cov)

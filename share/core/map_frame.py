@@ -39,7 +39,7 @@ class MapFrame:
         if self._target is None:
             return 0.0
         cov = se3.compose_cov(T_odom_body, self._cov, np.zeros((6, 6)))
-        return 100 * se3.spread(cov)
+        return 100 * se3.position_sigma(cov)
 
     def correct(self, correction: Correction, T_odom_body: F64, now_ns: int) -> bool:
         """A new target from now on. Returns whether it lies in another map."""

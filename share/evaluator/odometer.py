@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from share.geometry.se3 import angle, compose_cov, spread
+from share.geometry.se3 import angle, compose_cov, position_sigma
 from share.metrics.local_error import WINDOW_S
 from share.types import F64, Candidate, TrackState
 
@@ -72,5 +72,5 @@ class Odometer:
             way += float(np.linalg.norm(T[:3, 3]))
             turn += float(angle(T[:3, :3]))
             cov = compose_cov(T, cov, more)
-        self._sigmas.append((stamp_ns, 100 * spread(cov)))
+        self._sigmas.append((stamp_ns, 100 * position_sigma(cov)))
         return Lately(tuple(self._frames), way, turn, tuple(sigma for _, sigma in self._sigmas))

@@ -148,7 +148,7 @@ def inverse_cov(T_a_b: F64, cov: F64) -> F64:
     return Ad @ cov @ np.swapaxes(Ad, -1, -2)
 
 
-def spread(cov: F64) -> float:
+def position_sigma(cov: F64) -> float:
     """One sigma of a position, m: the root of the trace of the translation in cov (6, 6).
 
     What rounding took below 0 is 0; NaN stays NaN.

@@ -309,7 +309,7 @@ class Atlas:
         found = {
             stretch: Found(
                 se3.inverse_cov(nodes[last].T_odom_body, told[last]),
-                se3.spread(told[last]),
+                se3.position_sigma(told[last]),
                 answers.get(trails.stretches[stretch].agent),
             )
             for stretch, last in zip(job.stretches, job.last, strict=True)

@@ -88,6 +88,6 @@ def test_angle_is_that_of_the_logarithm_from_nothing_to_half_a_turn() -> None:
 
 def test_the_spread_of_a_position_is_of_its_translation_alone():
     cov = np.diag([100.0, 100.0, 100.0, 0.04, 0.05, 0.07])
-    assert se3.spread(cov) == pytest.approx(0.4)
-    assert se3.spread(-1e-20 * cov) == 0
-    assert np.isnan(se3.spread(cov * np.nan))
+    assert se3.position_sigma(cov) == pytest.approx(0.4)
+    assert se3.position_sigma(-1e-20 * cov) == 0
+    assert np.isnan(se3.position_sigma(cov * np.nan))

@@ -329,7 +329,7 @@ def motion_since(state: State) -> F64:
 
 def drift_m(state: State) -> float:
     """Sigma of the body's position against the newest keyframe's, m."""
-    return se3.spread(motion_since(state))
+    return se3.position_sigma(motion_since(state))
 
 
 def _between(state: State, a: slice, b: slice) -> F64:
