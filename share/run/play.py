@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -14,7 +15,7 @@ from pathlib import Path
 from share.config import STREAMED
 from share.errors import ShareError
 from share.io.files import writable_dir
-from share.io.json_file import read_json_lines
+from share.io.growing_file import GrowingFile
 from share.io.session import Session
 from share.io.transport.links import Links
 from share.metrics.together import Together
@@ -22,6 +23,7 @@ from share.run.processes import child, end
 
 START_S = 20.0  # how long the edge may take until it listens
 PATIENCE_S = 60.0  # how much longer than its recording an agent may take
+_LOOK_S = 0.5  # between two looks at what a run has come to
 _AFTER_AGENTS = 10  # niceness: a tenth of an agent's part of a core that both want
 Processes = dict[str, subprocess.Popen[bytes]]
 
@@ -94,7 +96,7 @@ def play(
             agents[name] = stack.enter_context(
                 child(logs[name], "agent", *who, *where, *terms.of_agent(number, links.of(name)))
             )
-        _watch(agents, folders, out / "edge" / "events.jsonl", seconds + PATIENCE_S, show)
+        _watch(agents, _Onlooker(folders, out / "edge" / "events.jsonl"), seconds + PATIENCE_S, show)
         for name, process in {**agents, "edge": edge}.items():
             if end(process) != 0:
                 raise ShareError(f"{name} failed: {_last_line(logs[name])}")
@@ -114,13 +116,7 @@ def _address(edge: subprocess.Popen[bytes], log: Path) -> str:
     raise ShareError(f"the edge did not start: {_last_line(log)}")
 
 
-def _watch(
-    agents: Processes,
-    folders: dict[str, Path],
-    events: Path,
-    limit_s: float,
-    show: Callable[[Progress], None],
-) -> None:
+def _watch(agents: Processes, onlooker: _Onlooker, limit_s: float, show: Callable[[Progress], None]) -> None:
     """Until every agent has ended, or one has failed."""
     deadline = time.monotonic() + limit_s
     while any(process.poll() is None for process in agents.values()):
@@ -128,26 +124,32 @@ def _watch(
             return
         if time.monotonic() > deadline:
             raise ShareError(f"the agents have not ended {PATIENCE_S:g} s after their recordings")
-        show(_progress(folders, events))
-        time.sleep(0.2)
-    show(_progress(folders, events))
+        show(onlooker.look())
+        time.sleep(_LOOK_S)
+    show(onlooker.look())
 
 
-def _progress(folders: dict[str, Path], events: Path) -> Progress:
-    decided = read_json_lines(events) if events.exists() else []
-    corrections = [event for event in decided if event["event"] == "correction"]
-    together = Together()
-    for event in corrections:
-        together.corrected(event["agent"], event["map_id"])
-    frames = {
-        name: max(len(_lines(folder / "odom.tum.partial")), len(_lines(folder / "odom.tum")))
-        for name, folder in folders.items()
-    }
-    return Progress(frames, len(together.agents), len(corrections))
+class _Onlooker:
+    """How far a run is, by what its files have grown; it costs the processes that are measured next to
+    nothing, however long they go on."""
 
+    def __init__(self, folders: dict[str, Path], events: Path) -> None:
+        self._odometry = {
+            name: GrowingFile(folder / "odom.tum", folder / "odom.tum.partial")
+            for name, folder in folders.items()
+        }
+        self._frames = dict.fromkeys(folders, 0)
+        self._events, self._corrections, self._together = GrowingFile(events), 0, Together()
 
-def _lines(path: Path) -> list[str]:
-    return path.read_text().splitlines() if path.exists() else []
+    def look(self) -> Progress:
+        for name, file in self._odometry.items():
+            self._frames[name] += len(file.lines())
+        for line in self._events.lines():
+            event = json.loads(line)
+            if event["event"] == "correction":
+                self._corrections += 1
+                self._together.corrected(event["agent"], event["map_id"])
+        return Progress(dict(self._frames), len(self._together.agents), self._corrections)
 
 
 def _last_line(log: Path) -> str:
