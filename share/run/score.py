@@ -25,7 +25,8 @@ class AgentScore:
 
 @dataclass(frozen=True, eq=False)
 class SessionScore:
-    """joint: map.tum of all agents in the largest map, one alignment; None where there is none."""
+    """joint: map.tum of all agents in the largest map, one alignment; None where no two are in one, since
+    everybody has a map of its own from its first moments on. An agent that plays alone is all there are."""
 
     agents: dict[str, AgentScore]
     joint: JointAte | None
@@ -63,6 +64,8 @@ def _joint(agents: dict[str, AgentScore]) -> JointAte | None:
     if not members:
         return None
     largest = max(members.values(), key=len)
+    if len(largest) < min(2, len(agents)):
+        return None
     pairs = {name: (agents[name].map, agents[name].truth) for name in largest}
     try:
         return joint_ate({name: (m, t) for name, (m, t) in pairs.items() if m is not None})

@@ -40,3 +40,6 @@ def test_who_was_told_of_the_join_too_late_is_not_scored_with_the_others(tmp_pat
     assert found is not None
     assert set(found.agents) == {"ann", "bob"}
     assert found.joint.rmse < 1e-9
+    alone = {"ann": agent("a/0", truth)}
+    assert _joint(alone | {"late": agent("b/0", elsewhere)}) is None  # each in a map of its own
+    assert _joint(alone) is not None  # who plays alone is all there are
