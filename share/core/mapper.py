@@ -252,8 +252,8 @@ class Mapper:
             return [Finding(b.agent, "loop not taken", reason)]
         account.merges["done"] += 1
         self._gating.completed(volume)
-        what = "merge undone" if decision.dropped else "maps joined" if decision.joined else "loop accepted"
-        return [Finding(b.agent, what, reason)]
+        undone = [Finding(b.agent, "merge undone", reason)] if decision.dropped else []
+        return [*undone, Finding(b.agent, "maps joined" if decision.joined else "loop accepted", reason)]
 
     def _review(self, number: int) -> list[Finding]:
         decision = self._atlas.review(number) if number in self._sights else None

@@ -47,10 +47,16 @@ def merges(trial: Trial) -> F64:
     events = read_json_lines(trial.folder / "edge" / "events.jsonl")
     began = began_s(events)
     done_s = np.array([e["t_s"] - began for e in events if e["event"] in _MERGES], float)
+    truths = {
+        name: (read_tum(trial.session.folder / "truth" / f"{name}.tum"), agent.clock_offset_ns)
+        for name, agent in trial.session.agents.items()
+    }
+    first_ns = min(truth.stamps_ns[0] - offset_ns for truth, offset_ns in truths.values())
     gone = np.zeros(len(done_s))
-    for name in trial.session.agents:
-        truth = read_tum(trial.session.folder / "truth" / f"{name}.tum")
-        gone += np.interp(done_s, (truth.stamps_ns - truth.stamps_ns[0]) * 1e-9, truth.way)
+    for truth, offset_ns in truths.values():
+        # in real time all recordings begin at once, in virtual time when they did
+        start_ns = first_ns + offset_ns if trial.terms.virtual else truth.stamps_ns[0]
+        gone += np.interp(done_s, (truth.stamps_ns - start_ns) * 1e-9, truth.way)
     return gone
 
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from share.io.trajectory import Trajectory, format_tum
+from share.io.trajectory import Trajectory, format_tum, read_tum
 from share.run.traces import merges, traces
 
 S = 1_000_000_000
@@ -37,8 +37,12 @@ def trial(tmp_path):
         {"t_s": 99.0, "event": "loop accepted"},
     ]
     (edge / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
-    agents = {"ann": None, "bob": None}
-    return SimpleNamespace(folder=tmp_path / "run", session=SimpleNamespace(folder=session, agents=agents))
+    agents = {"ann": SimpleNamespace(clock_offset_ns=0), "bob": SimpleNamespace(clock_offset_ns=0)}
+    return SimpleNamespace(
+        folder=tmp_path / "run",
+        session=SimpleNamespace(folder=session, agents=agents),
+        terms=SimpleNamespace(virtual=False),
+    )
 
 
 def test_what_an_agent_was_told_over_time(trial):
@@ -51,3 +55,13 @@ def test_what_an_agent_was_told_over_time(trial):
 
 def test_merges_lie_where_all_had_gone_by_then(trial):
     assert merges(trial).tolist() == pytest.approx([2 * 1.5, 4 * 1.5, 15.0])
+
+
+def test_who_began_later_has_gone_less_in_virtual_time_alone(trial):
+    bob = trial.session.folder / "truth" / "bob.tum"
+    later = read_tum(bob)
+    bob.write_text(format_tum(Trajectory(later.stamps_ns + 103 * S, later.T)))
+    trial.session.agents["bob"].clock_offset_ns = 100 * S  # by the session's clock 3 s after Ann
+    assert merges(trial).tolist() == pytest.approx([2 * 1.5, 4 * 1.5, 15.0])
+    trial.terms.virtual = True
+    assert merges(trial).tolist() == pytest.approx([2.0, 4 + 0.5, 15.0])
