@@ -145,7 +145,7 @@ def played(config: Config, options: argparse.Namespace) -> Figures:
         terms = Terms("", link="wifi5", true_error=True, virtual=True)
         runs = plan(sessions, POLICIES, SEEDS, terms, Path(folder), config)
         found = []
-        for _, came in go_through(runs, lambda n, now: None, side_by_side(options.workers, len(sessions))):
+        for _, came in go_through(runs, lambda n, now: None, side_by_side(options.workers)):
             if isinstance(came, ShareError):
                 raise came
             found.append(figures(came))

@@ -24,7 +24,7 @@ _MANY = (
         type=click.IntRange(1, 64),
         default=1,
         show_default=True,
-        help="Sessions at a time (--virtual).",
+        help="Processes that play (--virtual).",
     ),
 )
 

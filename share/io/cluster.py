@@ -28,6 +28,11 @@ class Cluster:
         except (OSError, ValueError) as error:
             raise UsageError(f"--scheduler {address}: nobody answers there: {error}") from None
 
+    @property
+    def count(self) -> int:
+        """Of workers now; as if there were one where none has come yet."""
+        return max(1, len(self._client.nthreads()))
+
     def run(self, work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result]]:
         """Every job with `work(job)`, in the order in which they are done. Raises what a job raised."""
         from distributed import KilledWorker, as_completed

@@ -32,6 +32,10 @@ class Pool:
         self._going_on, self._ours = context.Pipe(duplex=False)  # nothing is sent: workers end when it closes
         self._pool = ProcessPoolExecutor(workers, context, _begin, (self._going_on, start, arguments))
 
+    @property
+    def count(self) -> int:
+        return self._workers
+
     def run(self, work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result]]:
         """Every job with `work(job)`, in the order in which they are done. Raises what a job raised, or
         the ShareError that `start` did."""

@@ -25,6 +25,7 @@ def plan(
     config: by default, every setting as it is shipped. Raises UsageError where two sessions have one name.
     """
     check_names(sessions)
+    policies = list(dict.fromkeys(policies))
     runs = []
     for turn, (seed, session) in enumerate((seed, session) for seed in seeds for session in sessions):
         for k in range(len(policies)):

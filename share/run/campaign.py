@@ -10,6 +10,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from share import process
 from share.config import Config, load
 from share.errors import DataError, ShareError, UsageError
@@ -36,11 +38,14 @@ class Planned:
         return (self.out / RUN).is_file()
 
 
-Job = list[Planned]  # of one session: it is tracked once
+Job = list[Planned]  # of one session, which is tracked once for all
 
 
 class Workers(Protocol):
     """As `share.io.pool.Pool`."""
+
+    @property
+    def count(self) -> int: ...
 
     def run(
         self, work: Callable[[Job], list[Came]], jobs: Iterable[Job]
@@ -54,9 +59,9 @@ def check_names(sessions: Sequence[Session]) -> None:
         raise UsageError(f"two sessions are called {twice[0]}; rename a folder")
 
 
-def side_by_side(workers: int, sessions: int) -> AbstractContextManager[Workers] | None:
-    """So many processes on this machine, no more than there are sessions; None: one run after the other."""
-    return None if workers == 1 else Pool(min(workers, sessions), process.prepare, ())
+def side_by_side(workers: int) -> AbstractContextManager[Workers] | None:
+    """So many processes on this machine; None: one run after the other."""
+    return None if workers == 1 else Pool(workers, process.prepare, ())
 
 
 def go_through(
@@ -75,14 +80,21 @@ def go_through(
             show(number, None)
             yield planned, _play(planned, partial(show, number))
         return
-    by_session = sorted((planned for _, planned in left), key=lambda one: str(one.session.folder))
-    jobs = [list(group) for _, group in groupby(by_session, key=lambda one: one.session.folder)]
     done = len(ready)
     with workers as pool:
-        for job, came in pool.run(play_all, jobs):
+        for job, came in pool.run(play_all, dealt([planned for _, planned in left], pool.count)):
             done += len(job)
             show(done - 1, None)
             yield from zip(job, came, strict=True)
+
+
+def dealt(runs: Sequence[Planned], workers: int) -> list[Job]:
+    """By session, and each session in as many parts as it takes for nobody to stand idle."""
+    by_session = sorted(runs, key=lambda one: str(one.session.folder))
+    sessions = [list(group) for _, group in groupby(by_session, key=lambda one: one.session.folder)]
+    parts = -(-workers // max(1, len(sessions)))
+    cut = [np.array_split(np.arange(len(mine)), min(parts, len(mine))) for mine in sessions]
+    return [[mine[k] for k in part] for mine, pieces in zip(sessions, cut, strict=True) for part in pieces]
 
 
 def play_all(job: Job) -> list[Came]:
@@ -90,7 +102,9 @@ def play_all(job: Job) -> list[Came]:
 
 
 def _play(planned: Planned, show: Callable[[Progress], None]) -> Came:
-    """A run that fails is no reason not to play the next."""
+    """A run that fails is no reason not to play the next. Who does a dead worker's job takes what it left."""
+    if planned.is_done:
+        return _as_planned(planned)
     try:
         return run_trial(planned.session, planned.terms, planned.config, planned.out, show)
     except (UsageError, DataError):

@@ -17,6 +17,7 @@ from share import __version__
 from share.config import Config
 from share.core.measurement import CAM0
 from share.errors import DataError, UsageError
+from share.io.code_state import code_state
 from share.io.files import atomic_write, new_folder
 from share.io.json_file import read_json
 from share.io.machine import describe_machine
@@ -46,6 +47,23 @@ class Trial:
         """Of each agent's files, by name."""
         return {name: self.folder / name for name in self.session.agents}
 
+    @property
+    def clock(self) -> str:
+        """By which time it was played, for a reader."""
+        if self.terms.virtual:
+            return "virtual time" + (
+                f", as long as in {Path(self.terms.costs).name}" if self.terms.costs else ""
+            )
+        return "real time" + (", agents first" if self.terms.agents_first else "")
+
+    @property
+    def told(self) -> str:
+        """What the edge takes for an agent's error, for a reader."""
+        model = self.record.get("error_model")
+        if self.terms.true_error:
+            return "the true error"
+        return f"what the error model says ({Path(model).name})" if model else "odometry's sigma"
+
 
 def run_trial(
     session: Session, terms: Terms, config: Config, out: Path, show: Callable[[Progress], None]
@@ -71,6 +89,7 @@ def run_trial(
             "began": began.isoformat(timespec="seconds"),
             "took_s": round((datetime.now(UTC) - began).total_seconds(), 1),
             "version": __version__,
+            "code": code_state(),
             "machine": machine,
         }
         atomic_write(work / RUN, json.dumps(record, indent=2, default=str) + "\n")
@@ -78,7 +97,7 @@ def run_trial(
 
 
 def read_trial(folder: Path) -> Trial:
-    """Raises UsageError or DataError where `folder` is not one that is over."""
+    """Raises UsageError or DataError where `folder` is not one that is over, or its session is another."""
     path = folder / RUN
     if not path.is_file():
         raise UsageError(f"{folder}: has no {RUN}; it is not a run by `share evaluate run`")
@@ -90,7 +109,17 @@ def read_trial(folder: Path) -> Trial:
         raise DataError(f"{path}: is damaged: {error!r}") from None
     if not Path(session).is_dir():
         raise UsageError(f"{path}: its session {session} is not there any more, and with it the truth")
-    return Trial(folder, read_session(Path(session)), terms, record)
+    opened = read_session(Path(session))
+    if record.get("provenance", _plain(opened.provenance)) != _plain(opened.provenance):
+        raise UsageError(
+            f"{path}: its session {session} was made anew since, with another truth; play it again"
+        )
+    return Trial(folder, opened, terms, record)
+
+
+def _plain(value: Any) -> Any:
+    """As it comes back from JSON."""
+    return json.loads(json.dumps(value, default=str))
 
 
 def settings_of(config: Config, seed: int) -> str:

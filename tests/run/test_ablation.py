@@ -10,7 +10,7 @@ from share.config import Config, from_mapping
 from share.errors import UsageError
 from share.io.session import Session
 from share.run.ablation import plan
-from share.run.campaign import go_through
+from share.run.campaign import Planned, dealt, go_through, play_all
 from share.run.play import Terms
 from share.run.trial import read_trial, settings_of
 
@@ -39,6 +39,21 @@ def test_two_sessions_of_one_name_would_share_their_runs():
         plan([session("x/room"), session("y/room")], ("share",), [0], TERMS, Path("out"))
 
 
+def test_a_policy_that_is_named_twice_is_played_once():
+    assert len(plan([session("a")], ("share", "share"), [0], TERMS, Path("out"))) == 1
+
+
+@pytest.mark.parametrize(
+    ("workers", "sizes"), [(1, [4, 4]), (2, [4, 4]), (3, [2, 2, 2, 2]), (7, [1] * 8), (50, [1] * 8)]
+)
+def test_nobody_stands_idle_while_a_session_has_runs(workers, sizes):
+    runs = plan([session("b"), session("a")], ("share", "covins-g"), [0, 1], TERMS, Path("out"))
+    jobs = dealt(runs, workers)
+    assert [len(job) for job in jobs] == sizes
+    assert all(len({one.session.folder for one in job}) == 1 for job in jobs)
+    assert sorted((one for job in jobs for one in job), key=runs.index) == runs
+
+
 def test_each_seed_draws_anew_and_settings_come_back_as_they_were():
     texts = [settings_of(Config(), seed) for seed in (0, 3)]
     first, third = (from_mapping(Config, yaml.safe_load(text), "") for text in texts)
@@ -47,16 +62,36 @@ def test_each_seed_draws_anew_and_settings_come_back_as_they_were():
     assert third.control.random_seed == first.control.random_seed + 3
 
 
-def test_a_run_of_before_a_setting_was_there_is_taken(tmp_path):
+@pytest.fixture
+def done(tmp_path) -> Planned:
+    """A run that is there, as far as files say."""
     made = session(str(tmp_path / "room"))
     made.folder.mkdir()
     (made.folder / "session.yaml").write_text(
-        "schema: 1\nagents: {ann: {kind: ar, sensors: stereo, rate_hz: 15}}"
+        "schema: 1\nprovenance: {seed: 3}\nagents: {ann: {kind: ar, sensors: stereo, rate_hz: 15}}"
     )
     (one,) = plan([made], ("share",), [0], TERMS, tmp_path / "runs")
     one.out.mkdir(parents=True)
     record = {"session": str(made.folder), "policy": "share", "link": "wifi5", "seed": 0}
-    (one.out / "run.json").write_text(json.dumps(record))
+    (one.out / "run.json").write_text(json.dumps(record | {"provenance": {"seed": 3}}))
+    (one.out / "config.yaml").write_text(settings_of(Config(), 0))
+    return one
+
+
+def test_what_a_dead_worker_had_done_of_its_job_is_taken(done):
+    (came,) = play_all([done])
+    assert came.folder == done.out
+
+
+def test_a_run_of_a_session_that_was_made_anew_is_not_taken(done):
+    path = done.session.folder / "session.yaml"
+    path.write_text(path.read_text().replace("seed: 3", "seed: 4"))
+    with pytest.raises(UsageError, match=r"room was made anew since, with another truth; play it again"):
+        list(go_through([done], lambda number, now: None))
+
+
+def test_a_run_of_before_a_setting_was_there_is_taken(done):
+    one = done
     settings = yaml.safe_load(settings_of(Config(), 0))
     del settings["agent"]["error_model"]
     (one.out / "config.yaml").write_text(yaml.safe_dump(settings))
