@@ -20,7 +20,6 @@ from share.config import POLICIES
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.metrics.figures import RunFigures
     from share.run.annex import Annex
     from share.run.trial import Trial
 
@@ -82,16 +81,23 @@ def run(
 @evaluate.command(short_help="Errors, latency, merges and QoE of runs.")
 @click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--csv", "csv_file", metavar="FILE", type=click.Path(path_type=Path), help="A line an agent.")
+@click.option(
+    "--plots",
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="QoE and rates over time, merges on the way.",
+)
 @options.as_json
-def score(runs: tuple[Path, ...], csv_file: Path | None, as_json: bool) -> None:
+def score(runs: tuple[Path, ...], csv_file: Path | None, plots: Path | None, as_json: bool) -> None:
     """Score RUNS, folders by `share evaluate run`, against the truth of their sessions.
 
     \b
-    Example:  share evaluate score runs/*
+    Example:  share evaluate score runs/* --plots plots
     """
-    from share.io.files import atomic_write, check_writable
+    from share.io.files import atomic_write, check_writable, writable_dir
     from share.io.json_file import known
     from share.run.figures import figures
+    from share.run.pictures import draw_each
     from share.run.report import PROTOCOL, agents_csv
     from share.run.trial import read_trial
 
@@ -109,13 +115,16 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, as_json: bool) -> None:
         click.echo(json.dumps({"protocol": PROTOCOL, "runs": told}, default=str))
         return
     for one, trial in zip(found, trials, strict=True):
-        machine = trial.record["machine"]
+        machine, code = trial.record["machine"], one.conditions.code or "unknown"
         click.echo(table(one))
         click.echo(
-            f"played {trial.record['began']} by SHARE {trial.record['version']} on {machine['cores']} cores "
-            f"of {machine['cpu']}, load before {machine['load']:g}\n"
+            f"played {trial.record['began']} by SHARE {trial.record['version']} (code {code}) on "
+            f"{machine['cores']} cores of {machine['cpu']}, load before {machine['load']:g}\n"
         )
     click.echo("\n".join(PROTOCOL))
+    if plots is not None:
+        drawn = draw_each(writable_dir(plots), trials)
+        click.echo(f"\npictures: {', '.join(map(str, drawn))}")
 
 
 @evaluate.command(short_help="All policies on sessions, in turn, compared.")
@@ -165,7 +174,6 @@ def ablation(
     from share.run.ablation import plan
     from share.run.annex import annex
     from share.run.campaign import side_by_side
-    from share.run.figures import figures
     from share.run.play import Terms
 
     policies = chosen or tuple(policy for policy in POLICIES if policy != "streamed")
@@ -174,22 +182,25 @@ def ablation(
     config = settings(config_file, told, opened)
     planned = plan(opened, policies, range(seeds), Terms("", **told), out / "runs", config)
     writable_dir(out)
-    trials = list(played(planned, side_by_side(workers, len(opened)), lambda one: one.out.name).values())
+    came = played(planned, side_by_side(workers), lambda one: one.out.name)
+    trials, failed = list(came.values()), [one.out.name for one in planned if one.out not in came]
     if trials:
-        _write(out, [figures(trial) for trial in trials], trials, also)
+        _write(out, trials, failed, also)
     check_all(len(trials), len(planned))
 
 
-def _write(out: Path, found: list[RunFigures], trials: list[Trial], also: list[Annex]) -> None:
+def _write(out: Path, trials: list[Trial], failed: list[str], also: list[Annex]) -> None:
     from share.io.files import atomic_write
     from share.io.page import page
     from share.metrics.comparison import policies
+    from share.run.figures import figures
     from share.run.pictures import draw
     from share.run.report import agents_csv, markdown, runs_csv
 
+    found = [figures(trial) for trial in trials]
     names = policies(found)
     base = BASE if BASE in names else names[0]
-    report = "\n".join([markdown(found, trials, base), *(one.text for one in also)])
+    report = "\n".join([markdown(found, trials, base, failed), *(one.text for one in also)])
     atomic_write(out / "agents.csv", agents_csv(found))
     atomic_write(out / "runs.csv", runs_csv(found))
     atomic_write(out / "report.md", report)

@@ -14,8 +14,8 @@ from share.config import POLICIES
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.metrics.figures import RunFigures
     from share.run.sweep import Axis, Point
+    from share.run.trial import Trial
 
 _HEAT = ("AR latency", "AR ATE in the map", "merges a metre", "AR QoE")
 
@@ -66,7 +66,6 @@ def sweep(
     from share.io.files import writable_dir
     from share.io.session import read_session
     from share.run.campaign import side_by_side
-    from share.run.figures import figures
     from share.run.play import Terms
     from share.run.sweep import Axis, drawn, grid, planned
 
@@ -77,21 +76,23 @@ def sweep(
     runs = planned(opened, axes, points, range(seeds), Terms(policy, **told), out / "runs", config)
     writable_dir(out)
     at = {one.out: point for one, point in runs}
-    players = Cluster(scheduler) if scheduler else side_by_side(workers, len(opened))
+    players = Cluster(scheduler) if scheduler else side_by_side(workers)
     trials = played([one for one, _ in runs], players, lambda one: ", ".join(at[one.out]))
     if trials:
-        _write(out, axes, [(at[folder], figures(trial)) for folder, trial in trials.items()])
+        _write(out, axes, [at[folder] for folder in trials], list(trials.values()))
     check_all(len(trials), len(runs))
 
 
-def _write(out: Path, axes: list[Axis], runs: list[tuple[Point, RunFigures]]) -> None:
+def _write(out: Path, axes: list[Axis], points: list[Point], trials: list[Trial]) -> None:
     from share.io.charts import draw_heat
     from share.io.files import atomic_write
+    from share.run.figures import figures
     from share.run.report import sweep_csv, sweep_markdown
     from share.run.sweep import heat, table
 
-    rows = table(axes, runs)
-    report = sweep_markdown(rows)
+    runs = [figures(trial) for trial in trials]
+    rows = table(axes, list(zip(points, runs, strict=True)))
+    report = sweep_markdown(rows, runs, trials)
     atomic_write(out / "sweep.csv", sweep_csv(rows))
     atomic_write(out / "sweep.md", report)
     click.echo(report)

@@ -1,11 +1,15 @@
-"""How sure a mean over runs is, by drawing the runs again.
+"""How sure a mean over runs is, by drawing their sessions again.
 
-Source: B. Efron and R. J. Tibshirani, *An Introduction to the Bootstrap*, 1993, chapter 13 (percentiles).
+Runs of one session with several seeds have the room and the ways in common, so it is sessions that are drawn,
+each with all its runs: were runs drawn, three seeds would look like three rooms. Sources: B. Efron and
+R. J. Tibshirani, *An Introduction to the Bootstrap*, 1993, chapter 13 (percentiles); A. C. Davison and
+D. V. Hinkley, *Bootstrap Methods and their Application*, 1997, section 3.8 (groups).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,28 +22,33 @@ _LEVEL = 0.95
 
 
 class Interval(NamedTuple):
-    """A figure, and between which values it lies with 95 % confidence; equal to it where there is one run."""
+    """A figure, and between which values it lies with 95 % confidence; NaN where one session cannot tell."""
 
     value: float
     low: float
     high: float
 
 
-def mean(values: ArrayLike, rng: np.random.Generator) -> Interval:
-    """Of values (N,), without those that are NaN; all NaN where none is left."""
+def mean(values: ArrayLike, sessions: Sequence[str], rng: np.random.Generator) -> Interval:
+    """Of values (N,) of runs on `sessions` (N), without those that are NaN; all NaN where none is left."""
     v = np.asarray(values, np.float64)
-    return ratio(v, np.ones(len(v)), rng)
+    return ratio(v, np.ones(len(v)), sessions, rng)
 
 
-def ratio(over: ArrayLike, under: ArrayLike, rng: np.random.Generator) -> Interval:
-    """sum(over) / sum(under), (N,) each: runs are drawn in pairs, those with a NaN are left out."""
+def ratio(over: ArrayLike, under: ArrayLike, sessions: Sequence[str], rng: np.random.Generator) -> Interval:
+    """sum(over) / sum(under), (N,) each, of pairs of runs on `sessions` (N); without pairs with a NaN."""
     a, b = np.asarray(over, np.float64), np.asarray(under, np.float64)
     known = np.isfinite(a) & np.isfinite(b)
-    a, b = a[known], b[known]
-    if not len(a) or not b.sum():
+    _, of = np.unique(np.array(sessions, str)[known], return_inverse=True)
+    count = int(of.max(initial=-1)) + 1
+    a, b = (np.bincount(of, values[known], count) for values in (a, b))
+    if not b.sum():
         return Interval(math.nan, math.nan, math.nan)
-    drawn = rng.integers(len(a), size=(_DRAWS, len(a)))
+    value = float(a.sum() / b.sum())
+    if count == 1:
+        return Interval(value, math.nan, math.nan)
+    drawn = rng.integers(count, size=(_DRAWS, count))
     below = b[drawn].sum(1)
     ratios: F64 = a[drawn].sum(1)[below != 0] / below[below != 0]
     low, high = np.quantile(ratios, [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
-    return Interval(float(a.sum() / b.sum()), float(low), float(high))
+    return Interval(value, float(low), float(high))

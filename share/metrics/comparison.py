@@ -1,7 +1,7 @@
 """What policies gain over another, from runs of the same sessions with the same seeds.
 
-A ratio is of sums over all runs that both have, with 95 % by drawing those pairs of runs again; so a session
-counts as a whole, and one that is slow for everybody cancels.
+A ratio is of sums over all runs that both have, so one that is slow for everybody cancels; 95 % by drawing
+sessions again, each with all its runs.
 """
 
 from __future__ import annotations
@@ -63,12 +63,16 @@ MEASURES = (
 
 @dataclass(frozen=True)
 class Compared:
-    """One measure of one policy: over its runs, and as a part of the base's in the same runs."""
+    """One measure of one policy: over its runs, and as a part of the base's in the same runs.
+
+    pairs: of `of` such pairs, in how many both have it.
+    """
 
     measure: Measure
     value: Interval
     ratio: Interval
-    runs: int
+    pairs: int
+    of: int
 
 
 def policies(runs: Sequence[RunFigures]) -> list[str]:
@@ -83,11 +87,12 @@ def compare(runs: Sequence[RunFigures], policy: str, base: str) -> list[Compared
     out = []
     for measure in MEASURES:
         rng = np.random.default_rng(_SEED)
-        value = bootstrap.mean([measure.of(run) for run in mine.values()], rng)
-        ratio = bootstrap.ratio(
-            [measure.of(mine[place]) for place in both], [measure.of(theirs[place]) for place in both], rng
+        value = bootstrap.mean(
+            [measure.of(run) for run in mine.values()], [session for session, _, _ in mine], rng
         )
-        out.append(Compared(measure, value, ratio, len(both)))
+        over, under = (np.array([measure.of(runs[place]) for place in both]) for runs in (mine, theirs))
+        ratio = bootstrap.ratio(over, under, [session for session, _, _ in both], rng)
+        out.append(Compared(measure, value, ratio, int(np.isfinite(over + under).sum()), len(both)))
     return out
 
 

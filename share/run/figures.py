@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from share.errors import DataError
 from share.io.json_file import read_json, read_json_lines
+from share.io.trajectory import Trajectory
 from share.metrics.ate import Ate
 from share.metrics.figures import AgentFigures, Conditions, RunFigures
 from share.metrics.rpe import Rpe, rpe_frames, rpe_time
@@ -32,7 +34,15 @@ def figures(trial: Trial) -> RunFigures:
     merges = edge.get("merges", {})
     terms = trial.terms
     return RunFigures(
-        Conditions(trial.session.folder.name, terms.policy, terms.link or "", terms.seed),
+        Conditions(
+            trial.session.folder.name,
+            terms.policy,
+            terms.link or "",
+            terms.seed,
+            trial.clock,
+            trial.told,
+            trial.record.get("code", ""),
+        ),
         agents,
         in_one_map=0 if found.joint is None else len(found.joint.agents),
         joint_ate_cm=_cm(None if found.joint is None else found.joint.joint),
@@ -57,6 +67,7 @@ def _of_agent(
         tracked=report["tracked"],
         latency_ms=_number(report["latency_ms"]["mean"]),
         track_ms=_number(track["mean"]),
+        track_p50_ms=_number(track["p50"]),
         track_p95_ms=_number(track["p95"]),
         track_p99_ms=_number(track["p99"]),
         over_20ms=_number(report["over_20ms"]),
@@ -64,13 +75,17 @@ def _of_agent(
         corrected_ms=_number(corrected["mean"]),
         corrected_p50_ms=_number(corrected["p50"]),
         corrected_p95_ms=_number(corrected["p95"]),
+        corrected_p99_ms=_number(corrected["p99"]),
         odom_ate_cm=_cm(one.odometry),
+        odom_n=0 if one.odometry is None else one.odometry.n,
         ate_cm=_cm(in_map),
         in_map=0 if in_map is None else in_map.n,
-        rpe_frame_cm=frame[0],
-        rpe_frame_deg=frame[1],
-        rpe_1s_cm=second[0],
-        rpe_1s_deg=second[1],
+        rpe_frame_cm=frame.cm,
+        rpe_frame_deg=frame.degrees,
+        rpe_frame_n=frame.n,
+        rpe_1s_cm=second.cm,
+        rpe_1s_deg=second.degrees,
+        rpe_1s_n=second.n,
         metres=one.truth.metres,
         joined_s=joined_s,
         keyframes=report["keyframes"],
@@ -84,15 +99,22 @@ def _of_agent(
     )
 
 
-def _rpe(one: AgentScore, measure: Any) -> tuple[float, float]:
-    """rms, cm and degrees."""
+class _Relative(NamedTuple):
+    """RPE: rms, over n pairs."""
+
+    cm: float
+    degrees: float
+    n: int
+
+
+def _rpe(one: AgentScore, measure: Callable[[Trajectory, Trajectory], Rpe]) -> _Relative:
     try:
-        rpe: Rpe | None = None if one.map is None else measure(one.map, one.truth)
+        rpe = None if one.map is None else measure(one.map, one.truth)
     except DataError:  # too few poses
         rpe = None
-    return (
-        (math.nan, math.nan) if rpe is None else (100 * rpe.translation.rmse, math.degrees(rpe.rotation.rmse))
-    )
+    if rpe is None:
+        return _Relative(math.nan, math.nan, 0)
+    return _Relative(100 * rpe.translation.rmse, math.degrees(rpe.rotation.rmse), rpe.translation.n)
 
 
 def _joined(events: Path) -> dict[str, float]:

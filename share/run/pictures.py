@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -60,31 +60,56 @@ def draw(folder: Path, runs: Sequence[RunFigures], trials: Sequence[Trial], base
         }
         draw_parts(folder / "parts.png", compared, base)
         out[f"What each policy comes to, as a part of {base}; whiskers: 95 %"] = folder / "parts.png"
-    return out | _over_time(folder, trials)
+    return out | _first(folder, trials)
 
 
-def _over_time(folder: Path, trials: Sequence[Trial]) -> dict[str, Path]:
+def draw_each(folder: Path, trials: Sequence[Trial]) -> list[Path]:
+    """PNG files in `folder`, two a session: its runs over time, by the names of their folders."""
+    by_session: dict[Path, dict[str, Trial]] = {}
+    for trial in trials:
+        by_session.setdefault(trial.session.folder, {})[_name(trial.folder)] = trial
+    return [
+        path
+        for session, runs in by_session.items()
+        for path in _over_time(folder, f"{session.name}-", runs).values()
+    ]
+
+
+def _name(folder: Path) -> str:
+    return folder.resolve().name
+
+
+def _first(folder: Path, trials: Sequence[Trial]) -> dict[str, Path]:
     """Of the first session, with its first seed, by every policy."""
     first = trials[0]
-    where = first.session.folder.name
-    same = [
-        t for t in trials if t.session.folder == first.session.folder and t.terms.seed == first.terms.seed
-    ]
-    by_policy = {trial.terms.policy: traces(trial) for trial in same}
+    same = {
+        trial.terms.policy: trial
+        for trial in trials
+        if (trial.session.folder, trial.terms.seed) == (first.session.folder, first.terms.seed)
+    }
+    return _over_time(folder, "", same)
+
+
+def _over_time(folder: Path, prefix: str, trials: Mapping[str, Trial]) -> dict[str, Path]:
+    """Runs of one session, by name: QoE and rates, and merges; by what is to be said of each."""
+    session = next(iter(trials.values())).session
+    where = session.folder.name
+    found = {name: traces(trial) for name, trial in trials.items()}
     panels = {
         f"{what} of {agent}": {
-            name: (found[agent].seconds, found[agent].qoe if what == "QoE" else found[agent].rate_hz)
-            for name, found in by_policy.items()
+            name: (of[agent].seconds, of[agent].qoe if what == "QoE" else of[agent].rate_hz)
+            for name, of in found.items()
         }
-        for agent in first.session.agents
+        for agent in session.agents
         for what in ("QoE", "rate")
     }
     units = ["" if title.startswith("QoE") else "Hz" for title in panels]
-    draw_lines(folder / "over-time.png", panels, "s", units)
-    done = {trial.terms.policy: merges(trial) for trial in same}
+    over_time, along = folder / f"{prefix}over-time.png", folder / f"{prefix}merges.png"
+    draw_lines(over_time, panels, "s", units)
+    done = {name: merges(trial) for name, trial in trials.items()}
     counted = {name: (metres, np.arange(1.0, len(metres) + 1)) for name, metres in done.items()}
-    draw_lines(folder / "merges.png", {f"merges on {where}": counted}, "m that all agents have gone", [""])
+    draw_lines(along, {f"merges on {where}": counted}, "m that all agents have gone", [""])
     return {
-        f"QoE, and the rate that the edge allows, over time: {where}": folder / "over-time.png",
-        f"Merges along the way: {where}": folder / "merges.png",
+        f"QoE, and the rate that the edge allows, over time: {where}": over_time,
+        f"Merges along the way: {where}": along,
     }

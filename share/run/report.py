@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from share.metrics.bootstrap import Interval
-from share.metrics.comparison import MEASURES, compare, no_worse, no_worse_on_average, policies
+from share.metrics.comparison import MEASURES, Compared, compare, no_worse, no_worse_on_average, policies
 from share.metrics.figures import AgentFigures, Conditions, RunFigures
 from share.run.as_text import bullets, csv_text, markdown_table, number
 from share.run.trial import Trial
@@ -22,6 +22,9 @@ PROTOCOL = (
     "poses: causal, every frame that has one; truth interpolated at their stamps over at most 100 ms",
     "odom ATE: rms, SE3-aligned, each agent alone; map ATE: rms under one SE3 alignment for all in one map",
     "RPE: rms of poses in the map, from frame to frame and over 1 s, no alignment; docs/evaluation.md",
+)
+_DRAWN = (
+    "In brackets: 95 % by drawing sessions again, each with all its runs; none where there is one session."
 )
 
 
@@ -50,25 +53,30 @@ def sweep_csv(rows: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def sweep_markdown(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The same for a reader, with intervals."""
+def sweep_markdown(
+    rows: Sequence[Mapping[str, Any]], runs: Sequence[RunFigures], trials: Sequence[Trial]
+) -> str:
+    """The same for a reader, with intervals, and of what."""
     head = [*rows[0]["settings"], "runs", *rows[0]["means"]]
     body = [
         [*row["settings"].values(), str(row["runs"]), *(_wide(m) for m in row["means"].values())]
         for row in rows
     ]
-    return markdown_table([head, *body]) + "\n\nIn brackets: 95 % by drawing the runs again.\n"
+    return "\n\n".join([provenance(runs, trials), markdown_table([head, *body]), _DRAWN]) + "\n"
 
 
-def markdown(runs: Sequence[RunFigures], trials: Sequence[Trial], base: str) -> str:
-    """All policies against `base`."""
+def markdown(
+    runs: Sequence[RunFigures], trials: Sequence[Trial], base: str, failed: Sequence[str] = ()
+) -> str:
+    """All policies against `base`. failed: runs that came to nothing, by name."""
     names = policies(runs)
     parts = [
         "# Policies compared",
-        _provenance(runs, trials),
+        provenance(runs, trials, failed),
         f"## Each policy, and as a part of `{base}`",
         _comparison(runs, names, base),
-        "In brackets: 95 % by drawing the runs again (pairs of the same session, link and seed).",
+        "Values: means over all runs that have one. Parts: of pairs of runs of one session, link and seed; "
+        f"(n of N): not both have it in all pairs. {_DRAWN}",
     ]
     others = [name for name in names if name != names[0]]
     if others:
@@ -77,39 +85,38 @@ def markdown(runs: Sequence[RunFigures], trials: Sequence[Trial], base: str) -> 
     return "\n\n".join(parts) + "\n"
 
 
-def _provenance(runs: Sequence[RunFigures], trials: Sequence[Trial]) -> str:
+def provenance(runs: Sequence[RunFigures], trials: Sequence[Trial], failed: Sequence[str] = ()) -> str:
+    """What was played, where, when, by which code, and how it is scored: a Markdown list."""
     records = [trial.record for trial in trials]
+    conditions = [run.conditions for run in runs]
     machines = {
         f"{r['machine']['cpu']}, {r['machine']['cores']} cores, {r['machine']['system']}" for r in records
     }
     loads = [r["machine"]["load"] for r in records]
     told = [
-        f"{len(runs)} runs {_how(trials[0])}, "
+        f"{len(runs)} runs in {_each(c.clock for c in conditions)}, "
         f"{min(r['began'] for r in records)} to {max(r['began'] for r in records)}.",
-        f"Sessions: {', '.join(sorted({run.conditions.session for run in runs}))}; "
-        f"links: {', '.join(sorted({run.conditions.link or 'loopback' for run in runs}))}; "
-        f"seeds: {', '.join(map(str, sorted({run.conditions.seed for run in runs})))}.",
+        *([f"NOT played, and nowhere below: {', '.join(failed)}."] if failed else []),
+        f"Policies: {_each(c.policy for c in conditions)}; sessions: {_each(c.session for c in conditions)}; "
+        f"links: {_each(c.link or 'loopback' for c in conditions)}; "
+        f"seeds: {_each(str(c.seed) for c in conditions)}.",
         f"Machine: {'; '.join(sorted(machines))}; load before a run {min(loads):g} to {max(loads):g}.",
-        f"SHARE {', '.join(sorted({r['version'] for r in records}))}; evaluations tell {_told(records[0])}.",
+        f"SHARE {_each(r['version'] for r in records)}, {_code(conditions)}; "
+        f"evaluations tell {_each(c.told for c in conditions)}.",
     ]
     return "\n".join([*(f"* {line}" for line in told), bullets(PROTOCOL)])
 
 
-def _told(record: Mapping[str, Any]) -> str:
-    """Of a run: what the edge takes for an agent's error."""
-    if record["true_error"]:
-        return "the true error"
-    model = record.get("error_model")
-    return f"what the error model says ({Path(model).name})" if model else "odometry's sigma"
+def _each(names: Iterable[str]) -> str:
+    return ", ".join(sorted(set(names)))
 
 
-def _how(trial: Trial) -> str:
-    terms = trial.terms
-    if terms.virtual:
-        return "in virtual time" + (f", things as long as in {Path(terms.costs).name}" if terms.costs else "")
-    return "in real time, every agent and the edge a process" + (
-        ", agents first" if terms.agents_first else ""
-    )
+def _code(conditions: Sequence[Conditions]) -> str:
+    """By which state of the code; runs of several may differ for that alone."""
+    runs_by = Counter(c.code or "unknown" for c in conditions)
+    if len(runs_by) == 1:
+        return f"code {next(iter(runs_by))}"
+    return "SEVERAL STATES OF THE CODE: " + ", ".join(f"{code} ({n} runs)" for code, n in runs_by.items())
 
 
 def _comparison(runs: Sequence[RunFigures], names: Sequence[str], base: str) -> str:
@@ -119,7 +126,7 @@ def _comparison(runs: Sequence[RunFigures], names: Sequence[str], base: str) -> 
         cells = []
         for name in names:
             one = found[name][k]
-            ratio = "" if name == base else f"; {_interval(one.ratio)}"
+            ratio = "" if name == base else f"; {_part(one)}"
             cells.append(number(one.value.value) + ratio)
         rows.append([f"{measure.name}{', ' + measure.unit if measure.unit else ''}", *cells])
     return markdown_table(rows)
@@ -163,9 +170,18 @@ def _conditions(run: RunFigures) -> list[object]:
     return [getattr(run.conditions, name) for name in _CONDITIONS]
 
 
-def _interval(of: Interval) -> str:
-    return "–" if math.isnan(of.value) else f"{of.value:.2f} [{of.low:.2f}, {of.high:.2f}]"
+def _part(of: Compared) -> str:
+    partly = f" ({of.pairs} of {of.of})" if 0 < of.pairs < of.of else ""
+    return _told(of.ratio, ".2f") + partly
 
 
 def _wide(of: Interval) -> str:
-    return "–" if math.isnan(of.value) else f"{of.value:.3g} [{of.low:.3g}, {of.high:.3g}]"
+    return _told(of, ".3g")
+
+
+def _told(of: Interval, form: str) -> str:
+    """A dash where it is not known; alone where one session cannot say how sure it is."""
+    if math.isnan(of.value):
+        return "–"
+    between = "" if math.isnan(of.low) else f" [{of.low:{form}}, {of.high:{form}}]"
+    return f"{of.value:{form}}{between}"

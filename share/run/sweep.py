@@ -70,17 +70,19 @@ class Axis:
 
 
 def grid(axes: Sequence[Axis]) -> list[Point]:
-    """Every combination. Raises UsageError where an axis is a range."""
+    """Every combination, once. Raises UsageError where an axis is a range."""
     for axis in axes:
         if axis.is_range:
             raise UsageError(f"--set {axis.name}: a range is for --random N; give values for a grid")
-    return list(itertools.product(*(axis.values for axis in axes)))
+    return list(dict.fromkeys(itertools.product(*(axis.values for axis in axes))))
 
 
 def drawn(axes: Sequence[Axis], count: int, seed: int) -> list[Point]:
-    """`count` points; the same seed gives the same ones, and more of them the same first."""
+    """`count` points; the same seed gives the same ones, and more of them the same first. Fewer where listed
+    values make some of them one."""
     u = np.random.default_rng(seed).random((count, len(axes)))
-    return [tuple(axis.draw(x) for axis, x in zip(axes, row, strict=True)) for row in u.tolist()]
+    points = (tuple(axis.draw(x) for axis, x in zip(axes, row, strict=True)) for row in u.tolist())
+    return list(dict.fromkeys(points))
 
 
 def at(config: Config, axes: Sequence[Axis], point: Point) -> Config:
@@ -125,7 +127,8 @@ def table(axes: Sequence[Axis], runs: Sequence[tuple[Point, RunFigures]]) -> lis
     for point in dict.fromkeys(point for point, _ in runs):
         mine = [run for of, run in runs if of == point]
         rng = np.random.default_rng(_SEED)
-        means = {m.name: bootstrap.mean([m.of(run) for run in mine], rng) for m in MEASURES}
+        sessions = [run.conditions.session for run in mine]
+        means = {m.name: bootstrap.mean([m.of(run) for run in mine], sessions, rng) for m in MEASURES}
         named = dict(zip((axis.name for axis in axes), point, strict=True))
         rows.append({"settings": named, "runs": len(mine), "means": means})
     return rows

@@ -41,15 +41,26 @@ def test_a_run_is_scored_compared_and_never_overwritten(evaluate, plain_session,
     assert page.count("data:image/png;base64,") == len(pictures)
     assert "<td>AR latency, ms</td>" in page.replace(' style="text-align: left;"', "")
 
-    scored = evaluate("score", run, "--csv", tmp_path / "one.csv")
+    scored = evaluate("score", run, "--csv", tmp_path / "one.csv", "--plots", tmp_path / "plots")
     assert scored.code == 0, scored.err
-    assert "policy covins-g, loopback, seed 0" in scored.out
+    assert "policy covins-g, loopback, seed 0; in real time, evaluations tell the true error" in scored.out
+    assert {path.name for path in (tmp_path / "plots").iterdir()} == {
+        f"{plain_session.name}-over-time.png",
+        f"{plain_session.name}-merges.png",
+    }
     rows = rows_of(tmp_path / "one.csv")
     assert [row["agent"] for row in rows] == ["ar1", "ar2", "robot"]
     assert {row["frames"] for row in rows} == {"45"}
     assert rows == rows_of(out / "agents.csv")
     told = json.loads(evaluate("score", run, "--json").out)["runs"][0]
-    assert told["conditions"] == {"session": plain_session.name, "policy": "covins-g", "link": "", "seed": 0}
+    where = {"session": plain_session.name, "policy": "covins-g", "link": "", "seed": 0}
+    assert told["conditions"] == {
+        **where,
+        "clock": "real time",
+        "told": "the true error",
+        "code": told["record"]["code"],
+    }
+    assert told["agents"][0]["odom_n"] == 45
     assert told["record"]["machine"]["cores"] >= 1
     assert told["agents"][0]["latency_ms"] == pytest.approx(float(rows[0]["latency_ms"]), rel=1e-5)
 

@@ -6,18 +6,31 @@ import numpy as np
 import pytest
 
 from share.metrics import bootstrap
+from share.metrics.bootstrap import Interval
 
 
-def test_one_run_is_as_sure_as_it_looks(rng):
-    assert bootstrap.mean([3.0], rng) == (3.0, 3.0, 3.0)
-    assert bootstrap.ratio([3.0, 6.0], [1.0, 2.0], rng) == (3.0, 3.0, 3.0)
+def each(count: int) -> list[str]:
+    """A session a run."""
+    return [f"room{k}" for k in range(count)]
+
+
+def same(found: Interval, wanted: tuple[float, ...]) -> bool:
+    return np.array_equal(found, wanted, equal_nan=True)
+
+
+def test_one_session_cannot_say_how_sure_it_is(rng):
+    assert same(bootstrap.mean([3.0], ["a"], rng), (3.0, math.nan, math.nan))
+    assert same(bootstrap.mean([3.0, 5.0], ["a", "a"], rng), (4.0, math.nan, math.nan))
+    assert same(bootstrap.ratio([3.0, 6.0], [1.0, 2.0], ["a", "b"], rng), (3.0, 3.0, 3.0))
 
 
 def test_what_was_not_measured_is_left_out_with_its_pair(rng):
-    assert bootstrap.mean([1.0, math.nan, 3.0], rng).value == 2.0
-    assert bootstrap.ratio([1.0, math.nan, 100.0], [2.0, 5.0, math.nan], rng) == (0.5, 0.5, 0.5)
-    assert all(math.isnan(value) for value in bootstrap.mean([math.nan], rng))
-    assert all(math.isnan(value) for value in bootstrap.ratio([1.0], [0.0], rng))
+    assert bootstrap.mean([1.0, math.nan, 3.0], each(3), rng).value == 2.0
+    found = bootstrap.ratio([1.0, math.nan, 100.0], [2.0, 5.0, math.nan], each(3), rng)
+    assert same(found, (0.5, math.nan, math.nan))
+    assert all(math.isnan(value) for value in bootstrap.mean([math.nan], ["a"], rng))
+    assert all(math.isnan(value) for value in bootstrap.mean([], [], rng))
+    assert all(math.isnan(value) for value in bootstrap.ratio([1.0], [0.0], ["a"], rng))
 
 
 def test_it_covers_the_mean_as_often_as_it_says():
@@ -25,7 +38,19 @@ def test_it_covers_the_mean_as_often_as_it_says():
     inside = 0
     for seed in range(400):
         rng = np.random.default_rng(seed)
-        _, low, high = bootstrap.mean(rng.normal(5.0, 2.0, 20), rng)
+        _, low, high = bootstrap.mean(rng.normal(5.0, 2.0, 20), each(20), rng)
+        inside += low <= 5.0 <= high
+    assert 0.89 < inside / 400 < 0.96
+
+
+def test_it_covers_the_mean_over_rooms_however_often_each_is_played():
+    """Rooms differ by 2, runs in one of them by 0.3: three seeds tell hardly more than one."""
+    inside = 0
+    for seed in range(400):
+        rng = np.random.default_rng(seed)
+        rooms = np.repeat(rng.normal(5.0, 2.0, 20), 3)
+        names = np.repeat(each(20), 3).tolist()
+        _, low, high = bootstrap.mean(rooms + rng.normal(0.0, 0.3, 60), names, rng)
         inside += low <= 5.0 <= high
     assert 0.89 < inside / 400 < 0.96
 
@@ -34,8 +59,8 @@ def test_pairs_stay_together():
     """Sessions that differ much, a policy that takes 0.8 of each: the ratio is sure, the mean is not."""
     rng = np.random.default_rng(1)
     base = rng.uniform(1.0, 20.0, 12)
-    ratio = bootstrap.ratio(0.8 * base, base, rng)
+    ratio = bootstrap.ratio(0.8 * base, base, each(12), rng)
     assert ratio.low == pytest.approx(0.8)
     assert ratio.high == pytest.approx(0.8)
-    mean = bootstrap.mean(0.8 * base, rng)
+    mean = bootstrap.mean(0.8 * base, each(12), rng)
     assert mean.high - mean.low > 2.0

@@ -54,6 +54,22 @@ def test_ratios_are_of_sessions_that_both_have_played():
     assert math.isnan(share["AR QoE"][0])
 
 
+def test_how_many_pairs_a_ratio_rests_on_is_told():
+    pairs = {one.measure.name: (one.pairs, one.of) for one in compare(RUNS, "share", "covins-g")}
+    assert pairs["AR latency"] == (2, 2)
+    assert pairs["robot ATE in the map"] == (1, 2)
+    assert pairs["AR QoE"] == (0, 2)
+
+
+def test_seeds_of_one_session_do_not_make_it_surer():
+    again = [dataclasses.replace(r, conditions=dataclasses.replace(r.conditions, seed=1)) for r in RUNS]
+    once, twice = (
+        {one.measure.name: one.ratio for one in compare(runs, "share", "covins-g")}["AR latency"]
+        for runs in (RUNS, RUNS + again)
+    )
+    assert once == twice
+
+
 def test_the_base_is_all_of_itself():
     assert {ratio for _, ratio in found("covins-g").values() if not math.isnan(ratio)} == {1.0}
 

@@ -46,6 +46,11 @@ def test_points_are_drawn_evenly_by_the_logarithm_and_the_same_again():
     assert drawn(axes, 20, seed=1) != points[:20]
 
 
+def test_a_point_is_played_once_however_often_it_is_named_or_drawn():
+    assert grid([Axis.parse("control.kp=1,1,2")]) == [("1",), ("2",)]
+    assert sorted(drawn([KP, KI], 50, seed=0)) == sorted(grid([KP, KI]))
+
+
 def test_a_point_changes_its_settings_and_no_other():
     tied = Axis.parse("control.rate_min_hz+control.rate_max_hz=2,3")
     config = at(Config(), [KP, tied], ("0.2", "3"))
