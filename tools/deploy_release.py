@@ -1,4 +1,4 @@
-"""What is put onto a device: the frozen program, its units and its udev rule, as one release with a name."""
+"""What is put onto a device: the frozen program, its units and its udev rules, as one release with a name."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from share.core.checkup.camera import RULE
+from share.core.checkup import camera
 from share.errors import ShareError, UsageError
 
 HERE = Path(__file__).resolve().parent / "device"
@@ -71,7 +71,7 @@ def _members(folder: Path) -> list[tuple[str, Path | bytes]]:
     return [
         *((str(path.relative_to(folder)), path) for path in program),
         *((f"deploy/{path.name}", path) for path in units),
-        (RULES, f"{RULE}\n".encode()),
+        (RULES, "".join(f"{rule}\n" for rule in camera.RULES).encode()),
     ]
 
 

@@ -6,6 +6,7 @@ What is not there is None or empty: containers and virtual machines show little.
 from __future__ import annotations
 
 import importlib
+import os
 import shutil
 import socket
 from pathlib import Path
@@ -42,7 +43,7 @@ def cameras(root: Path = Path("/")) -> list[UsbCamera] | None:
 
 
 def camera_rules(root: Path = Path("/")) -> list[str]:
-    """Files of udev that name Intel's vendor and cameras in lines that are no comments."""
+    """Files of udev that name the camera and its IMU in lines that are no comments."""
     files = [path for folder in _RULES for path in sorted((root / folder).glob("*.rules"))]
     found = {path.resolve(): path for path in files if _names_camera(_text(path) or "")}  # /lib is /usr/lib
     return [f"/{path.relative_to(root)}" for path in found.values()]
@@ -92,13 +93,20 @@ def _is_d435i(path: Path) -> bool:
 
 
 def _camera(path: Path) -> UsbCamera:
-    return UsbCamera(path.name, float(_text(path / "speed") or 0), _text(path / "power/control"))
+    speed_mbit_s, control = float(_text(path / "speed") or 0), _text(path / "power/control")
+    return UsbCamera(path.name, speed_mbit_s, control, _may_start_imu(path))
+
+
+def _may_start_imu(path: Path) -> bool | None:
+    switches = list(path.glob(f"{path.name}:*/*/HID-SENSOR-*/iio:device*/scan_elements/*_en"))
+    return all(os.access(switch, os.W_OK) for switch in switches) if switches else None
 
 
 def _names_camera(text: str) -> bool:
-    """librealsense's own file names each product; ours the D435i."""
-    lines = (line.lower() for line in text.splitlines() if not line.lstrip().startswith("#"))
-    return any(_VENDOR in line and _D435I in line for line in lines)
+    """librealsense's own file names each product; ours the D435i. Without a line for iio the IMU is shut."""
+    lines = [line.lower() for line in text.splitlines() if not line.lstrip().startswith("#")]
+    named = [line for line in lines if _VENDOR in line and _D435I in line]
+    return any("iio" in line for line in named) and any("iio" not in line for line in named)
 
 
 def _text(path: Path) -> str | None:

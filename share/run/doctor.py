@@ -47,6 +47,7 @@ def of_camera(profile: HostProfile) -> list[Finding]:
         camera.sdk(sdk),
         camera.firmware(sdk, device.firmware, device.firmware_oldest),
         camera.udev(facts.camera_rules(), os.geteuid() == 0),
+        camera.imu(found or ()),
         camera.autosuspend(found or (), wanted.usb_autosuspend),
         camera.usb_memory(facts.usb_memory_mb(), wanted.usbfs_mb),
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -87,8 +88,31 @@ def test_facts_are_read_from_a_tree(tmp_path: Path) -> None:
         "power/control": "auto",
     }.items():
         (usb / name).write_text(text + "\n")
-    assert facts.cameras(tmp_path) == [UsbCamera("2-1", 480.0, "auto")]
-    (rules / "9.rules").write_text("# " + camera.RULE)
-    assert facts.camera_rules(tmp_path) == []
-    (rules / "9.rules").write_text(camera.RULE)
+    assert facts.cameras(tmp_path) == [UsbCamera("2-1", 480.0, "auto", may_start_imu=None)]
+    for told in ([], [f"# {rule}" for rule in camera.RULES], camera.RULES[:1], camera.RULES[1:]):
+        (rules / "9.rules").write_text("\n".join(told))
+        assert facts.camera_rules(tmp_path) == []  # the IMU as well as the camera
+    (rules / "9.rules").write_text("\n".join(camera.RULES))
     assert facts.camera_rules(tmp_path) == ["/etc/udev/rules.d/9.rules"]
+
+
+def test_the_imu_is_started_by_files_that_we_must_be_able_to_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usb = tmp_path / "sys/bus/usb/devices/2-1"
+    switches = usb / "2-1:1.5/0003:8086:0B3A.0001/HID-SENSOR-200073.1.auto/iio:device0/scan_elements"
+    switches.mkdir(parents=True)
+    for name, text in {"idVendor": "8086", "idProduct": "0b3a", "speed": "5000"}.items():
+        (usb / name).write_text(text + "\n")
+    for name in ("in_accel_x_en", "in_accel_x_index"):
+        (switches / name).write_text("0\n")
+    shut: set[str] = set()
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name not in shut)  # root may anything
+    assert camera.imu(facts.cameras(tmp_path) or ()).state is State.OK
+    shut.add("in_accel_x_en")
+    found = camera.imu(facts.cameras(tmp_path) or ())
+    assert found.state is State.FAIL
+    assert [rule for rule in camera.RULES if not any(f"echo '{rule}'" in line for line in found.mend)] == []
+    (switches / "in_accel_x_en").unlink()
+    assert camera.imu(facts.cameras(tmp_path) or ()).state is State.WARN
+    assert camera.imu([]).state is State.SKIPPED

@@ -122,13 +122,13 @@ rollback() { # to the release before
     say "$back runs; rollback again for $old"
 }
 
-switch() { # RELEASE: its program, units and udev rule
+switch() { # RELEASE: its program, units and udev rules
     touch "$OPT/releases/$1"
     mkdir -p "$UNITS" "$RULES" "$ROOT/usr/local/bin"
     cp "$OPT/releases/$1"/deploy/*.service "$UNITS/"
     cmp -s "$OPT/releases/$1"/deploy/*.rules "$RULES/99-share-realsense.rules" || {
         cp "$OPT/releases/$1"/deploy/*.rules "$RULES/99-share-realsense.rules"
-        udevadm control --reload-rules && udevadm trigger --subsystem-match=usb || say "udev did not reload"
+        udevadm control --reload-rules && udevadm trigger || say "udev did not reload"
     }
     ln -sfn /opt/share/current/share "$ROOT/usr/local/bin/share"
     point current "$1"

@@ -9,18 +9,27 @@ from dataclasses import dataclass
 from share.core.checkup import Finding, fail, ok, skipped, warn
 
 _USB3_MBIT_S = 5000
-RULE = 'SUBSYSTEMS=="usb", ATTRS{idVendor}=="8086", ATTRS{idProduct}=="0b3a", MODE:="0660", GROUP:="plugdev"'
+_D435I = 'ATTRS{idVendor}=="8086", ATTRS{idProduct}=="0b3a"'
+# The SDK starts the IMU by writing files in /sys, which MODE and GROUP do not reach.
+_IMU = f'{_D435I}, RUN+="/bin/chgrp -R plugdev /sys/%p /dev/%k", RUN+="/bin/chmod -R g+rwX /sys/%p /dev/%k"'
+RULES = (
+    f'SUBSYSTEMS=="usb", {_D435I}, MODE:="0660", GROUP:="plugdev"',
+    f'KERNEL=="iio*", {_IMU}',
+    f'DRIVER=="hid_sensor_custom", {_IMU}',
+)
 _RULE_FILE = "/etc/udev/rules.d/99-share-realsense.rules"
 
 
 @dataclass(frozen=True)
 class UsbCamera:
     """As the kernel sees it. path: its name in /sys/bus/usb/devices. speed_mbit_s: of the link. control:
-    power/control, "on" where it is never put to sleep; None where unknown."""
+    power/control, "on" where it is never put to sleep; None where unknown. may_start_imu: whether we may
+    write what starts its IMU; None where the kernel shows no IMU."""
 
     path: str
     speed_mbit_s: float
     control: str | None = None
+    may_start_imu: bool | None = True
 
 
 @dataclass(frozen=True)
@@ -78,19 +87,37 @@ def version(text: str) -> tuple[int, ...]:
 
 
 def udev(rules: Sequence[str], is_root: bool) -> Finding:
-    """rules: files that name Intel's cameras."""
+    """rules: files that name the camera and its IMU."""
     if rules:
         return ok("udev rule", ", ".join(rules))
+    mend = (*_write_rules(), "sudo usermod -aG plugdev $USER  # then log in again")
     if is_root:
-        return warn("udev rule", "none for 8086, but root needs none", *_rule())
-    return fail("udev rule", "none for 8086: only root may open the camera", *_rule())
+        return warn("udev rule", "none for 8086 and its IMU (iio), but root needs none", *mend)
+    return fail("udev rule", "none for 8086 and its IMU (iio): only root may open the camera", *mend)
 
 
-def _rule() -> tuple[str, ...]:
+def imu(cameras: Sequence[UsbCamera]) -> Finding:
+    """Whether we may start it."""
+    if not cameras:
+        return skipped("IMU", "no camera to look at")
+    unseen = [camera.path for camera in cameras if camera.may_start_imu is None]
+    if unseen:
+        what = f"{', '.join(unseen)}: the kernel shows no IMU (iio) of the camera"
+        return warn("IMU", what, "sudo modprobe -a hid_sensor_accel_3d hid_sensor_gyro_3d; replug the camera")
+    closed = [camera.path for camera in cameras if not camera.may_start_imu]
+    if closed:
+        what = f"{', '.join(closed)}: its files in /sys (iio:device*) cannot be written"
+        mend = "sudo usermod -aG plugdev $USER  # then log in again, and replug the camera"
+        return fail("IMU", what, *_write_rules(), mend)
+    return ok("IMU", "may be started")
+
+
+def _write_rules() -> tuple[str, ...]:
+    first, *others = RULES
     return (
-        f"echo '{RULE}' | sudo tee {_RULE_FILE}",
+        f"echo '{first}' | sudo tee {_RULE_FILE}",
+        *(f"echo '{rule}' | sudo tee -a {_RULE_FILE}" for rule in others),
         "sudo udevadm control --reload-rules && sudo udevadm trigger",
-        "sudo usermod -aG plugdev $USER  # then log in again",
     )
 
 
