@@ -30,14 +30,14 @@ def test_pictures_without_a_board_are_one_line_and_leave_nothing(
     assert not list((tmp_path / "out").glob("*"))
 
 
-def _pictures(folder: Path, rng: np.random.Generator) -> None:
-    """14 of a board all over the image, and one in which a single row of its corners is to be seen."""
+def _pictures(folder: Path, rng: np.random.Generator, count: int = 14) -> None:
+    """`count` of a board all over the image, and one in which a single row of its corners is to be seen."""
     board = CharucoBoard()
     print_out = printed(board)
     middle = np.append(board.extent.mean(axis=0), 0)
     facing = se3.exp(np.array([np.pi, 0, 0, 0, 0, 0]))
     folder.mkdir(parents=True)
-    for k in range(14):
+    for k in range(count):
         T = facing @ se3.exp(np.append(rng.uniform(-0.5, 0.5, 3), [0, 0, 0]))
         depth = rng.uniform(0.5, 0.9)
         T[:3, 3] = np.append(rng.uniform((-0.25, -0.2), (0.25, 0.2)), 1) * depth - T[:3, :3] @ middle
@@ -66,3 +66,20 @@ def test_a_known_camera_is_found_from_a_folder_of_pictures(
     assert report["passed"]
     assert "row" not in [view["name"] for view in report["per_view"]]
     assert (out / "camera-report.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_is_not_to_be_believed_does_not_replace_what_was(
+    share: Callable[..., Done], tmp_path: Path, rng: np.random.Generator
+) -> None:
+    _pictures(tmp_path / "pictures" / "cam0", rng, 5)
+    out = tmp_path / "out"
+    asked = ("calibrate", "camera", tmp_path / "pictures", "--target", "charuco", "--camera", "cam0", "--out")
+    first = share(*asked, out)
+    assert first.code == 1 and "kalibr_imucam_chain.yaml is written)" in first.err
+    assert "FAILED" in (out / "kalibr_imucam_chain.yaml").read_text()
+    (out / "kalibr_imucam_chain.yaml").write_text("a good one")
+    again = share(*asked, out)
+    assert again.code == 1 and again.err.count("\n") == 1
+    assert "kalibr_imucam_chain.failed.yaml is written; kalibr_imucam_chain.yaml is kept" in again.err
+    assert (out / "kalibr_imucam_chain.yaml").read_text() == "a good one"
+    assert "FAILED" in (out / "kalibr_imucam_chain.failed.yaml").read_text()

@@ -68,19 +68,28 @@ def test_mounting_and_offset_are_found_and_an_inverted_one_is_said(
     assert (tmp_path / "camera-imu-report.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_is_not_to_be_believed_is_written_and_fails(
+def test_what_is_not_to_be_believed_fails_and_leaves_what_was_there(
     share: Callable[..., Done], dance: Path, tmp_path: Path
 ) -> None:
+    """Beside a measured IMU chain and a camchain that somebody believes in."""
     proud = yaml.safe_load((dance / "imu.yaml").read_text())
     proud["imu0"]["gyroscope_noise_density"] /= 30
-    (tmp_path / "kalibr_imu_chain.yaml").write_text(yaml.safe_dump(proud))
-    before = (tmp_path / "kalibr_imu_chain.yaml").read_text()
-    done = share(*asked(dance, tmp_path, "--imu", tmp_path))
+    (tmp_path / "proud.yaml").write_text(yaml.safe_dump(proud))
+    before = {
+        "kalibr_imu_chain.yaml": "# measured\n" + (dance / "imu.yaml").read_text(),
+        "kalibr_imucam_chain.yaml": (dance / "camera.yaml").read_text(),
+    }
+    for name, text in before.items():
+        (tmp_path / name).write_text(text)
+    done = share(*asked(dance, tmp_path, "--imu", tmp_path / "proud.yaml"))
     assert done.code == 1
-    assert "not to be believed" in done.err and "gyroscope's residuals" in done.err
-    assert done.err.count("\n") == 1 and "time offset: +12." in done.out
-    assert "FAILED" in (tmp_path / "kalibr_imucam_chain.yaml").read_text()
-    assert (tmp_path / "kalibr_imu_chain.yaml").read_text() == before  # given, so left alone
+    kept, failed = done.err.splitlines()
+    assert "kalibr_imu_chain.yaml is of other noise and is kept; used was that of --imu" in kept
+    assert "not to be believed" in failed and "gyroscope's residuals" in failed
+    assert "kalibr_imucam_chain.failed.yaml is written; kalibr_imucam_chain.yaml is kept" in failed
+    assert "time offset: +12." in done.out and "kalibr_imucam_chain.failed.yaml" in done.out
+    assert "FAILED" in (tmp_path / "kalibr_imucam_chain.failed.yaml").read_text()
+    assert {name: (tmp_path / name).read_text() for name in before} == before
 
 
 def test_wrong_use_is_one_line_and_leaves_nothing(

@@ -26,3 +26,17 @@ def test_another_ending_is_refused(share, tmp_path):
     assert done.code == 2
     assert "ends in .pdf" in done.err
     assert not Path(tmp_path / "b.png").exists()
+
+
+def test_a_size_that_was_mended_is_kept(share, tmp_path):
+    asked = ("calibrate", "target", "--size", 20, "--out", tmp_path / "b.pdf")
+    assert share(*asked).code == 0
+    assert share(*asked).code == 0  # the same board once more
+    mended = (tmp_path / "b.yaml").read_text().replace("0.02\n", "0.01987  # calipers\n")
+    (tmp_path / "b.yaml").write_text(mended)
+    (tmp_path / "b.pdf").unlink()
+    done = share(*asked)
+    assert done.code == 2 and done.err.count("\n") == 1
+    assert "its size was mended, and is kept; give another --out" in done.err
+    assert (tmp_path / "b.yaml").read_text() == mended and "calipers" in mended
+    assert not (tmp_path / "b.pdf").exists()

@@ -12,9 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from share.errors import DataError, ShareError
+from share.errors import DataError, ShareError, UsageError
+from share.metrics.figures import Conditions, RunFigures
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
+
+
+def comparable(policy: str, in_one_map: int) -> RunFigures:
+    return RunFigures(Conditions("room", policy, "wifi5", 0), (), in_one_map, 1.0, 1, 0, 1)
 
 
 @pytest.fixture
@@ -43,7 +48,7 @@ def test_what_is_worse(tool, name, before, now, says):
 
 def test_a_run_is_kept_and_the_next_is_held_against_it(tool, monkeypatch, tmp_path, capsys):
     file = tmp_path / "history.jsonl"
-    options = Namespace(history=file, keep="the first", cache=None, workers=1)
+    options = Namespace(history=file, keep="the first", accept=[], cache=None, workers=1)
     monkeypatch.setattr(tool, "played", lambda config, options: {"share: joint ATE": 1.0})
     tool.compare(options)
     (first,) = tool.history(file)
@@ -51,15 +56,35 @@ def test_a_run_is_kept_and_the_next_is_held_against_it(tool, monkeypatch, tmp_pa
     assert first["figures"] == {"share: joint ATE": 1.0}
 
     monkeypatch.setattr(tool, "played", lambda config, options: {"share: joint ATE": 5.0})
-    options.keep = None
-    with pytest.raises(ShareError, match=r"worse than .* \(the first\): share: joint ATE"):
+    options.keep = "though it is worse"
+    with pytest.raises(ShareError, match=r"worse than before: share: joint ATE"):
         tool.compare(options)
-    assert len(tool.history(file)) == 1
+    assert len(tool.history(file)) == 1  # it is not what the next is held against
     assert "| worse |" in capsys.readouterr().out
+    options.accept = ["share: joint ATF"]
+    with pytest.raises(UsageError, match="--accept share: joint ATF: is none of share: joint ATE, all"):
+        tool.compare(options)
+    options.accept = ["all"]
+    tool.compare(options)
+    assert tool.history(file)[1]["accepted"] == ["share: joint ATE"]
+    assert tool.wanted(tool.history(file)) == {"share: joint ATE": 5.0}
 
     file.write_text(json.dumps(first) + "\n{")
     with pytest.raises(DataError, match="is damaged"):
         tool.history(file)
+
+
+def test_many_small_steps_down_are_seen(tool):
+    lines = [{"figures": {"share: joint ATE": value}} for value in (1.0, 1.1, 1.3, 1.6, 1.7)]
+    now = {"share: joint ATE": 2.3}
+    assert tool.judged(now, lines[-1]["figures"])[0].says == ""
+    assert tool.judged(now, tool.wanted(lines))[0].says == "worse"
+
+
+def test_one_agent_that_stays_outside_shows(tool):
+    """In one of four runs by each policy."""
+    runs = [comparable(policy, 2 if k == 0 else 3) for policy in tool.POLICIES for k in range(4)]
+    assert tool.figures_of(runs)["covins-g: agents in one map"] == 2.75
 
 
 def test_history_is_of_figures_that_are_judged(tool):
