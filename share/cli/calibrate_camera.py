@@ -50,7 +50,8 @@ def camera(
     """Find focal lengths, principal point and distortion of a camera or a stereo pair, and how the pair sits,
     from a recording of a calibration board or a folder with cam0/*.png and cam1/*.png.
 
-    Exit code 1 where the result is not to be believed; the files are written all the same.
+    Exit code 1 where the result is not to be believed; the files are written all the same. A camchain that
+    is in DIR is then kept.
 
     \b
     Example:  share calibrate camera board.mcap --target aprilgrid --out calib/mine
@@ -58,6 +59,7 @@ def camera(
     """
     from share.io import camera_report
     from share.io.board_views import open_pictures
+    from share.io.earlier import camchain_path, written
     from share.io.files import atomic_write, writable_dir
     from share.io.json_file import known
     from share.io.target import named_target
@@ -67,13 +69,14 @@ def camera(
     writable_dir(out)
     outcome = _calibrated(source, pictures, target, every, most, workers)
     text = json.dumps(known(camera_report.to_json(outcome)), indent=1)
-    atomic_write(out / "kalibr_imucam_chain.yaml", camera_report.kalibr_text(outcome, source))
+    chain = camchain_path(out, outcome.verdict.passed)
+    atomic_write(chain, camera_report.kalibr_text(outcome, source))
     atomic_write(out / "camera-report.json", text + "\n")
     atomic_write(out / "camera-report.png", camera_report.picture(outcome, source))
-    click.echo(text if as_json else _summary(outcome, out))
+    click.echo(text if as_json else _summary(outcome, chain))
     if not outcome.verdict.passed:
         raise ShareError(
-            f"{source}: not to be believed ({out} is written): " + "; ".join(outcome.verdict.reasons)
+            f"{source}: not to be believed ({written(chain)}): " + "; ".join(outcome.verdict.reasons)
         )
 
 
@@ -117,7 +120,7 @@ def _calibrated(
     return Outcome(used, solution, covers, judge(solution, covers, seen), pictures.rig, len(seen), before)
 
 
-def _summary(outcome: Outcome, out: Path) -> str:
+def _summary(outcome: Outcome, chain: Path) -> str:
     from share.io.camera_report import table
 
     verdict = outcome.verdict
@@ -144,4 +147,4 @@ def _summary(outcome: Outcome, out: Path) -> str:
     if verdict.outliers:
         names = ", ".join(outcome.views[k].name for k in verdict.outliers[:6])
         lines.append(f"{len(verdict.outliers)} views fit worse than the rest: {names}")
-    return "\n".join([*lines, f"{out}: kalibr_imucam_chain.yaml, camera-report.json, camera-report.png"])
+    return "\n".join([*lines, f"{chain.parent}: {chain.name}, camera-report.json, camera-report.png"])

@@ -60,14 +60,17 @@ def camera_imu(
     """Find T_cam_imu of each camera and the time offset of camera and IMU, from a minute in which a rig was
     turned and moved before a calibration board. What is not given is taken from the recording.
 
-    Exit code 1 where the result is not to be believed; the files are written all the same.
+    Exit code 1 where the result is not to be believed; the files are written all the same. An IMU chain that
+    is in DIR is kept, and so is a camchain then.
 
     \b
     Example:  share calibrate camera-imu dance.mcap --target board.yaml --camera calib/mine \\
                 --imu calib/mine --out calib/mine
     """
     from share.io import camera_imu_report as report
+    from share.io.calibration import IMU_CHAIN
     from share.io.camera_imu_chart import residual_png
+    from share.io.earlier import camchain_path, says_noise, written
     from share.io.files import atomic_write, writable_dir
     from share.io.json_file import known
     from share.io.rig_pictures import open_rig_pictures
@@ -79,22 +82,22 @@ def camera_imu(
     outcome = _calibrated(source, pictures, noise, target_name, every, within, workers)
     text = json.dumps(known(report.to_json(outcome)), indent=1)
     verdict = "passed" if outcome.verdict.passed else "FAILED"
-    atomic_write(out / "kalibr_imucam_chain.yaml", report.camchain_text(outcome, source))
-    if imu is None or (out / "kalibr_imu_chain.yaml").resolve() not in _files(imu):
-        atomic_write(out / "kalibr_imu_chain.yaml", report.imu_chain_text(outcome, source))
+    chain, imu_chain = camchain_path(out, outcome.verdict.passed), out / IMU_CHAIN
+    atomic_write(chain, report.camchain_text(outcome, source))
+    warnings = _warnings(outcome)
+    if not imu_chain.exists():
+        atomic_write(imu_chain, report.imu_chain_text(outcome, source))
+    elif not says_noise(imu_chain, noise):
+        used = "the recording's own" if imu is None else f"that of --imu {imu}"
+        warnings.append(f"{imu_chain} is of other noise and is kept; used was {used}; --imu {out} uses it")
     atomic_write(out / "camera-imu-report.json", text + "\n")
     atomic_write(out / "camera-imu-report.png", residual_png(outcome.fit, f"{source}: {verdict}"))
-    click.echo(text if as_json else _summary(outcome, out))
-    for warning in _warnings(outcome):
+    click.echo(text if as_json else _summary(outcome, chain))
+    for warning in warnings:
         click.echo(f"share: {source}: {warning}", err=True)
     if not outcome.verdict.passed:
         reasons = "; ".join(outcome.verdict.reasons)
-        raise ShareError(f"{source}: not to be believed ({out} is written): {reasons}")
-
-
-def _files(given: str) -> tuple[Path, Path]:
-    """What --imu may mean."""
-    return Path(given).resolve(), (Path(given) / "kalibr_imu_chain.yaml").resolve()
+        raise ShareError(f"{source}: not to be believed ({written(chain)}): {reasons}")
 
 
 def _calibrated(
@@ -129,7 +132,7 @@ def _calibrated(
     return Outcome(found, judge(found), pictures.rig, noise, before, looked, len(views))
 
 
-def _summary(outcome: Outcome, out: Path) -> str:
+def _summary(outcome: Outcome, chain: Path) -> str:
     import numpy as np
 
     from share.geometry import se3
@@ -159,8 +162,7 @@ def _summary(outcome: Outcome, out: Path) -> str:
         f"{_list(verdict.turning)} rad/s rms",
         f"accelerometer: {verdict.accel:.2f} times; moved by {_list(verdict.moving)} m/s^2 rms; "
         f"gravity {np.linalg.norm(fit.state.gravity):.4f} m/s^2",
-        f"{out}: kalibr_imucam_chain.yaml, kalibr_imu_chain.yaml, camera-imu-report.json, "
-        "camera-imu-report.png",
+        f"{chain.parent}: {chain.name}, kalibr_imu_chain.yaml, camera-imu-report.json, camera-imu-report.png",
     ]
     return "\n".join(lines)
 

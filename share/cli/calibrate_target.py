@@ -31,7 +31,8 @@ def target(
     """Write a calibration board as a PDF, true to scale, and the YAML file by which other commands know it.
 
     Print at 100 % ("actual size"), glue it to something flat and stiff, and measure: where a tag's or
-    square's edge is not what the sheet says, write into the YAML file what it is.
+    square's edge is not what the sheet says, write into the YAML file what it is. A YAML file that is there
+    and says something else is kept, and nothing printed.
 
     \b
     Example:  share calibrate target --paper A3 --out board.pdf
@@ -40,6 +41,7 @@ def target(
     import yaml
 
     from share.calibration.sheet import USUAL, sheet
+    from share.io.earlier import says_target
     from share.io.files import atomic_write, check_writable
     from share.io.target import to_plain
     from share.io.target_sheet import pdf, words
@@ -54,7 +56,14 @@ def target(
     known_as = out.with_suffix(".yaml")
     for path in (out, known_as):
         check_writable(path)
+    there = known_as.exists()
+    if there and not says_target(known_as, made.target):
+        raise UsageError(
+            f"{known_as}: is of another board, or its size was mended, and is kept; give another --out, or "
+            "move it away"
+        )
     atomic_write(out, pdf(made))
-    atomic_write(known_as, yaml.safe_dump(to_plain(made.target), sort_keys=False))
+    if not there:
+        atomic_write(known_as, yaml.safe_dump(to_plain(made.target), sort_keys=False))
     click.echo(f"{words(made)}, on {paper} ({made.width:g} x {made.height:g} mm)")
     click.echo(f"print: {out}   for --target: {known_as}")
