@@ -39,7 +39,7 @@ def cameras(root: Path = Path("/")) -> list[UsbCamera] | None:
     folder = root / "sys/bus/usb/devices"
     if not folder.is_dir():
         return None
-    return [_camera(path) for path in sorted(folder.iterdir()) if _is_d435i(path)]
+    return [_camera(path, root / "dev/bus/usb") for path in sorted(folder.iterdir()) if _is_d435i(path)]
 
 
 def camera_rules(root: Path = Path("/")) -> list[str]:
@@ -92,9 +92,11 @@ def _is_d435i(path: Path) -> bool:
     return (_text(path / "idVendor"), _text(path / "idProduct")) == (_VENDOR, _D435I)
 
 
-def _camera(path: Path) -> UsbCamera:
+def _camera(path: Path, nodes: Path) -> UsbCamera:
     speed_mbit_s, control = float(_text(path / "speed") or 0), _text(path / "power/control")
-    return UsbCamera(path.name, speed_mbit_s, control, _may_start_imu(path))
+    node = nodes / f"{_whole(path / 'busnum') or 0:03}" / f"{_whole(path / 'devnum') or 0:03}"
+    may_open = os.access(node, os.R_OK | os.W_OK)
+    return UsbCamera(path.name, speed_mbit_s, control, may_open, _may_start_imu(path))
 
 
 def _may_start_imu(path: Path) -> bool | None:

@@ -44,7 +44,7 @@ def of_camera(profile: HostProfile) -> list[Finding]:
     found, sdk = facts.cameras(), asked.ask()
     return [
         camera.link(found),
-        camera.sdk(sdk),
+        camera.sdk(sdk, found or ()),
         camera.firmware(sdk, device.firmware, device.firmware_oldest),
         camera.udev(facts.camera_rules(), os.geteuid() == 0),
         camera.imu(found or ()),

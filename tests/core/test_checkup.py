@@ -31,6 +31,17 @@ def test_firmware_is_compared_by_numbers_not_letters(found: str, state: str) -> 
     assert camera.firmware(Sdk(firmware=(found,)), good, "5.12.0.0").state.value == state
 
 
+def test_a_camera_that_is_plugged_in_must_be_one_that_the_sdk_sees() -> None:
+    here, seen = UsbCamera("2-1", 5000), Sdk(firmware=("5.16.0.1",))
+    assert camera.sdk(seen, [here]).state is camera.sdk(Sdk(), []).state is State.OK
+    assert camera.sdk(seen, [here, here]).state is State.FAIL
+    unseen, closed = camera.sdk(Sdk(), [here]), camera.sdk(Sdk(), [UsbCamera("2-1", 5000, may_open=False)])
+    assert unseen.state is closed.state is State.FAIL
+    assert unseen.what == "loads, but sees 0 of 1 cameras: not permitted, or in use"
+    assert closed.what == "loads, but sees 0 of 1 cameras: this user may not open 2-1"
+    assert "plugdev" in unseen.mend[0]
+
+
 def test_what_cannot_be_seen_is_skipped() -> None:
     found = [host.governor([], "performance"), host.throttling([]), camera.usb_memory(None, 128)]
     found += [host.priority(None, 10), camera.firmware(Sdk("no"), [], None), camera.autosuspend([], False)]
@@ -86,9 +97,15 @@ def test_facts_are_read_from_a_tree(tmp_path: Path) -> None:
         "idProduct": "0b3a",
         "speed": "480",
         "power/control": "auto",
+        "busnum": "2",
+        "devnum": "13",
     }.items():
         (usb / name).write_text(text + "\n")
-    assert facts.cameras(tmp_path) == [UsbCamera("2-1", 480.0, "auto", may_start_imu=None)]
+    assert facts.cameras(tmp_path) == [UsbCamera("2-1", 480.0, "auto", may_open=False, may_start_imu=None)]
+    node = tmp_path / "dev/bus/usb/002/013"
+    node.parent.mkdir(parents=True)
+    node.touch()
+    assert facts.cameras(tmp_path) == [UsbCamera("2-1", 480.0, "auto", may_open=True, may_start_imu=None)]
     for told in ([], [f"# {rule}" for rule in camera.RULES], camera.RULES[:1], camera.RULES[1:2]):
         (rules / "9.rules").write_text("\n".join(told))
         assert facts.camera_rules(tmp_path) == []  # the IMU as well as the camera

@@ -23,12 +23,14 @@ _RULE_FILE = "/etc/udev/rules.d/99-share-realsense.rules"
 @dataclass(frozen=True)
 class UsbCamera:
     """As the kernel sees it. path: its name in /sys/bus/usb/devices. speed_mbit_s: of the link. control:
-    power/control, "on" where it is never put to sleep; None where unknown. may_start_imu: whether we may
-    write what starts its IMU; None where the kernel shows no IMU."""
+    power/control, "on" where it is never put to sleep; None where unknown. may_open: whether we may read and
+    write its node in /dev. may_start_imu: whether we may write what starts its IMU; None where the kernel
+    shows no IMU."""
 
     path: str
     speed_mbit_s: float
     control: str | None = None
+    may_open: bool = True
     may_start_imu: bool | None = True
 
 
@@ -70,12 +72,25 @@ def firmware(sdk: Sdk, good: Sequence[str], oldest: str | None) -> Finding:
     return warn("firmware", f"{found} is not among those tried: {', '.join(good)}", update + ", ".join(good))
 
 
-def sdk(found: Sdk) -> Finding:
-    if found.trouble is None:
-        return ok("librealsense", f"loads; cameras it sees: {len(found.firmware)}")
-    library = "libusb-1.0.so" in found.trouble
-    mend = "sudo apt install libusb-1.0-0" if library else "pip install pyrealsense2"
-    return fail("librealsense", found.trouble, mend)
+def sdk(found: Sdk, cameras: Sequence[UsbCamera]) -> Finding:
+    """cameras: those that are plugged in, of which it must see every one."""
+    if found.trouble is not None:
+        library = "libusb-1.0.so" in found.trouble
+        mend = "sudo apt install libusb-1.0-0" if library else "pip install pyrealsense2"
+        return fail("librealsense", found.trouble, mend)
+    if len(cameras) > len(found.firmware):
+        closed = [camera.path for camera in cameras if not camera.may_open]
+        why = f"this user may not open {', '.join(closed)}" if closed else "not permitted, or in use"
+        what = f"loads, but sees {len(found.firmware)} of {len(cameras)} cameras: {why}"
+        return fail("librealsense", what, *_TO_OPEN)
+    return ok("librealsense", f"loads; cameras it sees: {len(found.firmware)}")
+
+
+_TO_OPEN = (
+    "id  # must show plugdev; if not: sudo usermod -aG plugdev $USER, and log in again",
+    "unplug the camera and plug it in again, so that the udev rule is followed",
+    "sudo systemctl stop 'share-agent@*'  # a service that has the camera",
+)
 
 
 def version(text: str) -> tuple[int, ...]:

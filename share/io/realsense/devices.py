@@ -51,7 +51,10 @@ def choose(devices: list[Attached], serial: str | None, facts: DeviceFacts) -> A
     """The device `serial`, or the only one. Raises UsageError if it is not there or cannot be used."""
     listed = ", ".join(f"{device.serial} ({device.name})" for device in devices)
     if not devices:
-        raise UsageError("no RealSense camera is attached; plug one into a USB 3 port and see `lsusb`")
+        raise UsageError(
+            "no RealSense camera is attached, or none may be opened; if `lsusb` shows one: `id` must show "
+            "plugdev (log in again, replug), and nothing else may use it (sudo systemctl stop 'share-agent@*')"
+        )
     if serial is None:
         if len(devices) > 1:
             raise UsageError(f"several RealSense cameras are attached; name one, realsense:SERIAL: {listed}")
