@@ -53,7 +53,7 @@ def choose(devices: list[Attached], serial: str | None, facts: DeviceFacts) -> A
     if not devices:
         raise UsageError(
             "no RealSense camera is attached, or none may be opened; if `lsusb` shows one: `id` must show "
-            "plugdev (log in again, replug), and nothing else may use it (sudo systemctl stop 'share-agent@*')"
+            "plugdev (log in again, replug), and nothing else may use it: sudo systemctl stop 'share-agent@*'"
         )
     if serial is None:
         if len(devices) > 1:
