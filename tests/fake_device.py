@@ -6,8 +6,10 @@ unless the release in force holds a file `broken`, and is started again and agai
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -88,6 +90,28 @@ class FakeDevice:
         assert "Traceback" not in done.stderr, done.stderr
         return Done(done.returncode, done.stdout, done.stderr)
 
+    def unseen(self, *verb: str, leaves: int = 0) -> int:
+        """Exit code of a verb of device.sh that nobody listens to. leaves: signal to it once it has started
+        services."""
+        ear, mouth = os.pipe()
+        os.close(ear)
+        with subprocess.Popen(
+            ["sh", TOOLS / "device" / "device.sh", *verb],
+            env={"PATH": self.path, "SHARE_ROOT": str(self.root), "SHARE_SETTLE": "0.5"},
+            stdin=subprocess.DEVNULL,
+            stdout=mouth,
+            stderr=mouth,
+            start_new_session=True,
+        ) as process:
+            os.close(mouth)
+            deadline = time.monotonic() + 60
+            while leaves and "restart" not in "".join(self.log):
+                assert time.monotonic() < deadline
+                time.sleep(0.01)
+            if leaves:
+                os.killpg(process.pid, leaves)
+            return process.wait(60)
+
     def agent(self, dist: Path | None, *words: object) -> Done:
         return self.deploy("agent", "--name", "ann", "--edge", "tcp://10.0.0.1:5555", *words, dist=dist)
 
@@ -99,11 +123,15 @@ class FakeDevice:
     def releases(self) -> set[str]:
         return {path.name.partition("-")[0] for path in (self.root / "opt/share/releases").iterdir()}
 
+    @property
+    def log(self) -> list[str]:
+        path = self.folder / "log"
+        return path.read_text().splitlines() if path.exists() else []
+
     def asked(self) -> list[str]:
         """What was asked of systemd and of the user data base since the last time."""
-        log = self.folder / "log"
-        lines = log.read_text().splitlines() if log.exists() else []
-        log.unlink(missing_ok=True)
+        lines = self.log
+        (self.folder / "log").unlink(missing_ok=True)
         return lines
 
 

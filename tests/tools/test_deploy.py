@@ -7,6 +7,7 @@ import os
 import platform
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -156,6 +157,27 @@ def test_a_first_release_that_does_not_run_is_stopped(device):
     done = device.agent(device.program("1.0", "broken"))
     assert done.code == 1
     assert "no other release to go back to" in done.err
+    assert "systemctl disable --now share-agent@ann" in device.asked()
+
+
+@pytest.mark.parametrize("leaves", [0, signal.SIGHUP, signal.SIGINT])
+def test_a_release_that_does_not_run_is_taken_back_though_nobody_looks_on(device, leaves):
+    """The line to the device breaks while its services are watched; or who typed it there goes away."""
+    device.agent(device.program("1.0"))
+    device.agent(device.program("1.1", "broken"))
+    (bad,) = [path.name for path in (device.root / "opt/share/releases").glob("1.1-*")]
+    device.asked()
+    code = device.unseen("activate", bad, "share-agent@ann", "d435i-n100-headset", leaves=leaves)
+    assert (code, device.current) == (1, "1.0")
+    assert [line for line in device.asked() if "restart" in line] == ["systemctl restart share-agent@ann"] * 2
+
+
+def test_a_service_that_fails_where_only_the_program_was_is_said_to_be_gone(device):
+    program = device.program("1.0", "broken")
+    assert device.deploy("program", dist=program).code == 0
+    done = device.agent(program)
+    assert done.err.rstrip().endswith("does not run like this; all is as it was, without a service")
+    assert (done.code, device.current) == (1, "1.0")
     assert "systemctl disable --now share-agent@ann" in device.asked()
 
 

@@ -3,14 +3,15 @@
 #     sudo sh /opt/share/current/deploy/device.sh rollback
 # SHARE_ROOT: a folder in place of /, for tests. Needs what a bare Debian or Ubuntu has: sh, tar, gzip, systemd.
 set -eu
+trap '' PIPE HUP INT # the line may break, or who looks on may leave: what was begun is ended, or taken back
 ROOT=${SHARE_ROOT:-}
 SETTLE=${SHARE_SETTLE:-10} # seconds for which a service must stay up
 KEEP=${SHARE_KEEP:-3}      # releases
 OPT=$ROOT/opt/share ETC=$ROOT/etc/share VAR=$ROOT/var/lib/share
 UNITS=$ROOT/etc/systemd/system RULES=$ROOT/etc/udev/rules.d
 
-say() { echo "share: $*"; }
-die() { echo "$*" >&2; exit 1; }
+say() { echo "share: $*" || :; } # perhaps to nobody
+die() { echo "$*" >&2 || :; exit 1; }
 release() { readlink "$OPT/$1" 2>/dev/null | sed 's|^releases/||'; } # current or previous: which it is
 services() { cat "$ETC/services" 2>/dev/null || true; }
 
@@ -102,8 +103,10 @@ go_back() { # RELEASE OLD: to OLD and what ran with it
     switch "$2"
     restart_all
     healthy || die "$1 does not run, nor does $2, to which all was put back"
-    [ "$1" != "$2" ] || die "$1 does not run like this; all is as it was, and runs"
-    die "$1 does not run; $2 is back and runs"
+    so=" and runs"
+    [ -n "$(services)" ] || so=", without a service"
+    [ "$1" != "$2" ] || die "$1 does not run like this; all is as it was$so"
+    die "$1 does not run; $2 is back$so"
 }
 
 stop_for_good() { # UNIT
@@ -194,7 +197,7 @@ make_keys() { # RELEASE UNIT: this machine's pair, once
 
 show_key() {
     say "this machine's public key, which the other side wants (docs/deployment-keys.md):"
-    cat "$ETC"/keys/*.public
+    cat "$ETC"/keys/*.public || :
 }
 
 take_settings() { # prints the names of those that differ; the old ones are kept until all is well
