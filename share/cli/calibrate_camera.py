@@ -117,7 +117,9 @@ def _calibrated(
         coverage([view.seen[eye].px for view in used], T, target, sizes[0])
         for eye, T in enumerate((state.T_cam0_target, state.T_cam1_cam0 @ state.T_cam0_target)[: len(sizes)])
     )
-    return Outcome(used, solution, covers, judge(solution, covers, seen), pictures.rig, len(seen), before)
+    return Outcome(
+        used, solution, covers, judge(solution, covers, seen), rig, len(seen), before, pictures.said
+    )
 
 
 def _summary(outcome: Outcome, chain: Path) -> str:

@@ -74,7 +74,7 @@ def camera_imu(
     from share.io.files import atomic_write, writable_dir
     from share.io.json_file import known
     from share.io.rig_pictures import open_rig_pictures
-    from share.io.stated_noise import stated_noise
+    from share.io.stated_noise import chain_file, stated_noise
 
     pictures = open_rig_pictures(source, camera)
     noise = stated_noise(source, imu, "--imu")
@@ -86,7 +86,8 @@ def camera_imu(
     atomic_write(chain, report.camchain_text(outcome, source))
     warnings = _warnings(outcome)
     if not imu_chain.exists():
-        atomic_write(imu_chain, report.imu_chain_text(outcome, source))
+        as_given = None if imu is None else chain_file(imu, "--imu").read_text(encoding="utf-8")
+        atomic_write(imu_chain, as_given or report.imu_chain_text(outcome, source))
     elif not says_noise(imu_chain, noise):
         used = "the recording's own" if imu is None else f"that of --imu {imu}"
         warnings.append(f"{imu_chain} is of other noise and is kept; used was {used}; --imu {out} uses it")
@@ -129,7 +130,9 @@ def _calibrated(
             partial(stages, "fitting"),
         )  # fmt: skip
     before = None if pictures.before is None else compare(found.T_imu_cam0, pictures.before)
-    return Outcome(found, judge(found), pictures.rig, noise, before, looked, len(views))
+    return Outcome(
+        found, judge(found), pictures.rig, noise, before, looked, len(views), pictures.pictures.said
+    )
 
 
 def _summary(outcome: Outcome, chain: Path) -> str:

@@ -12,10 +12,10 @@ from share.core.measurement import CAM0, CAM1
 from share.errors import DataError, UsageError
 from share.geometry.camera import Rig
 from share.geometry.target import Target
-from share.io.calibration import read_calibration
+from share.io.calibration import Calibration
 from share.io.images import decode_gray
 from share.io.pool import Pool
-from share.io.source import open_source
+from share.io.source import calibration_of, open_source
 from share.types import U8
 
 _PICTURES = (".png", ".jpg", ".jpeg")
@@ -25,11 +25,12 @@ _TOGETHER_NS = 2_000_000  # stamps of two pictures taken at once
 @dataclass(frozen=True, eq=False)
 class Pictures:
     """count: of cam0's; rig: the calibration so far, if the source has one; read: name and images of each,
-    which of a recording is the stamp of the first camera's, ns."""
+    which of a recording is the stamp of the first camera's, ns; said: the calibration that was given."""
 
     count: int
     rig: Rig | None
     read: Callable[[], Iterator[tuple[str, tuple[U8, ...]]]]
+    said: Calibration | None = None
 
 
 def open_pictures(source: str, eyes: Sequence[str], calib: str | None = None) -> Pictures:
@@ -37,9 +38,9 @@ def open_pictures(source: str, eyes: Sequence[str], calib: str | None = None) ->
 
     eyes: which cameras. Raises UsageError, ConfigError or DataError.
     """
-    folder = Path(source)
+    folder, said = Path(source), calibration_of(calib)
     if any((folder / CAM0).glob("*")) and not (folder / CAM0 / "data.csv").exists():
-        return _folder(folder, eyes, read_calibration(Path(calib)).rig if calib else None)
+        return _folder(folder, eyes, said)
     opened = open_source(source, calib)
     if CAM1 in eyes and opened.rig.cam1 is None:
         raise UsageError(f"{source}: has no cam1; give --camera cam0")
@@ -56,10 +57,10 @@ def open_pictures(source: str, eyes: Sequence[str], calib: str | None = None) ->
                 pair = tuple(waiting.pop(eye)[1].load() for eye in eyes)  # type: ignore[attr-defined]
                 yield str(first), pair
 
-    return Pictures(opened.images_count, opened.rig, read)
+    return Pictures(opened.images_count, opened.rig, read, said)
 
 
-def _folder(folder: Path, eyes: Sequence[str], rig: Rig | None) -> Pictures:
+def _folder(folder: Path, eyes: Sequence[str], said: Calibration | None) -> Pictures:
     found = [
         {p.stem: p for p in sorted((folder / eye).glob("*")) if p.suffix.lower() in _PICTURES} for eye in eyes
     ]
@@ -71,7 +72,7 @@ def _folder(folder: Path, eyes: Sequence[str], rig: Rig | None) -> Pictures:
         for name in names:
             yield name, tuple(decode_gray(one[name].read_bytes(), str(one[name])) for one in found)
 
-    return Pictures(len(names), rig, read)
+    return Pictures(len(names), None if said is None else said.rig, read, said)
 
 
 def find_views(

@@ -7,6 +7,7 @@ in docs/data.md.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -28,12 +29,25 @@ _DEPTH_SCALE = 1000.0  # 16-bit depth in millimetres, as ROS and RealSense have 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A rig and what else its file says. topics: stream -> ROS topic; depth_scale: units per metre."""
+    """A rig and what else its file says. topics: stream -> ROS topic; depth_scale: units per metre; eyes: of
+    cam0 and cam1, as they were read."""
 
     rig: Rig
     where: str
     depth_scale: float = _DEPTH_SCALE
     topics: dict[str, str] = field(default_factory=dict)
+    eyes: tuple[Section, ...] = ()
+
+    @property
+    def T_imu_cam0(self) -> F64 | None:
+        """(4, 4) as the file says, also without an IMU chain beside it. Raises ConfigError."""
+        told = self.eyes and {"T_cam_imu", "T_imu_cam"} & self.eyes[0].data.keys()
+        return kalibr_T_imu_cam(self.eyes[0]) if told else None
+
+    @property
+    def timeshift_s(self) -> float:
+        """IMU time less camera time, s, likewise. Raises ConfigError."""
+        return _timeshift_s(self.eyes)
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -56,11 +70,12 @@ def kalibr(chain: Section, imu: Section | None) -> Calibration:
     """The rig of a camchain (cam0, cam1 and, ours alone, depth) and an IMU chain's imu0."""
     cams = {name: chain.section(name) for name in ("cam0", "cam1", "depth") if name in chain}
     cam0 = chain.section("cam0")
+    eyes = tuple(cams[name] for name in ("cam0", "cam1") if name in cams)
     rig = Rig(
         cam0=_camera(cam0),
         T_body_cam0=kalibr_T_imu_cam(cam0) if imu else np.eye(4),
         imu=imu_noise(imu, "update_rate") if imu else None,
-        timeshift_s=_timeshift_s([cams[name] for name in ("cam0", "cam1") if name in cams]) if imu else 0.0,
+        timeshift_s=_timeshift_s(eyes) if imu else 0.0,
     )
     if "cam1" in cams:
         T_cam1_cam0 = _kalibr_T_cam1_cam0(cam0, cams["cam1"])
@@ -72,7 +87,7 @@ def kalibr(chain: Section, imu: Section | None) -> Calibration:
         scale = depth.number("depth_scale", _DEPTH_SCALE, positive=True)
     named = cams | ({"imu": imu} if imu else {})
     topics = {name: section.text("rostopic", "") for name, section in named.items()}
-    return Calibration(rig, chain.where, scale, {k: v for k, v in topics.items() if v})
+    return Calibration(rig, chain.where, scale, {k: v for k, v in topics.items() if v}, eyes)
 
 
 def read_camera_yaml(path: Path) -> Calibration:
@@ -86,7 +101,7 @@ def read_camera_yaml(path: Path) -> Calibration:
     else:  # registered: depth lies on the pixels of the undistorted colour image
         depth, T = replace(cam0, distortion=()), np.eye(4)
     rig = Rig(cam0=cam0, T_body_cam0=np.eye(4), depth=depth, T_depth_cam0=T)
-    return Calibration(rig, str(path), top.number("depth_scale", positive=True))
+    return Calibration(rig, str(path), top.number("depth_scale", positive=True), eyes=(top,))
 
 
 def read_euroc(cam0: Path, cam1: Path | None, imu0: Path | None) -> Calibration:
@@ -172,7 +187,7 @@ def kalibr_T_imu_cam(cam: Section) -> F64:
     raise ConfigError(f"{cam.where}: has no extrinsics to the IMU; add T_cam_imu (or T_imu_cam)")
 
 
-def _timeshift_s(cams: list[Section]) -> float:
+def _timeshift_s(cams: Sequence[Section]) -> float:
     """IMU time less camera time, s: the mean of what the cameras say, 0 where they say nothing."""
     said = [_one_timeshift_s(cam) for cam in cams if TIMESHIFT in cam]
     if said and max(said) - min(said) > _AGREE_S:

@@ -12,6 +12,7 @@ from share.calibration.camera_imu.fit import Fit
 from share.calibration.camera_imu.verdict import Comparison, Verdict
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
+from share.io.calibration import Calibration
 from share.io.kalibr import to_kalibr
 from share.types import F64
 
@@ -19,7 +20,8 @@ from share.types import F64
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """All that is told of one calibration. rig: the cameras as they were known; before: how T_imu_cam0 that
-    was given compares; looked, seen: pictures, and those that show the board."""
+    was given compares; looked, seen: pictures, and those that show the board; said: the cameras' calibration
+    that was given."""
 
     fit: Fit
     verdict: Verdict
@@ -28,6 +30,7 @@ class Outcome:
     before: Comparison | None
     looked: int
     seen: int
+    said: Calibration | None = None
 
     @property
     def calibrated(self) -> Rig:
@@ -44,7 +47,7 @@ class Outcome:
 
 def camchain_text(outcome: Outcome, source: str) -> str:
     """Kalibr's camchain-imucam: intrinsics as they were, T_cam_imu and timeshift_cam_imu of each camera."""
-    chain = to_kalibr(outcome.calibrated)
+    chain = to_kalibr(outcome.calibrated, outcome.said)
     del chain["imu0"]
     for eye, T in enumerate(outcome.T_cam_imu):
         chain[f"cam{eye}"] |= {"T_cam_imu": T.tolist(), "timeshift_cam_imu": outcome.fit.shift_s}
@@ -54,9 +57,9 @@ def camchain_text(outcome: Outcome, source: str) -> str:
 
 
 def imu_chain_text(outcome: Outcome, source: str) -> str:
-    """The IMU's noise as it was given, so that the folder is whole."""
+    """The IMU's noise as the recording has it, so that the folder is whole."""
     chain = {"imu0": to_kalibr(outcome.calibrated)["imu0"]}
-    return f"# as given to share calibrate camera-imu {source}\n" + yaml.safe_dump(chain, sort_keys=False)
+    return f"# as it came with share calibrate camera-imu {source}\n" + yaml.safe_dump(chain, sort_keys=False)
 
 
 def to_json(outcome: Outcome) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from share.calibration.projection import INTRINSICS, intrinsics
 from share.calibration.verdict import Verdict, residuals
 from share.geometry import se3
 from share.geometry.camera import Rig
+from share.io.calibration import Calibration
 from share.io.kalibr import to_kalibr
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
@@ -24,8 +25,9 @@ NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """All that is told of one calibration. before: the calibration that the source came with; seen: views
-    with the target among all pictures looked at; pair_before_px: as the verdict's, by `before`."""
+    """All that is told of one calibration. before: the cameras that the source came with; seen: views with
+    the target among all pictures looked at; pair_before_px: as the verdict's, by `before`; said: the
+    calibration that was given."""
 
     views: Sequence[View]
     solution: Solution
@@ -34,6 +36,7 @@ class Outcome:
     before: Rig | None
     seen: int
     pair_before_px: float | None = None
+    said: Calibration | None = None
 
     @property
     def rig(self) -> Rig:
@@ -50,8 +53,12 @@ class Outcome:
 
 
 def kalibr_text(outcome: Outcome, source: str) -> str:
-    """The camchain. The IMU's own noise is of another file, `share calibrate imu` writes it."""
-    chain = {key: value for key, value in to_kalibr(outcome.rig).items() if key != "imu0"}
+    """The camchain, with what was given of how the cameras sit on an IMU. The IMU's own noise is of another
+    file, `share calibrate imu` writes it."""
+    chain = {key: value for key, value in to_kalibr(outcome.rig, outcome.said).items() if key != "imu0"}
+    if "T_cam_imu" in chain["cam0"] and "cam1" in chain:  # by the new pair
+        T_cam1_cam0 = np.array(chain["cam1"]["T_cn_cnm1"])
+        chain["cam1"]["T_cam_imu"] = (T_cam1_cam0 @ chain["cam0"]["T_cam_imu"]).tolist()
     verdict = "passed" if outcome.verdict.passed else "FAILED, see camera-report.json"
     return f"# share calibrate camera {source}: {verdict}\n" + yaml.safe_dump(
         chain, sort_keys=False, default_flow_style=None

@@ -6,23 +6,34 @@ from typing import Any
 
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.io.calibration import CAMCHAIN, IMU_CHAIN, TIMESHIFT
-
-_DEPTH_SCALE = 1000.0  # 16-bit depth in millimetres
+from share.io.calibration import CAMCHAIN, IMU_CHAIN, TIMESHIFT, Calibration
 
 
-def to_kalibr(rig: Rig) -> dict[str, Any]:
-    """cam0, cam1, depth (ours) and imu0 of the rig, as plain data for a YAML file."""
-    shift = {TIMESHIFT: rig.timeshift_s} if rig.timeshift_s else {}  # 0 is what its absence means
+def to_kalibr(rig: Rig, said: Calibration | None = None) -> dict[str, Any]:
+    """cam0, cam1, depth (ours) and imu0 of the rig, as plain data for a YAML file.
+
+    said: what the rig was known by before. Of that is kept what no Rig holds: topics, depth_scale and, for a
+    rig without IMU, how cam0 sits on one and how late their clock is. Raises ConfigError.
+    """
+    said = said or Calibration(rig, "")
+    T_imu_cam0, shift_s = (
+        (said.T_imu_cam0, said.timeshift_s) if rig.imu is None else (rig.T_body_cam0, rig.timeshift_s)
+    )
+    shift = {TIMESHIFT: shift_s} if shift_s else {}  # 0 is what its absence means
     out = {"cam0": _camera(rig.cam0) | shift}
+    if T_imu_cam0 is not None:
+        out["cam0"]["T_cam_imu"] = se3.inverse(T_imu_cam0).tolist()
     if rig.imu is not None:
-        out["cam0"]["T_cam_imu"] = se3.inverse(rig.T_body_cam0).tolist()
         out["imu0"] = _imu(rig.imu)
     if rig.cam1 is not None and rig.T_cam1_cam0 is not None:
         out["cam1"] = _camera(rig.cam1) | shift | {"T_cn_cnm1": rig.T_cam1_cam0.tolist()}
     if rig.depth is not None and rig.T_depth_cam0 is not None:
         T = rig.T_depth_cam0.tolist()
-        out["depth"] = _camera(rig.depth) | {"T_depth_cam0": T, "depth_scale": _DEPTH_SCALE}
+        out["depth"] = _camera(rig.depth) | {"T_depth_cam0": T, "depth_scale": said.depth_scale}
+    for stream, topic in said.topics.items():
+        name = "imu0" if stream == "imu" else stream
+        if name in out:
+            out[name]["rostopic"] = topic
     return out
 
 

@@ -14,8 +14,7 @@ from share.errors import DataError, UsageError
 from share.geometry.camera import Camera, Rig
 from share.geometry.target import Target
 from share.io.board_views import Pictures, find_views, open_pictures
-from share.io.calibration import CAMCHAIN, kalibr_T_imu_cam
-from share.io.section import read_yaml
+from share.io.calibration import CAMCHAIN
 from share.types import F64, I64
 
 
@@ -39,7 +38,7 @@ def open_rig_pictures(source: str, camera: str | None) -> RigPictures:
     eyes = (CAM0, CAM1) if first.rig.cam1 is not None else (CAM0,)
     pictures = open_pictures(source, eyes, None if chain is None else str(chain)) if len(eyes) > 1 else first
     own = first.rig.T_body_cam0 if first.rig.imu is not None else None
-    return RigPictures(source, pictures, first.rig, own if chain is None else _given(chain))
+    return RigPictures(source, pictures, first.rig, own if first.said is None else first.said.T_imu_cam0)
 
 
 def _chain(camera: str) -> Path:
@@ -48,12 +47,6 @@ def _chain(camera: str) -> Path:
     if not path.is_file():
         raise UsageError(f"--camera {camera}: no such file, or no {CAMCHAIN} in it")
     return path
-
-
-def _given(chain: Path) -> F64 | None:
-    top = read_yaml(chain)
-    cam0 = top.section("cam0") if "cam0" in top else top
-    return kalibr_T_imu_cam(cam0) if {"T_cam_imu", "T_imu_cam"} & cam0.data.keys() else None
 
 
 def find_stamped(

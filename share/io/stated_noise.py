@@ -17,13 +17,18 @@ def stated_noise(source: str, given: str | None, option: str) -> ImuNoise:
     Raises UsageError or ConfigError.
     """
     if given is not None:
-        path = Path(given) / IMU_CHAIN if Path(given).is_dir() else Path(given)
-        if not path.is_file():
-            raise UsageError(f"{option} {given}: has no {IMU_CHAIN}")
-        return imu_noise(read_yaml(path).section("imu0"), "update_rate")
+        return imu_noise(read_yaml(chain_file(given, option)).section("imu0"), "update_rate")
     if Path(source).suffix == ".csv":
         raise UsageError(f"{source}: a table does not say how noisy the IMU is; give {option} DIR")
     noise = open_source(source).rig.imu
     if noise is None:
         raise UsageError(f"{source}: does not say how noisy the IMU is; give {option} DIR")
     return noise
+
+
+def chain_file(given: str, option: str) -> Path:
+    """The IMU chain that `option` gave: it, or the one in that folder. Raises UsageError."""
+    path = Path(given) / IMU_CHAIN if Path(given).is_dir() else Path(given)
+    if not path.is_file():
+        raise UsageError(f"{option} {given}: has no {IMU_CHAIN}")
+    return path

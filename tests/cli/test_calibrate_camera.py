@@ -6,12 +6,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import yaml
 from board_pictures import PAPER, printed
 from shell import Done
 
 from share.geometry import se3
+from share.geometry.camera import Camera, Rig
 from share.geometry.target import CharucoBoard
 from share.io.calibration import read_calibration
+from share.io.kalibr import to_kalibr
 
 K = np.array([[420, 0, 319.5], [0, 424, 241], [0, 0, 1]])
 
@@ -51,13 +54,21 @@ def _pictures(folder: Path, rng: np.random.Generator, count: int = 14) -> None:
 def test_a_known_camera_is_found_from_a_folder_of_pictures(
     share: Callable[..., Done], tmp_path: Path, rng: np.random.Generator
 ) -> None:
+    """Of the camchain that is given, all that is not found anew is kept."""
     _pictures(tmp_path / "pictures" / "cam0", rng)
-    out = tmp_path / "out"
+    out, given = tmp_path / "out", tmp_path / "given.yaml"
+    T_cam_imu = se3.exp(np.array([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]))
+    kept = {"T_cam_imu": T_cam_imu.tolist(), "timeshift_cam_imu": 0.004, "rostopic": "/left"}
+    camera = to_kalibr(Rig(Camera(640, 480, 400.0, 400.0, 320.0, 240.0), np.eye(4)))["cam0"]
+    given.write_text(yaml.safe_dump({"cam0": camera | kept}))
     done = share(
         "calibrate", "camera", tmp_path / "pictures", "--target", "charuco", "--camera", "cam0",
-        "--out", out, "--json",
+        "--calib", given, "--out", out, "--json",
     )  # fmt: skip
     assert done.code == 0, done.err
+    written = yaml.safe_load((out / "kalibr_imucam_chain.yaml").read_text())["cam0"]
+    np.testing.assert_allclose(written.pop("T_cam_imu"), kept.pop("T_cam_imu"), atol=1e-12)
+    assert {key: written[key] for key in kept} == kept
     found = read_calibration(out).rig.cam0
     np.testing.assert_allclose(found.K, K, rtol=1e-3, atol=0.5)
     assert (found.width, found.height) == (640, 480)

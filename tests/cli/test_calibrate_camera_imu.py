@@ -39,7 +39,8 @@ def dance(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lines = [f"{t},{','.join(map(repr, row))}\n" for t, row in zip(run.imu.stamps_ns, rows, strict=True)]
     (folder / "imu0" / "data.csv").write_text("".join(lines))
     chain = to_kalibr(Rig(CAMERA, se3.inverse(T_IMU_CAM0), imu=NOISE))  # the other way round
-    (folder / "imu.yaml").write_text(yaml.safe_dump({"imu0": chain.pop("imu0")}))
+    (folder / "imu.yaml").write_text("# measured\n" + yaml.safe_dump({"imu0": chain.pop("imu0")}))
+    chain["cam0"]["rostopic"] = "/left"
     (folder / "camera.yaml").write_text(yaml.safe_dump(chain))
     del chain["cam0"]["T_cam_imu"]
     (folder / "bare.yaml").write_text(yaml.safe_dump(chain))
@@ -62,6 +63,8 @@ def test_mounting_and_offset_are_found_and_an_inverted_one_is_said(
     assert np.degrees(np.linalg.norm(off[:3])) < 0.1 and np.linalg.norm(off[3:]) < 2e-3
     assert rig.timeshift_s == pytest.approx(SHIFT_S, abs=2e-4)
     assert rig.cam0 == CAMERA and rig.imu == NOISE
+    assert read_calibration(tmp_path).topics == {"cam0": "/left"}
+    assert (tmp_path / "kalibr_imu_chain.yaml").read_text() == (dance / "imu.yaml").read_text()
     report = json.loads(done.out)
     assert report == json.loads((tmp_path / "camera-imu-report.json").read_text())
     assert report["passed"] and report["given"]["inverted"]
@@ -76,7 +79,7 @@ def test_what_is_not_to_be_believed_fails_and_leaves_what_was_there(
     proud["imu0"]["gyroscope_noise_density"] /= 30
     (tmp_path / "proud.yaml").write_text(yaml.safe_dump(proud))
     before = {
-        "kalibr_imu_chain.yaml": "# measured\n" + (dance / "imu.yaml").read_text(),
+        "kalibr_imu_chain.yaml": (dance / "imu.yaml").read_text(),
         "kalibr_imucam_chain.yaml": (dance / "camera.yaml").read_text(),
     }
     for name, text in before.items():

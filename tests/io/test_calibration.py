@@ -157,6 +157,30 @@ def test_a_rig_written_under_kalibrs_names_is_read_as_it_was(tmp_path, seconds):
     np.testing.assert_allclose(back.T_body_cam0, rig.T_body_cam0, atol=1e-12)
 
 
+DEPTH = """depth:
+  intrinsics: [385.0, 385.0, 320.0, 240.0]
+  resolution: [640, 480]
+  T_depth_cam0: [[1, 0, 0, 0.015], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+  depth_scale: 5000
+  rostopic: /depth/image
+"""
+
+
+def test_what_no_rig_holds_is_kept_of_the_calibration_that_it_was(tmp_path):
+    """Also without the IMU chain, without which the rig has no IMU."""
+    T = matrix(se3.inverse(T_CAM0_IMU))
+    told = f"  T_imu_cam: {T}\n  timeshift_cam_imu: 0.004\n  rostopic: /left/image\n"
+    path = write(tmp_path, chain(told) + DEPTH, None) / CAMCHAIN
+    given = read_calibration(path)
+    assert given.rig.imu is None and given.rig.timeshift_s == 0
+    written = to_kalibr(given.rig, given)
+    np.testing.assert_allclose(written["cam0"]["T_cam_imu"], T_CAM0_IMU, atol=1e-12)
+    assert written["cam0"]["timeshift_cam_imu"] == 0.004
+    assert written["cam0"]["rostopic"] == "/left/image"
+    assert (written["depth"]["depth_scale"], written["depth"]["rostopic"]) == (5000, "/depth/image")
+    assert "imu0" not in written
+
+
 def test_imu_chain_and_missing_files(tmp_path):
     with pytest.raises(ConfigError, match=f"{IMU_CHAIN}: imu0: key 'update_rate' is missing"):
         read_calibration(write(tmp_path, chain(GOOD0), IMU.replace("update_rate", "rate")))
