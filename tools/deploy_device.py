@@ -57,14 +57,17 @@ class Device:
         return self._run(self._sudo() + self._shell(*verb), data)
 
     def send(self, release: Release, write: Callable[[IO[bytes]], None]) -> None:
-        """Raises ShareError; then the device is as it was."""
+        """Raises UsageError where the line broke, else ShareError; then the device is as it was."""
         command = self._command(self._sudo() + self._shell("receive", release.name))
         with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as there:
             assert there.stdin is not None and there.stderr is not None
             with contextlib.suppress(BrokenPipeError):  # then it says why, below
                 write(there.stdin)
+            with contextlib.suppress(BrokenPipeError):  # what was still to be written
                 there.stdin.close()
             said = there.stderr.read().decode(errors="replace")
+        if there.returncode == _UNREACHABLE:
+            raise self._unreachable(said)
         if there.returncode:
             raise ShareError(f"{self.host}: the program was not copied: {_told(said)}")
 
@@ -81,10 +84,13 @@ class Device:
         done = subprocess.run(self._command(text), input=data or b"", capture_output=True, check=False)
         said = done.stderr.decode(errors="replace")
         if done.returncode == _UNREACHABLE:
-            raise UsageError(f"{self.host}: cannot be reached: {_told(said)}; try `{self.ssh} {self.host}`")
+            raise self._unreachable(said)
         if done.returncode:
             raise ShareError("\n".join([*done.stdout.decode(errors="replace").splitlines(), _told(said)]))
         return done.stdout.decode(errors="replace")
+
+    def _unreachable(self, said: str) -> UsageError:
+        return UsageError(f"{self.host}: cannot be reached: {_told(said)}; try `{self.ssh} {self.host}`")
 
     def _command(self, text: str) -> list[str]:
         return [*shlex.split(self.ssh), *_OPTIONS, self.host, text]

@@ -276,14 +276,26 @@ def test_what_is_wrong_is_said_in_one_line(device, tmp_path):
 
 
 def test_a_copy_that_breaks_off_leaves_no_release(device):
-    (Path(device.path.split(":")[0]) / "tar").write_text("#!/bin/sh\nhead -c 10 >/dev/null\nexit 2\n")
-    (Path(device.path.split(":")[0]) / "tar").chmod(0o755)
-    done = device.agent(device.program("1.0"))
+    program = device.program("1.0")
+    (program / "model").write_bytes(os.urandom(5_000_000))  # more than pipes hold
+    (device.ssh.parent / "tar").write_text("#!/bin/sh\nhead -c 10 >/dev/null\nexit 2\n")
+    (device.ssh.parent / "tar").chmod(0o755)
+    done = device.agent(program)
     assert (done.code, done.err) == (
         1,
         "deploy: pi@headset1: the program was not copied: the program could not be unpacked\n",
     )
     assert list((device.root / "opt/share/releases").iterdir()) == []
+
+
+def test_a_line_that_breaks_while_the_program_is_copied_is_said(device):
+    program = device.program("1.0")
+    (program / "model").write_bytes(os.urandom(5_000_000))
+    breaks = "*'device.sh receive '*) echo 'client_loop: send disconnect: Broken pipe' >&2; exit 255"
+    device.ssh.write_text(device.ssh.read_text().replace("exec sh", f"case $2 in {breaks} ;; esac\nexec sh"))
+    done = device.agent(program)
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "pi@headset1: cannot be reached: client_loop: send disconnect: Broken pipe; try" in done.err
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
