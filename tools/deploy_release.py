@@ -34,7 +34,7 @@ class Release:
 
 
 def read_release(folder: Path) -> Release:
-    """Raises UsageError where there is no frozen program, ShareError where it does not start."""
+    """Raises UsageError where there is no frozen program, ShareError where its version is not told."""
     if not (folder / "share").is_file():
         raise UsageError(f"{folder}: no frozen program there; make one with `make freeze`")
     digest, size, machine, glibc = hashlib.sha256(), 0, "", 0
@@ -82,10 +82,19 @@ def _content(source: Path | bytes) -> bytes:
 
 
 def _version(folder: Path) -> str:
+    """What `make freeze` wrote there; the program may be for another processor than this one's."""
+    if (folder / "VERSION").is_file():
+        text = (folder / "VERSION").read_text(errors="replace").strip()
+        if not re.fullmatch(r"[\w.+-]+", text, re.ASCII):
+            raise ShareError(
+                f"{folder}/VERSION: '{text}' is no version; make the program anew, `make freeze`"
+            )
+        return text
     try:
         done = subprocess.run([folder / "share", "--version"], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError) as error:
         raise ShareError(
-            f"{folder}/share does not start here ({error}); make it anew with `make freeze`"
+            f"{folder}: has no file VERSION, and its program does not start here ({error}); make it anew, with "
+            "`make freeze` on a machine of the device's kind"
         ) from None
     return done.stdout.split()[-1]

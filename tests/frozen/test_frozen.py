@@ -212,4 +212,4 @@ def test_it_is_put_onto_a_device(program, tmp_path):
     assert done.code == 0, done.err
     there = device.root / "opt" / "share" / "current" / "share"
     told = subprocess.run([there, "--version"], env={}, capture_output=True, text=True, check=True).stdout
-    assert told.split()[-1] == __version__
+    assert told.split()[-1] == __version__ == (program.parent / "VERSION").read_text().strip()

@@ -376,6 +376,21 @@ def test_what_a_program_needs_is_read_from_its_machine_code(monkeypatch, tmp_pat
     assert found.name != read_release(folder).name
 
 
+def test_a_program_for_another_processor_comes_as_far_as_the_device(device):
+    """A Raspberry Pi's, on a laptop: it cannot be asked for its version here, nor need it be."""
+    program = device.program("1.0")
+    elf = b"\x7fELF".ljust(18, b"\0") + bytes([183 if platform.machine() != "aarch64" else 62, 0])
+    (program / "share").write_bytes(elf)
+    assert "has no file VERSION, and its program does not start here" in device.agent(program).err
+    (program / "VERSION").write_text("1.0\n")
+    done = device.agent(program)
+    other = "aarch64" if platform.machine() != "aarch64" else "x86_64"
+    assert f"is {platform.machine()}, the program was built for {other}; " in done.err
+    assert (done.code, done.err.count("\n")) == (1, 1)
+    (program / "VERSION").write_text("../1.0\n")
+    assert "'../1.0' is no version" in device.agent(program).err
+
+
 def test_nobody_who_becomes_root_is_one_line(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(TOOLS)
     tool = importlib.import_module("deploy_device")
