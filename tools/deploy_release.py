@@ -94,7 +94,7 @@ def _version(folder: Path) -> str:
         done = subprocess.run([folder / "share", "--version"], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError) as error:
         raise ShareError(
-            f"{folder}: has no file VERSION, and its program does not start here ({error}); make it anew, with "
+            f"{folder}: has no file VERSION, and its program does not start here ({error}); make it anew: "
             "`make freeze` on a machine of the device's kind"
         ) from None
     return done.stdout.split()[-1]
