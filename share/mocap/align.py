@@ -15,7 +15,7 @@ from share.errors import MisfitError
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
 from share.mocap.fit import Fit, fit
-from share.mocap.mocap import Mocap
+from share.mocap.mocap import Mocap, check_imu
 from share.mocap.offset import Peak, find_offset
 from share.mocap.options import FitOptions
 from share.mocap.path import FittedPath
@@ -78,6 +78,7 @@ class Aligned:
 
 def align(imu: ImuBatch, noise: ImuNoise, mocap: Mocap, options: FitOptions) -> Aligned:
     """Raises DataError as `fit` does, MisfitError also where more than one offset would do."""
+    check_imu(imu)  # before the search: where a clock was set that would go through years, in steps of 10 ms
     peak = find_offset(imu, mocap, options.within_s)
     if peak.lead < LEAST_LEAD:
         raise MisfitError(

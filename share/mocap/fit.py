@@ -24,7 +24,6 @@ from share.mocap.solve import node_covariances
 from share.mocap.start import first_state, hand_eye
 from share.types import F64, I64, ImuBatch
 
-_IMU_HOLE_NS = 100_000_000  # longer, and straight lines between samples are no motion
 _EDGE_NS = 50_000_000  # mocap this near to the ends is left out: the offset may yet carry it beyond
 _LEAST_S = 2.0
 _WORST_MM = 100.0  # a path farther than this from the mocap is not the same motion
@@ -73,7 +72,7 @@ def fit(imu: ImuBatch, noise: ImuNoise, mocap: Mocap, options: FitOptions | None
     does not turn; MisfitError (a DataError) where the two do not tell of one motion.
     """
     options = options or FitOptions()
-    check_imu(imu, _IMU_HOLE_NS)
+    check_imu(imu)
     inflated = _inflated(noise, options.imu_inflation)
     coarse_ns = 0 if options.within_s == 0 else coarse_offset(imu, mocap, options.within_s)
     near = _overlap(imu, mocap.shifted(coarse_ns))

@@ -12,6 +12,9 @@ from share.geometry import se3
 from share.types import F64, I64, ImuBatch, checked
 
 _HOLE = 5  # times the usual spacing of samples
+_IMU_HOLE_NS = 100_000_000  # longer, and straight lines between samples are no motion
+_LONGEST_NS = 6 * 3600 * 10**9  # so long a recording may last however little is seen in it
+_MOST_HIDDEN = 100  # a longer one, so many times what is seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +30,7 @@ class Mocap:
         if n < 2:
             raise DataError(f"mocap: {n} poses; at least two are needed, record again")
         check_stamps("mocap", self.stamps_ns)
+        self._check_span()
         try:
             object.__setattr__(self, "T", checked("T", self.T, (n, 4, 4), np.float64))
         except ValueError as error:
@@ -38,6 +42,17 @@ class Mocap:
             raise DataError(
                 f"mocap: pose {int(bad.argmax()) + 1} of {n} is not a rigid transform; leave it out"
             )
+
+    def _check_span(self) -> None:
+        """Raises DataError for stamps of which one is astray, or that are by a clock that was set."""
+        t = self.stamps_ns
+        if t[-1] - t[0] <= max(_LONGEST_NS, _MOST_HIDDEN * len(t) * self.spacing_ns):
+            return
+        i = int(np.diff(t).argmax())
+        raise DataError(
+            f"mocap: stamps jump by {(t[i + 1] - t[i]) * 1e-9:.0f} s at sample {i + 2}, from {t[i]} to "
+            f"{t[i + 1]} ns; cut there"
+        )
 
     @cached_property
     def spacing_ns(self) -> int:
@@ -77,12 +92,12 @@ def holes(stamps_ns: I64, longer_ns: int) -> I64:
     return np.stack([stamps_ns[far], stamps_ns[far + 1]], axis=1)
 
 
-def check_imu(imu: ImuBatch, longest_ns: int) -> None:
+def check_imu(imu: ImuBatch) -> None:
     """Raises DataError for an IMU that cannot be integrated from end to end."""
     if len(imu) < 2:
         raise DataError(f"IMU: {len(imu)} samples; at least two are needed, record again")
     check_stamps("IMU", imu.stamps_ns)
-    missing = holes(imu.stamps_ns, longest_ns)
+    missing = holes(imu.stamps_ns, _IMU_HOLE_NS)
     if len(missing):
         start, end = (missing[0] - imu.stamps_ns[0]) * 1e-9
         raise DataError(

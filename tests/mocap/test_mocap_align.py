@@ -96,6 +96,28 @@ def test_a_motion_that_repeats_itself_is_refused() -> None:
     assert abs(align(imu, NOISE, near, replace(ANYWHERE, within_s=0.4)).offset_ns) < 1e6
 
 
+YEARS_NS = 56 * 365 * 86_400 * 10**9
+
+
+def test_a_clock_that_was_set_is_said_and_nothing_searched() -> None:
+    """A device that learns half way that it is not 1970."""
+    imu, mocap = record_imu(Motion(3), 12), record_mocap(Motion(3), 12, AWAY_NS)
+    stamps = imu.stamps_ns + np.where(np.arange(len(imu)) < 1200, -YEARS_NS // 2, YEARS_NS // 2)
+    with pytest.raises(DataError, match=r"IMU: no samples from 5\.995 to 1766016006"):
+        align(replace(imu, stamps_ns=stamps), NOISE, mocap, ANYWHERE)
+
+
+def test_a_stray_stamp_of_the_motion_capture_is_said() -> None:
+    mocap = record_mocap(Motion(3), 12)
+    stamps = mocap.stamps_ns.copy()
+    stamps[0] = 0
+    with pytest.raises(DataError, match=r"stamps jump by 1600000000 s at sample 2, from 0 to .*; cut there"):
+        Mocap(stamps, mocap.T)
+    hours = np.arange(5 * 3600 * 10, dtype=np.int64) * 100_000_000  # five at 10 Hz
+    rarely = np.concatenate([hours[:400], hours[-400:]])  # seen as it began, and as it ended
+    Mocap(rarely, np.tile(np.eye(4), (len(rarely), 1, 1)))
+
+
 def test_somebody_elses_motion_is_refused() -> None:
     with pytest.raises(DataError):
         align(record_imu(Motion(3), 20), NOISE, record_mocap(Motion(4), 20, AWAY_NS), ANYWHERE)
