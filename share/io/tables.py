@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
@@ -84,19 +85,37 @@ def parse_ns(text: str, where: str) -> int:
         stamp = int(text)
     except ValueError:
         raise DataError(f"{where}: stamp '{text}' is not a whole number of nanoseconds") from None
-    if abs(stamp) >= 2**63:
-        raise DataError(f"{where}: stamp {text} is out of range")
-    return stamp
+    return _in_range(stamp, text, where)
 
 
 def parse_seconds(text: str, where: str) -> int:
-    """Decimal seconds to integer nanoseconds without going through a float (digits past ns are cut)."""
+    """Decimal seconds, with an exponent or not, to integer nanoseconds without going through a float (digits
+    past ns are cut)."""
+    if "e" in text.lower():
+        return _parse_power(text, where)
     whole, _, fraction = text.partition(".")
     digits = whole.lstrip("+-")
     if not (digits + fraction).isdecimal() or len(digits) > 10:
         raise DataError(f"{where}: stamp '{text}' is not a time in seconds")
     stamp = int(digits or "0") * 10**9 + int((fraction + "000000000")[:9])
-    return -stamp if whole.startswith("-") else stamp
+    return _in_range(-stamp if whole.startswith("-") else stamp, text, where)
+
+
+def _parse_power(text: str, where: str) -> int:
+    """As `parse_seconds`, of 1.4e+09."""
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation:
+        raise DataError(f"{where}: stamp '{text}' is not a time in seconds") from None
+    if not -(10**10) < seconds < 10**10:  # before it is made whole: 1e999999 has a million digits
+        raise DataError(f"{where}: stamp {text} is out of range")
+    return _in_range(int(seconds * 10**9), text, where)
+
+
+def _in_range(stamp_ns: int, text: str, where: str) -> int:
+    if abs(stamp_ns) >= 2**63:
+        raise DataError(f"{where}: stamp {text} is out of range")
+    return stamp_ns
 
 
 def parse_number(text: str, where: str) -> float:

@@ -56,7 +56,25 @@ def test_seconds_are_exact(stamp):
     assert parse_seconds(format_seconds(stamp), "x") == stamp
 
 
-@pytest.mark.parametrize("text", ["nan", "inf", "", "1e3", "1,5", "0x10", "1.2.3", "99999999999"])
+@pytest.mark.parametrize(
+    ("text", "stamp"),
+    [
+        ("1.403636579763555527e+09", 1_403_636_579_763_555_527),  # as evo and np.savetxt write it
+        ("-1.403636579763555527E9", -1_403_636_579_763_555_527),
+        ("0.000000000000000000e+00", 0),
+        ("1e3", 10**12),
+        ("2.5e-09", 2),
+        ("1e-999999", 0),
+    ],
+)
+def test_seconds_with_an_exponent_are_exact(text, stamp):
+    assert parse_seconds(text, "x") == stamp
+
+
+BAD_SECONDS = "nan inf e 1e snane3 1e10 1e999999 -1e99999999 9.3e9 9300000000 1,5 0x10 1.2.3 99999999999"
+
+
+@pytest.mark.parametrize("text", ["", *BAD_SECONDS.split()])
 def test_other_seconds_are_refused(text):
     with pytest.raises(DataError, match=r"t\.txt, line 1"):
         parse_seconds(text, "t.txt, line 1")
