@@ -122,17 +122,13 @@ def _calibrated(
         table = read_imu(source, partial(stages, "reading the IMU"))
         if not len(table.imu):
             raise DataError(f"{source}: has no IMU")
-        stamps, views, looked = find_stamped(
-            pictures, target, every, partial(stages, "looking for the board"), workers
-        )
+        seen = find_stamped(pictures, target, every, partial(stages, "looking for the board"), workers)
         found = fit(
-            stamps, views, target, pictures.rig, table.imu, noise, within,
+            seen.stamps, seen.views, target, pictures.rig, table.imu, noise, within,
             partial(stages, "fitting"),
         )  # fmt: skip
     before = None if pictures.before is None else compare(found.T_imu_cam0, pictures.before)
-    return Outcome(
-        found, judge(found), pictures.rig, noise, before, looked, len(views), pictures.pictures.said
-    )
+    return Outcome(found, judge(found), pictures.rig, noise, before, seen, pictures.pictures.said)
 
 
 def _summary(outcome: Outcome, chain: Path) -> str:
@@ -149,7 +145,8 @@ def _summary(outcome: Outcome, chain: Path) -> str:
     ]
     shift = f"{fit.shift_s * 1e3:+.3f} ± {fit.sigma_shift * 1e3:.3f} ms"
     lines = [
-        f"{outcome.seen} of {outcome.looked} pictures show the board, {fit.state.curve.end_s:.1f} s",
+        f"{outcome.pictures.with_target} of {outcome.pictures.looked} pictures show the board, "
+        f"{fit.state.curve.end_s:.1f} s",
         "",
         aligned(rows),
         "in the IMU's frame (rotation vector); ± one sigma",
@@ -181,7 +178,12 @@ def _list(values: F64) -> str:
 def _warnings(outcome: Outcome) -> list[str]:
     """What a person ought to know before believing it: a line each."""
     verdict = outcome.verdict
-    return _of_given(outcome.before) + [
+    out = _of_given(outcome.before)
+    if dropped := outcome.pictures.dropped:
+        out.append(
+            f"{dropped} pictures of the board are left out: their stamps are not later than those before"
+        )
+    return out + [
         f"{name} errs by {times:.1f} times its stated noise: scale, axes, or the board's size; the sigmas "
         "take that into account"
         for name, times in (("gyroscope", verdict.gyro), ("accelerometer", verdict.accel))

@@ -61,9 +61,7 @@ def open_pictures(source: str, eyes: Sequence[str], calib: str | None = None) ->
 
 
 def _folder(folder: Path, eyes: Sequence[str], said: Calibration | None) -> Pictures:
-    found = [
-        {p.stem: p for p in sorted((folder / eye).glob("*")) if p.suffix.lower() in _PICTURES} for eye in eyes
-    ]
+    found = [_pictures(folder / eye) for eye in eyes]
     names = [name for name in found[0] if all(name in others for others in found)]
     if not names:
         raise DataError(f"{folder}: has no pictures of the same name in {' and '.join(eyes)}")
@@ -73,6 +71,12 @@ def _folder(folder: Path, eyes: Sequence[str], said: Calibration | None) -> Pict
             yield name, tuple(decode_gray(one[name].read_bytes(), str(one[name])) for one in found)
 
     return Pictures(len(names), None if said is None else said.rig, read, said)
+
+
+def _pictures(folder: Path) -> dict[str, Path]:
+    """By their names, in the order of numbers: 99 goes before 100."""
+    paths = [path for path in folder.glob("*") if path.suffix.lower() in _PICTURES]
+    return {path.stem: path for path in sorted(paths, key=lambda path: (len(path.stem), path.stem))}
 
 
 def find_views(

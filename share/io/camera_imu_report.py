@@ -14,22 +14,21 @@ from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
 from share.io.calibration import Calibration
 from share.io.kalibr import to_kalibr
+from share.io.rig_pictures import Stamped
 from share.types import F64
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """All that is told of one calibration. rig: the cameras as they were known; before: how T_imu_cam0 that
-    was given compares; looked, seen: pictures, and those that show the board; said: the cameras' calibration
-    that was given."""
+    was given compares; pictures: what was looked at; said: the cameras' calibration that was given."""
 
     fit: Fit
     verdict: Verdict
     rig: Rig
     noise: ImuNoise
     before: Comparison | None
-    looked: int
-    seen: int
+    pictures: Stamped
     said: Calibration | None = None
 
     @property
@@ -68,8 +67,9 @@ def to_json(outcome: Outcome) -> dict[str, Any]:
     return {
         "passed": verdict.passed,
         "reasons": list(verdict.reasons),
-        "pictures": outcome.looked,
-        "pictures_with_target": outcome.seen,
+        "pictures": outcome.pictures.looked,
+        "pictures_with_target": outcome.pictures.with_target,
+        "pictures_dropped": outcome.pictures.dropped,
         "seconds": fit.state.curve.end_s,
         "T_cam_imu": [T.tolist() for T in outcome.T_cam_imu],
         "T_imu_cam0": fit.T_imu_cam0.tolist(),

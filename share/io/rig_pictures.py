@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,13 +50,24 @@ def _chain(camera: str) -> Path:
     return path
 
 
+class Stamped(NamedTuple):
+    """stamps (F,) ns, rising, and views with at least one corner; looked: how many pictures were looked at;
+    dropped: how many show the board, but their stamps are not later than the one before."""
+
+    stamps: I64
+    views: list[View]
+    looked: int
+    dropped: int
+
+    @property
+    def with_target(self) -> int:
+        return len(self.views) + self.dropped
+
+
 def find_stamped(
     source: RigPictures, target: Target, every: int, told: Callable[[int, int], None], workers: int = 1
-) -> tuple[I64, list[View], int]:
-    """Stamps (F,) ns rising and views with at least one corner; how many pictures were looked at.
-
-    told: how many are done, of how many. Raises DataError.
-    """
+) -> Stamped:
+    """told: how many are done, of how many. Raises DataError."""
     views, sizes = find_views(source.pictures, target, every, told, workers)
     cameras = [camera for camera in (source.rig.cam0, source.rig.cam1) if camera is not None]
     for eye, (size, camera) in enumerate(zip(sizes, cameras, strict=False)):
@@ -65,11 +77,12 @@ def find_stamped(
         raise DataError(
             f"{source.name}: no board in {len(views)} pictures; is --target the board that was shown?"
         )
-    if not all(view.name.isdecimal() for view in seen):
+    if not all(view.name.isdecimal() and int(view.name) < 2**63 for view in seen):
         raise DataError(f"{source.name}: pictures without stamps; name them cam0/STAMP.png, STAMP in ns")
     stamps = np.array([int(view.name) for view in seen], np.int64)
     later = stamps > np.maximum.accumulate(np.concatenate([[-(2**62)], stamps[:-1]]))
-    return stamps[later], [view for view, keep in zip(seen, later, strict=True) if keep], len(views)
+    kept = [view for view, keep in zip(seen, later, strict=True) if keep]
+    return Stamped(stamps[later], kept, len(views), len(seen) - len(kept))
 
 
 def _same_size(name: str, eye: int, size: tuple[int, int], camera: Camera) -> None:

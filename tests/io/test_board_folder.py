@@ -1,0 +1,52 @@
+"""Pictures of a board in a folder: in the order of their stamps, and none lost without a word."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from share.calibration.bundle import View
+from share.calibration.detect import Detection
+from share.errors import DataError
+from share.geometry.camera import Camera, Rig
+from share.geometry.target import AprilGrid
+from share.io import rig_pictures
+from share.io.board_views import open_pictures
+from share.io.rig_pictures import RigPictures, find_stamped
+
+CORNER = Detection(np.array([3]), np.array([[10.0, 20.0]]))
+
+
+def written(folder: Path, *names: str) -> Path:
+    folder.mkdir(parents=True)
+    for name in names:
+        cv2.imwrite(str(folder / name), np.full((8, 12), 90, np.uint8))
+    return folder
+
+
+def test_a_stamp_with_fewer_digits_goes_first(tmp_path: Path) -> None:
+    written(tmp_path / "cam0", "100000000000.png", "99950000000.png", "99900000000.png")
+    names = [name for name, _ in open_pictures(str(tmp_path), ("cam0",)).read()]
+    assert names == ["99900000000", "99950000000", "100000000000"]
+
+
+def stamped(monkeypatch: pytest.MonkeyPatch, *names: str) -> rig_pictures.Stamped:
+    """What is found in pictures of these names, which all show the board."""
+    views = [View(name, (CORNER,)) for name in names]
+    monkeypatch.setattr(rig_pictures, "find_views", lambda *_: (views, [(12, 8)]))
+    rig = Rig(Camera(12, 8, 9.0, 9.0, 6.0, 4.0), np.eye(4))
+    return find_stamped(RigPictures("dance", None, rig, None), AprilGrid(), 1, lambda done, total: None)  # type: ignore[arg-type]
+
+
+def test_pictures_that_are_not_later_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = stamped(monkeypatch, "10", "30", "20", "30", "40")
+    assert found.stamps.tolist() == [10, 30, 40]
+    assert [view.name for view in found.views] == ["10", "30", "40"]
+    assert (found.looked, found.with_target, found.dropped) == (5, 5, 2)
+
+
+@pytest.mark.parametrize("name", ["row", "1.5", "12345678901234567890"])
+def test_a_name_that_is_no_stamp_is_refused(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    with pytest.raises(DataError, match="dance: pictures without stamps; name them cam0/STAMP"):
+        stamped(monkeypatch, "10", name)
