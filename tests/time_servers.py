@@ -27,10 +27,10 @@ Replies = Callable[[bytes], list[bytes]]
 
 
 @contextmanager
-def udp(replies: Replies) -> Iterator[int]:
+def udp(replies: Replies, address: str = "127.0.0.1") -> Iterator[int]:
     """Answers each datagram with some; gives its port."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own:
-        own.bind(("127.0.0.1", 0))
+        own.bind((address, 0))
         own.settimeout(0.05)
         over = threading.Event()
 

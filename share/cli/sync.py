@@ -47,8 +47,8 @@ def sync() -> None:
 def server(bind: str, stratum: int) -> None:
     """Tell others the time of this machine by NTP (RFC 5905), until Ctrl-C.
 
-    Its own clock is what is told, whether or not anybody corrects it: all who follow it agree. In a client's
-    chrony.conf: server HOST port 11123 iburst. Where chronyd runs here, it can serve for good: docs/sync.md.
+    Its own clock is what is told, whether or not anybody corrects it: all who follow it agree. `share sync
+    check` says what their chrony.conf must say. Where chronyd runs here, it can serve for good: docs/sync.md.
 
     \b
     Example:  share sync server --bind 0.0.0.0:11123
@@ -74,12 +74,15 @@ def server(bind: str, stratum: int) -> None:
 
 
 def _introduce(at: Host, stratum: int, by_kernel: bool) -> None:
+    from share.io.chrony import follow
+    from share.io.udp import Host
+
     stamps = "by the kernel" if by_kernel else "by this program, which is less exact"
     click.echo(f"telling this machine's own time at {at} (UDP); arrivals are stamped {stamps}", err=True)
     click.echo(
         f"stratum {stratum}, reference 127.127.1.1: this machine's own clock, none better behind it", err=True
     )
-    click.echo(f"clients' chrony.conf: server THIS-MACHINE port {at.port} iburst", err=True)
+    click.echo(f"clients' chrony.conf: {follow(Host('THIS-MACHINE', at.port))[0]}", err=True)
 
 
 def _counts(times: TimeServer) -> str:
@@ -155,7 +158,9 @@ def _judge(rows: Sequence[Row], limit_ms: float) -> None:
 def _advise(host: Host) -> None:
     from share.io.chrony import follow
 
-    click.echo("to follow it: install chrony, put this into /etc/chrony/chrony.conf, restart it:", err=True)
+    click.echo(
+        "to follow it: install chrony, put this at the end of /etc/chrony/chrony.conf, restart it:", err=True
+    )
     for line in follow(host):
         click.echo(f"    {line}", err=True)
 

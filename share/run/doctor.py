@@ -32,7 +32,7 @@ def of_host(profile: HostProfile, out: Path) -> list[Finding]:
         host.throttling(facts.throttles()),
         host.priority(facts.priority_limit(), wanted.realtime_priority),
         host.disk(str(where), free, 0.0 if profile.sensor is None else _bytes_s(profile.sensor)),
-        _clock(),
+        host.clock_of_edge() if profile.role == "edge" else _clock(),
     ]
 
 

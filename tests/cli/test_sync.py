@@ -70,8 +70,8 @@ def test_who_is_off_is_told_what_to_write_into_chrony_conf(share: Share) -> None
         done = share("sync", "check", f"127.0.0.1:{port}", "--limit-ms", 20)
     *advice, last = done.err.splitlines()
     assert advice == [
-        "to follow it: install chrony, put this into /etc/chrony/chrony.conf, restart it:",
-        f"    server 127.0.0.1 port {port} iburst minpoll 0 maxpoll 4",
+        "to follow it: install chrony, put this at the end of /etc/chrony/chrony.conf, restart it:",
+        f"    server 127.0.0.1 port {port} iburst minpoll 0 maxpoll 4 prefer trust",
         "    makestep 0.01 3",
         "    rtcsync",
     ]
@@ -226,7 +226,8 @@ def serving(stratum: int = 10) -> Iterator[tuple[subprocess.Popen[str], int]]:
             assert said[1:] == [
                 f"stratum {stratum}, reference 127.127.1.1: this machine's own clock, none "
                 "better behind it\n",
-                f"clients' chrony.conf: server THIS-MACHINE port {port} iburst\n",
+                f"clients' chrony.conf: server THIS-MACHINE port {port} iburst "
+                "minpoll 0 maxpoll 4 prefer trust\n",
             ]
             yield process, port
         finally:

@@ -6,7 +6,7 @@ import re
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,7 +14,7 @@ from shell import Done
 from time_servers import CHRONYC, chronyd, free_port, needs_chrony, running_chronyd, shifted, udp, wait_for
 
 from share.core.time_server import TimeServer
-from share.io.chrony import tracking
+from share.io.chrony import follow, tracking
 from share.io.udp import Host, StampedSocket
 from share.run import time_check
 from share.run.time_check import check
@@ -75,6 +75,25 @@ def test_chronyd_and_our_client_agree_on_a_clock_that_is_off(offset_ms: float) -
     assert abs(ours.estimate.offset_ns / MS - offset_ms) <= ours.estimate.uncertainty_ns / MS
     assert theirs == pytest.approx(offset_ms, abs=CLOSE_MS)
     assert theirs == pytest.approx(ours.estimate.offset_ns / MS, abs=CLOSE_MS)
+
+
+def test_the_room_s_clock_is_followed_though_three_of_the_internet_disagree(tmp_path: Path) -> None:
+    """They are nearer to a true clock, and many, as those that a package of chrony brings."""
+    addresses = ("127.0.0.2", "127.0.0.3", "127.0.0.4")
+    with ExitStack() as servers:
+        ports = [servers.enter_context(udp(shifted(0.0, stratum=2), address)) for address in addresses]
+        lines = [f"server {a} port {p} {QUICK}" for a, p in zip(addresses, ports, strict=True)]
+        room = follow(Host("127.0.0.1", servers.enter_context(udp(shifted(40.0)))))
+        control = servers.enter_context(running_chronyd(tmp_path / "run", "port 0", *lines, *room))
+        refused = dict.fromkeys(addresses, "x")  # falsetickers, chronyc(1)
+        wait_for(lambda: _chosen(control) == {**refused, "127.0.0.1": "*"})
+
+
+def _chosen(control: Path) -> dict[str, str]:
+    """What that chronyd makes of its servers."""
+    command = [str(CHRONYC), "-h", str(control), "-c", "sources"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return {row[2]: row[1] for row in (line.split(",") for line in done.stdout.splitlines())}
 
 
 def test_our_client_asks_a_chronyd(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -71,6 +72,7 @@ def test_a_machine_without_a_camera_is_fine_where_none_is_wanted(share: Share, t
     states = {line.split()[0] for line in done.out.split("\n\n")[0].splitlines()}
     assert (done.code, done.err) == (0, "")
     assert states <= {"OK", "WARN", "SKIPPED"}
+    assert re.search(r"^OK +clock +`share sync server` makes it the room's", done.out, re.MULTILINE)
     assert "libraries" in done.out
 
 

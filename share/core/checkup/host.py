@@ -66,15 +66,23 @@ def clock(known: tuple[float, float] | None, trouble: str | None) -> Finding:
     if trouble is not None:
         return warn("clock", trouble, "chronyc sources")
     if known is None:
-        mend = "sudo apt install chrony; then see `share sync check HOST` for what to tell it"
-        return warn("clock", "no chronyd runs here: nothing keeps this clock with the others'", mend)
+        mend = (
+            "sudo apt install chrony",
+            "share sync check HOST  # the edge's machine: it says what to tell chrony",
+        )
+        return warn("clock", "no chronyd runs here: nothing keeps this clock with the others'", *mend)
     offset_ms, uncertainty_ms = known
     what = f"{offset_ms:+.3f} ± {uncertainty_ms:.3f} ms"
     if abs(offset_ms) + uncertainty_ms <= CLOCK_LIMIT_MS:
         return ok("clock", what)
     return warn(
-        "clock", f"{what}, should be within {CLOCK_LIMIT_MS:g} ms", "chronyc sources; share sync check"
+        "clock", f"{what}, should be within {CLOCK_LIMIT_MS:g} ms", "chronyc sources; share sync check HOST"
     )
+
+
+def clock_of_edge() -> Finding:
+    """Others follow it, and it needs to follow none."""
+    return ok("clock", "`share sync server` makes it the room's, right or not: devices follow it")
 
 
 def libraries(found: Mapping[str, str | None]) -> Finding:
