@@ -5,27 +5,36 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from share.errors import DataError, UsageError
 from share.io import tables
-from share.io.trajectory import poses, read_tum
+from share.io.trajectory import poses, read_tum_table
 from share.io.vicon import is_vicon, read_vicon
 from share.mocap.mocap import Mocap
 
+_NOWHERE = (0, 0, 0, 0, 0, 0, 1)  # x y z qx qy qz qw
+
 
 def read_mocap(path: Path) -> Mocap:
-    """`.csv`: t[ns], x y z, qw qx qy qz, and more that is not read; else TUM: t[s] x y z qx qy qz qw.
+    """`.csv`: t[ns], x y z, qw qx qy qz, and more that is not read; else TUM: t[s] x y z qx qy qz qw. Rows
+    with NaN, or a quaternion of zeros, are the body not seen: a gap.
 
     Raises UsageError without such a file, DataError that names it for what is damaged.
     """
     if not path.is_file():
         raise UsageError(f"{path}: no such file of motion capture")
-    if path.suffix == ".csv":
-        stamps, values = tables.read_table(path, 8)
-        T = poses(values[:, :3], values[:, [4, 5, 6, 3]], path)
+    if path.suffix.lower() == ".csv":
+        stamps, values = tables.read_table(path, 8, nan=True)
+        values = values[:, [0, 1, 2, 4, 5, 6, 3]]
     else:
-        stamps, T = read_tum(path)
+        stamps, values = read_tum_table(path, nan=True)
+    seen = ~np.isnan(values).any(1) & (values[:, 3:] != 0).any(1)
+    if not seen.any():
+        raise DataError(f"{path}: the body was never seen: no pose, NaN and zeros only")
+    values[~seen] = _NOWHERE  # still there, so that a complaint counts the poses of the file
     try:
-        return Mocap(stamps, T)
+        return Mocap(stamps[seen], poses(values[:, :3], values[:, 3:], path)[seen])
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
 

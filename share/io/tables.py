@@ -16,7 +16,7 @@ from share.types import F64, I64
 def read_text(path: Path) -> str:
     """The text of a file. Raises DataError if it is missing, unreadable or binary."""
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # spreadsheets and Windows begin with a byte-order mark
     except FileNotFoundError:
         raise DataError(f"{path}: no such file; the recording is not complete") from None
     except UnicodeDecodeError:
@@ -47,11 +47,11 @@ def rows(path: Path, separator: str | None, columns: int) -> Iterator[tuple[int,
         raise DataError(f"{path}: has no data; the recording is empty or not complete")
 
 
-def read_table(path: Path, columns: int) -> tuple[I64, F64]:
+def read_table(path: Path, columns: int, nan: bool = False) -> tuple[I64, F64]:
     """A CSV of integer nanoseconds and numbers: stamps (N,) and the next columns - 1 as (N, columns - 1).
 
-    Raises DataError naming file and line for a short line, a stamp or value that is no finite
-    number, or stamps that go back.
+    nan: values may be NaN, or empty. Raises DataError naming file and line for a short line, a stamp or value
+    that is no finite number, or stamps that go back.
     """
     dtype = [("stamp", np.int64), *((f"c{i}", np.float64) for i in range(1, columns))]
     lines = read_text(path).splitlines()
@@ -61,19 +61,19 @@ def read_table(path: Path, columns: int) -> tuple[I64, F64]:
         table = np.loadtxt(lines, dtype, delimiter=",", usecols=range(columns), ndmin=1)
         values = np.stack([table[name] for name, _ in dtype[1:]], axis=1)
     except (ValueError, IndexError, OverflowError):
-        return _read_slowly(path, columns)
-    if len(table) == 0 or not np.isfinite(values).all():
-        return _read_slowly(path, columns)
+        return _read_slowly(path, columns, nan)
+    if len(table) == 0 or not (np.isfinite(values) | (nan & np.isnan(values))).all():
+        return _read_slowly(path, columns, nan)
     check_sorted(path, table["stamp"])
     return table["stamp"], values
 
 
-def _read_slowly(path: Path, columns: int) -> tuple[I64, F64]:
+def _read_slowly(path: Path, columns: int, nan: bool) -> tuple[I64, F64]:
     """As `read_table`, line by line: finds what is wrong and says where."""
     stamps, values = [], []
     for number, fields in rows(path, ",", columns):
         stamps.append(parse_ns(fields[0], f"{path}, line {number}"))
-        values.append([parse_number(field, f"{path}, line {number}") for field in fields[1:columns]])
+        values.append([parse_number(field, f"{path}, line {number}", nan) for field in fields[1:columns]])
     out = np.array(stamps, np.int64)
     check_sorted(path, out)
     return out, np.array(values, np.float64)
@@ -118,13 +118,15 @@ def _in_range(stamp_ns: int, text: str, where: str) -> int:
     return stamp_ns
 
 
-def parse_number(text: str, where: str) -> float:
-    """A finite number."""
+def parse_number(text: str, where: str, nan: bool = False) -> float:
+    """A finite number; with `nan` also NaN, which nothing is too."""
+    if nan and not text:
+        return math.nan
     try:
         value = float(text)
     except ValueError:
         raise DataError(f"{where}: '{text}' is not a number") from None
-    if not math.isfinite(value):
+    if not (math.isfinite(value) or (nan and math.isnan(value))):
         raise DataError(f"{where}: '{text}' is not finite")
     return value
 

@@ -50,14 +50,20 @@ def format_tum(trajectory: Trajectory) -> str:
 
 def read_tum(path: Path) -> Trajectory:
     """Raises DataError naming file and line."""
+    stamps_ns, numbers = read_tum_table(path)
+    return Trajectory(stamps_ns, poses(numbers[:, :3], numbers[:, 3:], path))
+
+
+def read_tum_table(path: Path, nan: bool = False) -> tuple[I64, F64]:
+    """Stamps (N,) ns, and x y z qx qy qz qw (N, 7). nan: these may be NaN. Raises DataError likewise."""
     stamps, values = [], []
     for number, fields in tables.rows(path, None, 8):
         where = f"{path}, line {number}"
         stamps.append(tables.parse_seconds(fields[0], where))
-        values.append([tables.parse_number(field, where) for field in fields[1:8]])
-    stamps_ns, numbers = np.array(stamps, np.int64), np.array(values)
+        values.append([tables.parse_number(field, where, nan) for field in fields[1:8]])
+    stamps_ns = np.array(stamps, np.int64)
     tables.check_sorted(path, stamps_ns, None)
-    return Trajectory(stamps_ns, poses(numbers[:, :3], numbers[:, 3:], path))
+    return stamps_ns, np.array(values)
 
 
 def poses(p: F64, q: F64, path: Path) -> F64:

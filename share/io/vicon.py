@@ -7,7 +7,8 @@
     ,,deg,deg,deg,mm,mm,mm,deg,…              units
     1,0,0.12,…                                empty cells where a body is not seen
 
-Other blocks (markers, devices) may stand before or after, divided by an empty line.
+Other blocks (markers, devices) may stand before or after, divided by an empty line. Between cells are commas
+or semicolons; with these a number may have a decimal comma.
 """
 
 from __future__ import annotations
@@ -76,8 +77,8 @@ class _Block:
 
 def is_vicon(path: Path) -> bool:
     """Whether its first line with anything in it is the title of a block."""
-    first = next((line for line in read_text(path).splitlines() if line.strip(" ,;\ufeff")), "")
-    return first.strip(" ,;\ufeff") in (*_BLOCKS, *_OTHERS)
+    first = next((line for line in read_text(path).splitlines() if line.strip(" ,;")), "")
+    return first.strip(" ,;") in (*_BLOCKS, *_OTHERS)
 
 
 def read_vicon(path: Path, rotations: str = "helical") -> dict[str, Mocap]:
@@ -108,7 +109,7 @@ def _name(cell: str) -> str:
 
 
 def _block(path: Path) -> _Block:
-    lines = read_text(path).lstrip("\ufeff").splitlines()
+    lines = read_text(path).splitlines()
     titles = [line.strip(" ,;") for line in lines]
     start = next((k for k, title in enumerate(titles) if title in _BLOCKS), None)
     if start is None:
@@ -126,7 +127,8 @@ def _block(path: Path) -> _Block:
 
 def _numbers(path: Path, line: int, rows: list[list[str]]) -> F64:
     width = len(rows[3])
-    cells = [[cell or "nan" for cell in row[:width]] + ["nan"] * (width - len(row)) for row in rows[_HEAD:]]
+    cells = [[_point(cell) or "nan" for cell in row[:width]] for row in rows[_HEAD:]]
+    cells = [row + ["nan"] * (width - len(row)) for row in cells]
     try:
         return np.array(cells, np.float64)
     except ValueError:
@@ -141,9 +143,14 @@ def _numbers(path: Path, line: int, rows: list[list[str]]) -> F64:
     raise DataError(f"{path}: cannot be read as numbers; export again")
 
 
+def _point(number: str) -> str:
+    """With a decimal point, where some countries' exports have a comma."""
+    return number.replace(",", ".")
+
+
 def _stamps(block: _Block) -> I64:
     try:
-        rate = float(block.head[1][0])
+        rate = float(_point(block.head[1][0]))
     except (ValueError, IndexError):
         rate = 0.0
     if not 0 < rate < 1e5:

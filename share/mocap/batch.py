@@ -18,6 +18,10 @@ from share.types import F64, ImuBatch
 
 _BIAS_SIGMA = np.repeat([0.2, 1.0], 3)  # rad/s, m/s^2: no IMU is worse; only holds what no motion shows
 _TILT_SIGMA = 1.0  # rad: none to speak of
+CHECK = (
+    "check units (m, rad/s, m/s^2), the order of quaternions (TUM: qx qy qz qw; .csv: qw qx qy qz), and that "
+    "both are of one body"
+)
 _CONVERGED = 1e-6  # of the cost: far below what one sigma of anything costs
 
 
@@ -66,8 +70,7 @@ class Batch:
                 break
         else:
             raise MisfitError(
-                f"mocap and IMU: no solution after {self.options.max_iterations} steps; check that both "
-                "are of one body, in metres and radians"
+                f"mocap and IMU: no solution after {self.options.max_iterations} steps; {CHECK}"
             )
         normal = self._normal(state, chain, seen)
         weight = self._weight(seen)

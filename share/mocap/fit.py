@@ -15,7 +15,7 @@ import numpy as np
 from share.errors import DataError, MisfitError
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
-from share.mocap.batch import Batch, Solved
+from share.mocap.batch import CHECK, Batch, Solved
 from share.mocap.mocap import Mocap, check_imu, holes
 from share.mocap.offset import coarse_offset
 from share.mocap.options import FitOptions
@@ -174,10 +174,7 @@ def _report(batch: Batch, solved: Solved, coarse_ns: int) -> Fit:
 
 
 def _apart(what: str) -> str:
-    return (
-        f"mocap and IMU do not tell of one motion: {what}; check units (m, rad/s, m/s^2), "
-        "and that both are of one body"
-    )
+    return f"mocap and IMU do not tell of one motion: {what}; {CHECK}"
 
 
 def _closed(seen: I64, nodes: I64) -> I64:

@@ -65,6 +65,13 @@ def test_quaternions_metres_and_other_blocks(tmp_path):
     np.testing.assert_allclose(ann.T[0, :3, 3], [0.5, -0.25, 1.75])
 
 
+def test_decimal_commas_between_semicolons(tmp_path):
+    comma = (HEAD + ROWS).replace(",", ";").replace("2000", "2000,5").replace("100\n", "100,0\n", 1)
+    ann = read_vicon(written(tmp_path, comma))["Ann"]
+    np.testing.assert_allclose(ann.T[:, 1, 3], 2.0005)
+    assert ann.stamps_ns[0] == 101 * 10_000_000
+
+
 def test_a_file_that_names_nobody_is_one_body(tmp_path):
     path = tmp_path / "seen.tum"
     path.write_text("1.0 0 0 0 0 0 0 1\n1.1 0 0 0 0 0 0 1\n")

@@ -1,0 +1,62 @@
+"""A motion capture's poses as people's programs write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from share.errors import DataError
+from share.io.mocap_file import read_bodies, read_mocap
+
+TUM = "1.0 1 2 3 0 0 0 1\n1.1 1 2 4 0 0 0 1\n1.2 1 2 5 0 0 0 1\n"
+CSV = "1000000000,1,2,3,1,0,0,0\n1100000000,1,2,4,1,0,0,0\n1200000000,1,2,5,1,0,0,0\n"
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(("name", "text"), [("a.tum", TUM), ("a.csv", CSV), ("a.CSV", CSV), ("A.TXT", TUM)])
+@pytest.mark.parametrize("head", ["", "\ufeff", "\ufeff# t x y z and a quaternion\n"])
+def test_capitals_and_a_byte_order_mark_do_not_matter(
+    tmp_path: Path, name: str, text: str, head: str
+) -> None:
+    mocap = read_mocap(written(tmp_path / name, head + text))
+    assert mocap.stamps_ns.tolist() == [1_000_000_000, 1_100_000_000, 1_200_000_000]
+    np.testing.assert_allclose(mocap.T[:, :3, 3], [[1, 2, 3], [1, 2, 4], [1, 2, 5]])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "row", "unseen"),
+    [
+        ("a.tum", TUM, "1.1 1 2 4 0 0 0 1", "1.1 nan nan nan nan nan nan nan"),
+        ("a.tum", TUM, "1.1 1 2 4 0 0 0 1", "1.1 -nan 2 4 0 0 0 1"),
+        ("a.tum", TUM, "1.1 1 2 4 0 0 0 1", "1.1 0 0 0 0 0 0 0"),
+        ("a.csv", CSV, "1100000000,1,2,4,1,0,0,0", "1100000000,NaN,NaN,NaN,NaN,NaN,NaN,NaN"),
+        ("a.csv", CSV, "1100000000,1,2,4,1,0,0,0", "1100000000,,,,,,,"),
+        ("a.csv", CSV, "1100000000,1,2,4,1,0,0,0", "1100000000,0,0,0,0,0,0,0"),
+    ],
+)
+def test_a_body_that_is_not_seen_is_a_gap(
+    tmp_path: Path, name: str, text: str, row: str, unseen: str
+) -> None:
+    assert row in text
+    (mocap,) = read_bodies(written(tmp_path / name, text.replace(row, unseen))).values()
+    assert mocap.stamps_ns.tolist() == [1_000_000_000, 1_200_000_000]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (TUM.replace("4 0 0 0 1", "inf 0 0 0 1"), "line 2: 'inf' is not finite"),
+        (TUM.replace("4 0 0 0 1", "4 0 0 0 2"), "pose 2: quaternion has length 2"),
+        ("1 0 0 0 0 0 0 0\n" + TUM.replace("1.2 1 2 5 0 0 0 1", "1.2 1 2 5 0 0 0 2"), "pose 4: quaternion"),
+        ("1 nan 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n", "the body was never seen"),
+    ],
+)
+def test_what_is_damaged_is_still_said(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(DataError, match=f"a.tum.*{said}"):
+        read_mocap(written(tmp_path / "a.tum", text))
