@@ -83,7 +83,7 @@ def mocap(
     if one_clock:
         chosen = replace(chosen, within_s=0.0, offset_sigma=1e-5, drift_sigma=1e-8)
     noise, bodies = stated_noise(source, calib, "--calib"), read_bodies(truth, rotations)
-    seen = bodies[pick_body(str(truth), list(bodies), body, Path(source).stem, "--body BODY")]
+    _, seen = pick_body(str(truth), bodies, body, Path(source).stem, "--body BODY")
     writable_dir(out)
     with Stages() as stages:
         table = read_imu(source, lambda done, total: stages("reading", done, total))

@@ -162,14 +162,21 @@ def _bodies(
     from share.io.mocap_file import pick_body, read_bodies
 
     read = {file: read_bodies(Path(file), rotations) for file in dict.fromkeys(files.values())}
-    out = {}
+    out: dict[str, tuple[str, Mocap]] = {}
+    taken: dict[tuple[Path, str], str] = {}
     for name in names:
         file = files.get(name, files.get("", ""))
         if not file:
             raise UsageError(f"{name}: has no motion capture; give --mocap {name}=FILE, or FILE for all")
         wanted = bodies.get(name, bodies.get(""))
-        body = pick_body(file, list(read[file]), wanted, name, f"--body {name}=BODY")
-        out[name] = (f"{file} {body}".strip(), read[file][body])
+        body, seen = pick_body(file, read[file], wanted, name, f"--body {name}=BODY")
+        if (other := taken.setdefault((Path(file).resolve(), body), name)) != name:
+            both = f"body '{body}'" if body else "one body"
+            raise UsageError(
+                f"{file}: its {both} cannot be both {other} and {name}; give each its own by "
+                f"--body {name}=BODY or --mocap {name}=FILE"
+            )
+        out[name] = (f"{file} {body}".strip(), seen)
     return out
 
 

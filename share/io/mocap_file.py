@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +39,9 @@ def read_mocap(path: Path) -> Mocap:
         raise DataError(f"{path}: {error}") from None
 
 
-def read_bodies(path: Path, rotations: str = "helical") -> dict[str, Mocap]:
-    """All rigid bodies of a file by their names; "" in a file that tells of one without naming it.
+def read_bodies(path: Path, rotations: str = "helical") -> Mapping[str, Mocap | None]:
+    """All rigid bodies of a file by their names, None for one that was never seen; "" in a file that tells of
+    one without naming it.
 
     rotations: as for `read_vicon`. Raises as `read_mocap`.
     """
@@ -49,14 +50,22 @@ def read_bodies(path: Path, rotations: str = "helical") -> dict[str, Mocap]:
     return {"": read_mocap(path)}
 
 
-def pick_body(file: str, there: Sequence[str], wanted: str | None, device: str, option: str) -> str:
-    """Which of the bodies in a file a device is: the one wanted, else the one of the device's name, else the
-    only one. option: how a person may say which. Raises UsageError."""
+def pick_body(
+    file: str, there: Mapping[str, Mocap | None], wanted: str | None, device: str, option: str
+) -> tuple[str, Mocap]:
+    """Which of the bodies in a file a device is, and its poses: the one wanted, else the one of the device's
+    name, else the only one that the file names. option: how a person may say which. Raises UsageError."""
     alike = [body for body in there if body.lower() == (device if wanted is None else wanted).lower()]
+    if not alike and wanted is None and len(there) == 1:
+        alike = list(there)
     if alike:
-        return alike[0]
-    if wanted is None and len(there) == 1:
-        return there[0]
+        seen = there[alike[0]]
+        if seen is None:
+            raise UsageError(
+                f"{file}: body '{alike[0]}' is in the file but was never seen; record again with its markers "
+                f"in sight, or name another ({option})"
+            )
+        return alike[0], seen
     listed = ", ".join(there) if any(there) else "one without a name"
     what = f"body for '{device}' (give {option})" if wanted is None else f"body '{wanted}'"
     raise UsageError(f"{file}: has no {what}; it has {listed}")

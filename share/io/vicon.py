@@ -81,22 +81,21 @@ def is_vicon(path: Path) -> bool:
     return first.strip(" ,;") in (*_BLOCKS, *_OTHERS)
 
 
-def read_vicon(path: Path, rotations: str = "helical") -> dict[str, Mocap]:
-    """By body, its poses where it was seen; stamps are frame / rate, ns. rotations: what three columns of
-    rotation are, one of ROTATIONS; four are a quaternion. Raises DataError naming file and line."""
+def read_vicon(path: Path, rotations: str = "helical") -> dict[str, Mocap | None]:
+    """By body, its poses where it was seen, None where it never was; stamps are frame / rate, ns. rotations:
+    what three columns of rotation are, one of ROTATIONS; four are a quaternion. Raises DataError naming file
+    and line."""
     block = _block(path)
     stamps = _stamps(block)
-    out = {}
+    out: dict[str, Mocap | None] = {}
     for start in [k for k, name in enumerate(block.head[2]) if name and k > 1]:
         T, seen = _poses(block, start, rotations)
         name = _name(block.head[2][start])
-        if seen.sum() < 2:
-            continue  # an object that was never in the room
         try:
-            out[name] = Mocap(stamps[seen], T)
+            out[name] = Mocap(stamps[seen], T) if seen.sum() >= 2 else None
         except DataError as error:
             raise DataError(f"{path}: body '{name}': {error}") from None
-    if not out:
+    if all(seen is None for seen in out.values()):
         raise DataError(f"{path}: no body was ever seen; export the objects that were tracked")
     return out
 

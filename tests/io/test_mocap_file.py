@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from share.errors import DataError
-from share.io.mocap_file import read_bodies, read_mocap
+from share.errors import DataError, UsageError
+from share.io.mocap_file import pick_body, read_bodies, read_mocap
+from share.mocap.mocap import Mocap
 
 TUM = "1.0 1 2 3 0 0 0 1\n1.1 1 2 4 0 0 0 1\n1.2 1 2 5 0 0 0 1\n"
 CSV = "1000000000,1,2,3,1,0,0,0\n1100000000,1,2,4,1,0,0,0\n1200000000,1,2,5,1,0,0,0\n"
@@ -60,3 +61,22 @@ def test_a_body_that_is_not_seen_is_a_gap(
 def test_what_is_damaged_is_still_said(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(DataError, match=f"a.tum.*{said}"):
         read_mocap(written(tmp_path / "a.tum", text))
+
+
+SEEN = Mocap(np.array([0, 10]), np.tile(np.eye(4), (2, 1, 1)))
+
+
+def test_a_device_is_the_body_wanted_or_of_its_name_or_the_only_one() -> None:
+    there = {"Ann": SEEN, "Hat": SEEN}
+    assert pick_body("v.csv", there, None, "ann", "--body") == ("Ann", SEEN)
+    assert pick_body("v.csv", there, "hat", "ann", "--body") == ("Hat", SEEN)
+    assert pick_body("v.csv", {"Hat": SEEN}, None, "ann", "--body") == ("Hat", SEEN)
+    assert pick_body("a.tum", {"": SEEN}, None, "ann", "--body") == ("", SEEN)
+
+
+def test_a_body_that_was_never_seen_is_no_reason_to_take_another() -> None:
+    there = {"Ann": SEEN, "Bob": None}
+    with pytest.raises(UsageError, match="body 'Bob' is in the file but was never seen"):
+        pick_body("v.csv", there, None, "bob", "--body")
+    with pytest.raises(UsageError, match=r"has no body for 'eve' .*; it has Ann, Bob"):
+        pick_body("v.csv", there, None, "eve", "--body")

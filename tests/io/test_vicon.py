@@ -98,8 +98,9 @@ def test_what_is_wrong_is_said_with_its_line(old, new, said, tmp_path):
     assert str(path) in str(error.value) and "\n" not in str(error.value)
 
 
-def test_an_object_that_was_never_there_is_left_out(tmp_path):
+def test_an_object_that_was_never_there_is_known_but_not_seen(tmp_path):
     hidden = "\n".join(f"{k},0,1,2,3,4,5,{k},,,,,," for k in range(1, 9))
-    assert list(read_vicon(written(tmp_path, HEAD + hidden))) == ["Ann"]
+    bodies = read_vicon(written(tmp_path, HEAD + hidden))
+    assert [(name, seen is None) for name, seen in bodies.items()] == [("Ann", False), ("Bob:Head", True)]
     with pytest.raises(DataError, match="no body was ever seen"):
         read_vicon(written(tmp_path, HEAD + "1,0,,,,,,,,,,,,\n2,0,,,,,,,,,,,,\n"))
