@@ -143,7 +143,7 @@ def make_device(folder: Path, path: str, doctor: Path) -> FakeDevice:
     log, started = folder / "log", folder / "started"
     _executable(tools / "ssh", _SSH)
     _executable(tools / "systemctl", _SYSTEMCTL.format(log=log, started=started, root=root))
-    for name in ("useradd", "usermod", "groupadd", "chown", "udevadm", "journalctl"):
+    for name in ("useradd", "usermod", "groupadd", "chown", "udevadm", "journalctl", "systemd-tmpfiles"):
         _executable(tools / name, _LOGGED.format(log=log))
     return FakeDevice(folder, f"{tools}:{path}", doctor)
 

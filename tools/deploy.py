@@ -17,6 +17,7 @@ from deploy_settings import merged
 from tool_main import exit_code
 
 from share.cli.progress import progress
+from share.core.checkup import boot
 from share.errors import UsageError
 from share.io.keys import public_key
 
@@ -193,6 +194,7 @@ def plan(
             for name, text in files.items()
         ),
         f"{where}/etc/systemd/system/share-*.service, /etc/udev/rules.d/99-share-realsense.rules",
+        f"{where}{boot.FILE}: CPU governor and USB memory, as the profile wants them",
         f"{where}/opt/share/current: {there.current or 'none'} -> {release.name}",
         *(begin if service.unit else []),
     ]

@@ -1,4 +1,4 @@
-"""What is put onto a device: the frozen program, its units and its udev rules, as one release with a name."""
+"""What is put onto a device: the frozen program, units, rules and settings, as one release with a name."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from share.core.checkup import camera
+from share.core.checkup import boot, camera
 from share.errors import ShareError, UsageError
+from share.io.profile import host_profile, shipped
 
 HERE = Path(__file__).resolve().parent / "device"
 RULES = "deploy/99-share-realsense.rules"
@@ -71,8 +72,16 @@ def _members(folder: Path) -> list[tuple[str, Path | bytes]]:
     return [
         *((str(path.relative_to(folder)), path) for path in program),
         *((f"deploy/{path.name}", path) for path in units),
+        *((f"deploy/{name}.conf", _at_boot(name)) for name in shipped()),
         (RULES, "".join(f"{rule}\n" for rule in camera.RULES).encode()),
     ]
+
+
+def _at_boot(profile: str) -> bytes:
+    """What such a computer is set to."""
+    host = host_profile(profile).host
+    head = f"# Of SHARE, for {profile}: docs/deployment.md"
+    return "".join(f"{line}\n" for line in (head, *boot.lines(host.cpu_governor, host.usbfs_mb))).encode()
 
 
 def _content(source: Path | bytes) -> bytes:

@@ -1,4 +1,4 @@
-"""What Linux tells of the computer: processor, USB, udev, limits. Every root can be a tree of a test.
+"""What Linux tells of the computer: processor, USB, udev, disk. Every root can be a tree of a test.
 
 What is not there is None or empty: containers and virtual machines show little.
 """
@@ -47,14 +47,6 @@ def camera_rules(root: Path = Path("/")) -> list[str]:
     files = [path for folder in _RULES for path in sorted((root / folder).glob("*.rules"))]
     found = {path.resolve(): path for path in files if _names_camera(_text(path) or "")}  # /lib is /usr/lib
     return [f"/{path.relative_to(root)}" for path in found.values()]
-
-
-def priority_limit() -> int | None:
-    """Realtime priority that this process may ask for, -1 = any; None where there is no such limit."""
-    import resource
-
-    kind = getattr(resource, "RLIMIT_RTPRIO", None)
-    return None if kind is None else resource.getrlimit(kind)[0]
 
 
 def free_bytes(folder: Path) -> tuple[Path, int]:

@@ -6,6 +6,7 @@ for a gyroscope and m/s^2 for an accelerometer.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -140,6 +141,9 @@ class DeviceFacts:
     def __post_init__(self) -> None:
         if self.emitter not in _EMITTER:
             raise ValueError(f"emitter: '{self.emitter}' is not one of {', '.join(_EMITTER)}")
+        for text in (*self.firmware, *filter(None, [self.firmware_oldest])):
+            if not re.fullmatch(r"\d+(\.\d+)+", text, re.ASCII):
+                raise ValueError(f"firmware: '{text}' is not dotted numbers such as 5.16.0.1")
         for name in ("exposure_ms", "gain"):
             low, high = getattr(self, name)
             if not 0 < low <= high:
@@ -148,12 +152,20 @@ class DeviceFacts:
 
 @dataclass(frozen=True)
 class HostFacts:
-    """How the computer at the sensor is to be set. usbfs_mb: memory for USB transfers, 0 = leave it."""
+    """How the computer at the sensor is to be set. cpu_governor: "" = leave it. usbfs_mb: memory for USB
+    transfers, 0 = leave it."""
 
     cpu_governor: str
     usb_autosuspend: bool
     usbfs_mb: int
-    realtime_priority: int
+
+    def __post_init__(self) -> None:
+        if self.cpu_governor not in ("", *_GOVERNORS):
+            raise ValueError(
+                f"cpu_governor: '{self.cpu_governor}' is not one of {', '.join(_GOVERNORS)}, or \"\""
+            )
+        if not 0 <= self.usbfs_mb <= _USBFS_MOST:
+            raise ValueError(f"usbfs_mb: {self.usbfs_mb} must lie in 0 .. {_USBFS_MOST}")
 
 
 @dataclass(frozen=True)
@@ -259,6 +271,8 @@ class Profile:
 
 
 _EMITTER = ("off", "on", "interleaved", "none")
+_GOVERNORS = ("performance", "powersave", "ondemand", "conservative", "schedutil", "userspace")
+_USBFS_MOST = 2047  # of the kernel
 
 
 def _listed(values: tuple[float, ...]) -> str:

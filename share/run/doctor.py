@@ -6,14 +6,14 @@ import os
 import time
 from pathlib import Path
 
-from share.core.checkup import Finding, camera, fail, host, ok, skipped
+from share.core.checkup import Finding, boot, camera, fail, host, ok, skipped
 from share.core.checkup.calibration import calibration
 from share.errors import ShareError
 from share.io import host as facts
 from share.io.calibration import read_calibration
 from share.io.keys import AgentKeys, agent_keys, default_folder, has_pair, load
 from share.io.profile import HostProfile
-from share.io.profile_types import Profile
+from share.io.profile_types import HostFacts, Profile
 from share.io.realsense import asked
 from share.io.transport import parse_address
 from share.run.clocks import of_chrony
@@ -28,9 +28,8 @@ def of_host(profile: HostProfile, out: Path) -> list[Finding]:
     where, free = facts.free_bytes(out)
     return [
         host.libraries(facts.native_libraries()),
-        host.governor(facts.governors(), wanted.cpu_governor),
+        host.governor(facts.governors(), wanted.cpu_governor, _boot(wanted)),
         host.throttling(facts.throttles()),
-        host.priority(facts.priority_limit(), wanted.realtime_priority),
         host.disk(str(where), free, 0.0 if profile.sensor is None else _bytes_s(profile.sensor)),
         host.clock_of_edge() if profile.role == "edge" else _clock(),
     ]
@@ -49,7 +48,7 @@ def of_camera(profile: HostProfile) -> list[Finding]:
         camera.udev(facts.camera_rules(), os.geteuid() == 0),
         camera.imu(found or ()),
         camera.autosuspend(found or (), wanted.usb_autosuspend),
-        camera.usb_memory(facts.usb_memory_mb(), wanted.usbfs_mb),
+        camera.usb_memory(facts.usb_memory_mb(), wanted.usbfs_mb, _boot(wanted)),
     ]
 
 
@@ -108,6 +107,10 @@ def _clock() -> Finding:
     if found.offset_ms is None or found.uncertainty_ms is None:
         return host.clock(None, f"chronyd {found.wrong}")
     return host.clock((found.offset_ms, found.uncertainty_ms), None)
+
+
+def _boot(wanted: HostFacts) -> tuple[str, ...]:
+    return boot.mend(wanted.cpu_governor, wanted.usbfs_mb)
 
 
 def _bytes_s(sensor: Profile) -> float:

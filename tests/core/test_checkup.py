@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from share.core.checkup import State, camera, host
+from share.core.checkup import State, boot, camera, host
 from share.core.checkup.calibration import calibration
 from share.core.checkup.camera import Sdk, UsbCamera
 from share.geometry.camera import Camera, ImuNoise, Rig
@@ -44,17 +44,26 @@ def test_a_camera_that_is_plugged_in_must_be_one_that_the_sdk_sees() -> None:
 
 def test_what_cannot_be_seen_is_skipped() -> None:
     found = [host.governor([], "performance"), host.throttling([]), camera.usb_memory(None, 128)]
-    found += [host.priority(None, 10), camera.firmware(Sdk("no"), [], None), camera.autosuspend([], False)]
+    found += [camera.firmware(Sdk("no"), [], None), camera.autosuspend([], False)]
     assert {one.state for one in found} == {State.SKIPPED}
 
 
 def test_the_host_is_held_against_the_profile() -> None:
     assert host.governor(["performance"] * 4, "performance").state is State.OK
     assert "1 of 2 cores" in host.governor(["performance", "powersave"], "performance").what
-    assert host.throttling([0, 3]).state is host.priority(5, 10).state is State.WARN
-    assert host.priority(-1, 10).state is camera.usb_memory(128, 128).state is State.OK
-    assert camera.usb_memory(16, 128).state is State.WARN
+    assert host.throttling([0, 3]).state is camera.usb_memory(16, 128).state is State.WARN
+    assert camera.usb_memory(128, 128).state is State.OK
     assert camera.udev([], is_root=False).state is State.FAIL
+
+
+def test_what_mends_the_host_outlives_a_start() -> None:
+    lines, mend = boot.lines("performance", 128), boot.mend("performance", 128)
+    assert [line.split()[-1] for line in lines] == ["performance", "128"]
+    assert all(f"'{line}'" in mend[0] for line in lines)
+    assert boot.FILE in mend[0] and boot.FILE in mend[1]
+    assert boot.lines("", 0) == ()
+    asleep = camera.autosuspend([UsbCamera("2-1", 5000, "auto")], allowed=False)
+    assert any('ATTR{power/control}="on"' in line and "rules.d" in line for line in asleep.mend)
 
 
 @pytest.mark.parametrize(("minutes", "state"), [(4, "FAIL"), (6, "WARN"), (61, "OK")])

@@ -106,6 +106,19 @@ def test_what_is_not_known_is_refused_with_what_is(arguments: tuple, says: str):
         ),
         ("width: 640", "width: 0", "device: modes[0]: resolution: 0x480 is not positive"),
         ("default_mode: 640x480@30", "default_mode: 9x9", "mine.yaml: mode '9x9' is not known"),
+        (
+            "cpu_governor: performance",
+            "cpu_governor: perfomance",
+            "host: cpu_governor: 'perfomance' is not one of performance, powersave",
+        ),
+        ("usbfs_mb: 128", "usbfs_mb: -5", "host: usbfs_mb: -5 must lie in 0 .. 2047"),
+        ("usbfs_mb: 128", "realtime_priority: 10", "host: unknown key 'realtime_priority'"),
+        ('"5.16.0.1"]', '"latest"]', "device: firmware: 'latest' is not dotted numbers such as 5.16.0.1"),
+        (
+            'firmware_oldest: "5.12.0.0"',
+            "firmware_oldest: v5",
+            "device: firmware: 'v5' is not dotted numbers",
+        ),
         ("[[1, 0, 0, -0.00552]", "[[2, 0, 0, -0.00552]", "device: T_imu_cam0: is not a rigid transform"),
     ],
 )

@@ -19,9 +19,10 @@ from fake_device import TOOLS, FakeDevice, make_device
 from ssh_server import HOST, ssh_server
 
 from share.cli.main import cli
+from share.core.checkup import boot
 from share.core.checkup.camera import RULES
 from share.errors import ShareError, UsageError
-from share.io.profile import shipped
+from share.io.profile import host_profile, shipped
 
 
 @pytest.fixture(scope="module")
@@ -214,6 +215,10 @@ def test_the_doctor_looks_for_what_that_kind_of_computer_needs(device, kind, pro
         device.agent(device.program("1.1"))  # the kind is known by now
     assert (device.root / "etc/share/profile").read_text() == f"{profile}\n"
     assert profile in shipped()
+    wanted = host_profile(profile).host
+    _head, *lines = (device.root / "etc/tmpfiles.d/share.conf").read_text().splitlines()
+    assert lines == list(boot.lines(wanted.cpu_governor, wanted.usbfs_mb))
+    assert f"systemd-tmpfiles --create {device.root}/etc/tmpfiles.d/share.conf" in device.asked()
 
 
 def test_back_without_a_release_before_is_one_line(device):
@@ -314,6 +319,20 @@ def test_systemd_understands_the_units(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     complaints = [line for line in done.stderr.splitlines() if "share" in line]
     assert (done.returncode, complaints) == (0, []), done.stderr
+
+
+@pytest.mark.skipif(shutil.which("systemd-tmpfiles") is None, reason="needs systemd-tmpfiles")
+def test_systemd_sets_what_a_profile_wants(device):
+    device.agent(device.program("1.0"))
+    cores = [device.root / f"sys/devices/system/cpu/cpufreq/policy{k}/scaling_governor" for k in (0, 1)]
+    usb = device.root / "sys/module/usbcore/parameters/usbfs_memory_mb"
+    for path in (*cores, usb):
+        path.parent.mkdir(parents=True)
+        path.write_text("x" * 11)
+    command = ["systemd-tmpfiles", f"--root={device.root}", "--create"]
+    subprocess.run([*command, device.root / "etc/tmpfiles.d/share.conf"], check=True, timeout=60)
+    assert [path.read_text() for path in cores] == ["performance"] * 2
+    assert usb.read_text().startswith("128")
 
 
 def test_an_agent_may_write_what_starts_the_camera_s_imu():

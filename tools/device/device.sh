@@ -8,7 +8,7 @@ ROOT=${SHARE_ROOT:-}
 SETTLE=${SHARE_SETTLE:-10} # seconds for which a service must stay up
 KEEP=${SHARE_KEEP:-3}      # releases
 OPT=$ROOT/opt/share ETC=$ROOT/etc/share VAR=$ROOT/var/lib/share
-UNITS=$ROOT/etc/systemd/system RULES=$ROOT/etc/udev/rules.d
+UNITS=$ROOT/etc/systemd/system RULES=$ROOT/etc/udev/rules.d BOOT=$ROOT/etc/tmpfiles.d
 
 say() { echo "share: $*" || :; } # perhaps to nobody
 die() { echo "$*" >&2 || :; exit 1; }
@@ -125,7 +125,7 @@ rollback() { # to the release before
     say "$back runs; rollback again for $old"
 }
 
-switch() { # RELEASE: its program, units and udev rules
+switch() { # RELEASE: its program, units, udev rules and settings of the kernel
     touch "$OPT/releases/$1"
     mkdir -p "$UNITS" "$RULES" "$ROOT/usr/local/bin"
     cp "$OPT/releases/$1"/deploy/*.service "$UNITS/"
@@ -133,8 +133,16 @@ switch() { # RELEASE: its program, units and udev rules
         cp "$OPT/releases/$1"/deploy/*.rules "$RULES/99-share-realsense.rules"
         udevadm control --reload-rules && udevadm trigger || say "udev did not reload"
     }
+    set_kernel "$OPT/releases/$1/deploy/$(cat "$ETC/profile" || :).conf"
     ln -sfn /opt/share/current/share "$ROOT/usr/local/bin/share"
     point current "$1"
+}
+
+set_kernel() { # FILE: what the profile asks of processor and USB, now and at every start; an old release has none
+    [ -f "$1" ] || return 0
+    mkdir -p "$BOOT"
+    cp "$1" "$BOOT/share.conf"
+    systemd-tmpfiles --create "$BOOT/share.conf" || say "the kernel did not take all of /etc/tmpfiles.d/share.conf"
 }
 
 point() { # LINK RELEASE: at once, so that nobody ever finds none

@@ -16,6 +16,7 @@ RULES = (
     f'SUBSYSTEMS=="usb", {_D435I}, MODE:="0660", GROUP:="plugdev"',
     f'KERNEL=="iio*", {_IMU}',
     f'DRIVER=="hid_sensor_custom", {_IMU}',
+    'SUBSYSTEM=="usb", ATTR{idVendor}=="8086", ATTR{idProduct}=="0b3a", ATTR{power/control}="on"',
 )
 _RULE_FILE = "/etc/udev/rules.d/99-share-realsense.rules"
 
@@ -146,16 +147,15 @@ def autosuspend(cameras: Sequence[UsbCamera], allowed: bool) -> Finding:
     asleep = [camera for camera in told if camera.control != "on"]
     if not asleep:
         return ok("USB power saving", "off for the camera")
-    mend = (f"echo on | sudo tee /sys/bus/usb/devices/{camera.path}/power/control" for camera in asleep)
-    return warn("USB power saving", "the kernel may put the camera to sleep", *mend)
+    return warn("USB power saving", "the kernel may put the camera to sleep", *_write_rules())
 
 
-def usb_memory(found_mb: int | None, wanted_mb: int) -> Finding:
+def usb_memory(found_mb: int | None, wanted_mb: int, mend: Sequence[str] = ()) -> Finding:
+    """mend: what sets it, see `boot.mend`."""
     if not wanted_mb:
         return skipped("USB memory", "the profile leaves it")
     if found_mb is None:
         return skipped("USB memory", "usbfs_memory_mb is not to be seen here")
     if found_mb == 0 or found_mb >= wanted_mb:  # 0: no limit
         return ok("USB memory", f"{found_mb} MB" if found_mb else "no limit")
-    mend = f"echo {wanted_mb} | sudo tee /sys/module/usbcore/parameters/usbfs_memory_mb"
-    return warn("USB memory", f"{found_mb} MB, the profile wants {wanted_mb}", mend)
+    return warn("USB memory", f"{found_mb} MB, the profile wants {wanted_mb}", *mend)

@@ -1,4 +1,4 @@
-"""The computer: its processor, priority, disk, clock and libraries."""
+"""The computer: its processor, disk, clock and libraries."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ _LEAST_MINUTES, _ENOUGH_MINUTES = 5.0, 60.0
 CLOCK_LIMIT_MS = 1.0  # as `share sync check`
 
 
-def governor(found: Sequence[str], wanted: str) -> Finding:
-    """found: of each core. wanted: "" where the profile leaves it."""
+def governor(found: Sequence[str], wanted: str, mend: Sequence[str] = ()) -> Finding:
+    """found: of each core. wanted: "" where the profile leaves it. mend: what sets it, see `boot.mend`."""
     if not wanted:
         return skipped("CPU governor", "the profile leaves it")
     if not found:
@@ -21,8 +21,7 @@ def governor(found: Sequence[str], wanted: str) -> Finding:
         return ok("CPU governor", f"{wanted} on {len(found)} cores")
     count = sum(one != wanted for one in found)
     what = f"{', '.join(others)} on {count} of {len(found)} cores, the profile wants {wanted}"
-    files = "/sys/devices/system/cpu/cpu*/cpufreq/scaling_governor"
-    return warn("CPU governor", what, f"echo {wanted} | sudo tee {files}")
+    return warn("CPU governor", what, *mend)
 
 
 def throttling(counts: Sequence[int]) -> Finding:
@@ -33,18 +32,6 @@ def throttling(counts: Sequence[int]) -> Finding:
         return ok("throttling", "none since the start")
     what = f"slowed by heat, {max(counts)} times on one core since the start"
     return warn("throttling", what, "cool it better (fan, dust, air), or ask less of it: a lower image rate")
-
-
-def priority(limit: int | None, wanted: int) -> Finding:
-    """limit: RLIMIT_RTPRIO; None where there is no such thing."""
-    if not wanted:
-        return skipped("realtime priority", "the profile needs none")
-    if limit is None:
-        return skipped("realtime priority", "this system has no such limit")
-    if limit < 0 or limit >= wanted:  # -1: no limit
-        return ok("realtime priority", "no limit" if limit < 0 else f"up to {limit}")
-    line = f'echo "$USER - rtprio {wanted}" | sudo tee /etc/security/limits.d/share.conf  # then log in again'
-    return warn("realtime priority", f"up to {limit}, the profile wants {wanted}", line)
 
 
 def disk(where: str, free_bytes: int, bytes_s: float) -> Finding:
