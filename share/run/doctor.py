@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from pathlib import Path
 
@@ -27,7 +28,7 @@ def of_host(profile: HostProfile, out: Path) -> list[Finding]:
     wanted = profile.host
     where, free = facts.free_bytes(out)
     return [
-        host.libraries(facts.native_libraries()),
+        host.libraries(facts.native_libraries(), _frozen()),
         host.governor(facts.governors(), wanted.cpu_governor, _boot(wanted)),
         host.throttling(facts.throttles()),
         host.disk(str(where), free, 0.0 if profile.sensor is None else _bytes_s(profile.sensor)),
@@ -43,7 +44,7 @@ def of_camera(profile: HostProfile) -> list[Finding]:
     found, sdk = facts.cameras(), asked.ask()
     return [
         camera.link(found),
-        camera.sdk(sdk, found or ()),
+        camera.sdk(sdk, found or (), _frozen()),
         camera.firmware(sdk, device.firmware, device.firmware_oldest),
         camera.udev(facts.camera_rules(), os.geteuid() == 0),
         camera.imu(found or ()),
@@ -107,6 +108,10 @@ def _clock() -> Finding:
     if found.offset_ms is None or found.uncertainty_ms is None:
         return host.clock(None, f"chronyd {found.wrong}")
     return host.clock((found.offset_ms, found.uncertainty_ms), None)
+
+
+def _frozen() -> bool:
+    return bool(getattr(sys, "frozen", False))
 
 
 def _boot(wanted: HostFacts) -> tuple[str, ...]:

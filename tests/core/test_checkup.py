@@ -24,11 +24,30 @@ def test_a_link_is_usb_3_from_5000_mbit_on(mbit_s: float, state: str) -> None:
 
 @pytest.mark.parametrize(
     ("found", "state"),
-    [("5.9.0.0", "FAIL"), ("5.12.0", "WARN"), ("5.13.0.50", "OK"), ("5.16.0.1", "OK"), ("5.17", "WARN")],
+    [("5.9.0.0", "FAIL"), ("5.12.0", "WARN"), ("5.13.0.50", "OK"), ("5.15", "WARN"), ("5.16.0.1", "OK")],
 )
 def test_firmware_is_compared_by_numbers_not_letters(found: str, state: str) -> None:
     good = ["5.13.0.50", "5.16.0.1"]
-    assert camera.firmware(Sdk(firmware=(found,)), good, "5.12.0.0").state.value == state
+    told = camera.firmware(Sdk(firmware=(found,)), good, "5.12.0.0")
+    assert told.state.value == state
+    assert any("librealsense2-utils" in line for line in told.mend) == (state != "OK")
+
+
+def test_nobody_is_told_to_go_back_to_an_older_firmware() -> None:
+    found = camera.firmware(Sdk(firmware=("5.17.0.10",)), ["5.9.0.1", "5.16.0.1", "5.13"], None)
+    assert (found.state, found.mend) == (State.OK, ())
+    assert found.what.startswith("5.17.0.10, newer than those tried")
+
+
+def test_into_a_frozen_program_nothing_can_be_installed() -> None:
+    for frozen in (False, True):
+        mends = [
+            *camera.sdk(Sdk("no module pyrealsense2"), [], frozen).mend,
+            *host.libraries({"zmq": "no", "numpy": None}, frozen).mend,
+        ]
+        assert ["pip" in mend for mend in mends] == [not frozen] * 2
+        assert ["tools/deploy" in mend for mend in mends] == [frozen] * 2
+    assert camera.sdk(Sdk("libusb-1.0.so.0: not there"), [], True).mend == ("sudo apt install libusb-1.0-0",)
 
 
 def test_a_camera_that_is_plugged_in_must_be_one_that_the_sdk_sees() -> None:

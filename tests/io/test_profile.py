@@ -113,7 +113,7 @@ def test_what_is_not_known_is_refused_with_what_is(arguments: tuple, says: str):
         ),
         ("usbfs_mb: 128", "usbfs_mb: -5", "host: usbfs_mb: -5 must lie in 0 .. 2047"),
         ("usbfs_mb: 128", "realtime_priority: 10", "host: unknown key 'realtime_priority'"),
-        ('"5.16.0.1"]', '"latest"]', "device: firmware: 'latest' is not dotted numbers such as 5.16.0.1"),
+        ('"5.17.0.10"]', '"latest"]', "device: firmware: 'latest' is not dotted numbers such as 5.16.0.1"),
         (
             'firmware_oldest: "5.12.0.0"',
             "firmware_oldest: v5",

@@ -61,23 +61,38 @@ def link(cameras: Sequence[UsbCamera] | None) -> Finding:
 
 
 def firmware(sdk: Sdk, good: Sequence[str], oldest: str | None) -> Finding:
-    """good: known to be good; oldest: what is below it is not to be trusted."""
+    """good: known to be good, and what is newer than all of them will do; oldest: what is below it is not to
+    be trusted."""
     if sdk.trouble or not sdk.firmware:
         return skipped("firmware", "no camera told it")
     found = min(sdk.firmware, key=version)
-    update = "rs-fw-update -l; then rs-fw-update -f FILE, with a file of the firmware recommended: "
+    known = sorted(map(version, good))
     if oldest and version(found) < version(oldest):
-        return fail("firmware", f"{found} is older than {oldest}", update + ", ".join(good))
-    if version(found) in map(version, good):
+        return fail("firmware", f"{found} is older than {oldest}", *_update(good))
+    if version(found) in known:
         return ok("firmware", found)
-    return warn("firmware", f"{found} is not among those tried: {', '.join(good)}", update + ", ".join(good))
+    if known and version(found) > known[-1]:
+        return ok("firmware", f"{found}, newer than those tried: {', '.join(good)}")
+    return warn("firmware", f"{found} is not among those tried: {', '.join(good)}", *_update(good))
 
 
-def sdk(found: Sdk, cameras: Sequence[UsbCamera]) -> Finding:
-    """cameras: those that are plugged in, of which it must see every one."""
+def _update(good: Sequence[str]) -> tuple[str, ...]:
+    return (
+        f"rs-fw-update -l; then rs-fw-update -f FILE, with a file of one of {', '.join(good)}",
+        "FILE: https://dev.realsenseai.com/docs/firmware-releases-d400",
+        "rs-fw-update: in the maker's package librealsense2-utils, for any computer with the camera at it, "
+        "https://github.com/realsenseai/librealsense/blob/master/doc/distribution_linux.md",
+    )
+
+
+def sdk(found: Sdk, cameras: Sequence[UsbCamera], frozen: bool = False) -> Finding:
+    """cameras: those that are plugged in, of which it must see every one. frozen: as `host.libraries`."""
     if found.trouble is not None:
-        library = "libusb-1.0.so" in found.trouble
-        mend = "sudo apt install libusb-1.0-0" if library else "pip install pyrealsense2"
+        mend = "pip install pyrealsense2"
+        if "libusb-1.0.so" in found.trouble:
+            mend = "sudo apt install libusb-1.0-0"
+        elif frozen:
+            mend = "put a program here that was frozen beside pyrealsense2: make freeze, then tools/deploy"
         return fail("librealsense", found.trouble, mend)
     if len(cameras) > len(found.firmware):
         closed = [camera.path for camera in cameras if not camera.may_open]

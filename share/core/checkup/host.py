@@ -72,13 +72,17 @@ def clock_of_edge() -> Finding:
     return ok("clock", "`share sync server` makes it the room's, right or not: devices follow it")
 
 
-def libraries(found: Mapping[str, str | None]) -> Finding:
-    """found: by library, why it does not load; None where it does."""
+def libraries(found: Mapping[str, str | None], frozen: bool = False) -> Finding:
+    """found: by library, why it does not load; None where it does. frozen: whether this is a program that
+    brings its own Python, into which nothing can be installed."""
     broken = {name: why for name, why in found.items() if why is not None}
     if not broken:
         return ok("libraries", f"{', '.join(found)} load")
     what = "; ".join(f"{name}: {why}" for name, why in broken.items())
-    return fail("libraries", what, "pip install --force-reinstall share-slam, for this Python and processor")
+    mend = "pip install --force-reinstall share-slam, for this Python and processor"
+    if frozen:
+        mend = "put a program here that was frozen on a machine of this kind: make freeze, then tools/deploy"
+    return fail("libraries", what, mend)
 
 
 def port(number: int, free: bool) -> Finding:
