@@ -114,6 +114,7 @@ def generate(folder: Path, name: str | None = None) -> KeyPair:
 
 
 def has_pair(folder: Path) -> bool:
+    """Raises UsageError where it cannot be looked into."""
     return bool(_secrets(folder))
 
 
@@ -230,7 +231,14 @@ def _text(path: Path) -> str:
 
 
 def _secrets(folder: Path) -> list[Path]:
-    return sorted(folder.glob("*.secret"))
+    """None where there is no folder. Raises UsageError where it cannot be looked into."""
+    try:
+        names = os.listdir(folder)  # glob would find nothing where it may not look
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be read: {error.strerror}") from None
+    return sorted(folder / name for name in names if name.endswith(".secret"))
 
 
 def _make(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import time
@@ -100,6 +101,21 @@ def test_a_folder_that_cannot_be_used(damage, said: str, tmp_path: Path) -> None
     damage(tmp_path)
     with pytest.raises(UsageError, match=said):
         keys.load(tmp_path)
+
+
+def test_a_folder_that_may_not_be_read_is_not_said_to_be_empty(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def denied(where: object) -> list[str]:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(where))
+
+    keys.generate(tmp_path, "edge")
+    assert not keys.has_pair(tmp_path / "none")
+    monkeypatch.setattr(os, "listdir", denied)  # root, who may run this, may read all
+    monkeypatch.setattr(os, "scandir", denied)
+    for look in (keys.load, keys.has_pair, keys.edge_keys):
+        with pytest.raises(UsageError, match=rf"^{tmp_path}: cannot be read: Permission denied$"):
+            look(tmp_path)
 
 
 def test_default_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
