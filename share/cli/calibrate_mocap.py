@@ -29,9 +29,18 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     help="What the motion capture saw: Vicon's CSV, TUM, or CSV with t[ns], x y z, qw qx qy qz.",
 )
-@click.option("--body", metavar="BODY", help="Which rigid body of Vicon's CSV.  [default: the only one]")
+@click.option(
+    "--body",
+    metavar="BODY",
+    help="Which rigid body of Vicon's CSV.  [default: the one of the source's name, or the only one]",
+)
 @options.rotations
-@options.calib
+@click.option(
+    "--calib",
+    metavar="FILE",
+    help="The IMU's noise, by share calibrate imu: kalibr_imu_chain.yaml, or a folder with it; overrides "
+    "what the source carries.",
+)
 @click.option(
     "--track",
     metavar="T.tum",

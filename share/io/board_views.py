@@ -15,7 +15,7 @@ from share.geometry.target import Target
 from share.io.calibration import Calibration
 from share.io.images import decode_gray
 from share.io.pool import Pool
-from share.io.source import calibration_of, open_source
+from share.io.source import READERS, calibration_of, open_source
 from share.types import U8
 
 _PICTURES = (".png", ".jpg", ".jpeg")
@@ -33,17 +33,22 @@ class Pictures:
     said: Calibration | None = None
 
 
-def open_pictures(source: str, eyes: Sequence[str], calib: str | None = None) -> Pictures:
+def open_pictures(
+    source: str, eyes: Sequence[str], calib: str | None = None, alone: str = "give --camera cam0"
+) -> Pictures:
     """A recording, or a folder with cam0/*.png and, for stereo, cam1/*.png of the same names (.jpg too).
 
-    eyes: which cameras. Raises UsageError, ConfigError or DataError.
+    eyes: which cameras; alone: how a person may ask for cam0 alone. Raises UsageError, ConfigError or
+    DataError.
     """
     folder, said = Path(source), calibration_of(calib)
     if any((folder / CAM0).glob("*")) and not (folder / CAM0 / "data.csv").exists():
-        return _folder(folder, eyes, said)
+        return _folder(folder, eyes, said, alone)
+    if _pictures(folder) and not any(reader.knows(folder) for reader in READERS):
+        raise UsageError(f"{source}: has pictures, but no cam0 with them; give a folder with cam0/*.png")
     opened = open_source(source, calib)
     if CAM1 in eyes and opened.rig.cam1 is None:
-        raise UsageError(f"{source}: has no cam1; give --camera cam0")
+        raise UsageError(f"{source}: has no cam1; {alone}")
 
     def read() -> Iterator[tuple[str, tuple[U8, ...]]]:
         waiting: dict[str, tuple[int, object]] = {}
@@ -60,11 +65,12 @@ def open_pictures(source: str, eyes: Sequence[str], calib: str | None = None) ->
     return Pictures(opened.images_count, opened.rig, read, said)
 
 
-def _folder(folder: Path, eyes: Sequence[str], said: Calibration | None) -> Pictures:
+def _folder(folder: Path, eyes: Sequence[str], said: Calibration | None, alone: str) -> Pictures:
     found = [_pictures(folder / eye) for eye in eyes]
     names = [name for name in found[0] if all(name in others for others in found)]
     if not names:
-        raise DataError(f"{folder}: has no pictures of the same name in {' and '.join(eyes)}")
+        wanted = f"of the same name in {' and '.join(eyes)}; {alone}" if len(eyes) > 1 else f"in {eyes[0]}"
+        raise DataError(f"{folder}: has no pictures {wanted}")
 
     def read() -> Iterator[tuple[str, tuple[U8, ...]]]:
         for name in names:

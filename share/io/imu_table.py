@@ -38,12 +38,19 @@ def read_imu(spec: str, told: Callable[[int, int], None] = lambda done, total: N
         return _table(path.stem, *_of_mcap(path, told))
     if is_session(path.parent) and not path.exists():
         return _table(path.name, *_of_mcap(read_session(path.parent).recording(path.name), told))
-    for csv in (path, path / "mav0" / "imu0" / "data.csv", path / "imu0" / "data.csv", path / "data.csv"):
-        if csv.is_file() and csv.suffix == ".csv":
+    for csv in imu_tables(path):
+        if csv.is_file():
             return _table(path.stem, *tables.read_table(csv, 7))
     if not path.exists():
         raise UsageError(f"SOURCE {path}: no such file or folder")
     raise UsageError(f"{spec}: is no recording of an IMU that SHARE reads: {_KINDS}")
+
+
+def imu_tables(path: Path) -> list[Path]:
+    """Where the samples of a folder may be; a table itself."""
+    if path.suffix == ".csv":
+        return [path]
+    return [path / "mav0" / "imu0" / "data.csv", path / "imu0" / "data.csv", path / "data.csv"]
 
 
 def _of_mcap(path: Path, told: Callable[[int, int], None]) -> tuple[I64, F64]:

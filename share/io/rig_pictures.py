@@ -18,6 +18,8 @@ from share.io.board_views import Pictures, find_views, open_pictures
 from share.io.calibration import CAMCHAIN
 from share.types import F64, I64
 
+_ALONE = "for one camera, give --camera a camchain without cam1"
+
 
 @dataclass(frozen=True, eq=False)
 class RigPictures:
@@ -32,12 +34,12 @@ class RigPictures:
 def open_rig_pictures(source: str, camera: str | None) -> RigPictures:
     """Of a recording, or a folder with cam0/STAMP.png. camera: a camchain or a folder with one, in place
     of the source's own. Raises UsageError, ConfigError or DataError."""
-    chain = None if camera is None else _chain(camera)
-    first = open_pictures(source, (CAM0,), None if chain is None else str(chain))
+    chain = None if camera is None else str(_chain(camera))
+    first = open_pictures(source, (CAM0,), chain)
     if first.rig is None:
         raise UsageError(f"{source}: does not say what its cameras are like; give --camera FILE")
-    eyes = (CAM0, CAM1) if first.rig.cam1 is not None else (CAM0,)
-    pictures = open_pictures(source, eyes, None if chain is None else str(chain)) if len(eyes) > 1 else first
+    two = first.rig.cam1 is not None
+    pictures = open_pictures(source, (CAM0, CAM1), chain, _ALONE) if two else first
     own = first.rig.T_body_cam0 if first.rig.imu is not None else None
     return RigPictures(source, pictures, first.rig, own if first.said is None else first.said.T_imu_cam0)
 

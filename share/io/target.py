@@ -37,6 +37,7 @@ _KEYS: dict[str, tuple[type[Target], dict[str, str]]] = {
     ),
 }
 _TYPE = "target_type"
+_FIRST_TAG = "codeOffset"  # Kalibr's, of an aprilgrid: the number of its first tag
 TARGET = "target"  # of a session.yaml: the target that stands in its room, and there beside its keys
 T_WORLD_TARGET = "T_world_target"
 
@@ -61,8 +62,14 @@ def target_of(section: Section) -> Target:
     if kind not in _KEYS:
         raise ConfigError(f"{section.where}: {_TYPE}: '{kind}' is not known; known: {', '.join(_KEYS)}")
     cls, names = _KEYS[kind]
+    beside = (_TYPE, T_WORLD_TARGET, *((_FIRST_TAG,) if cls is AprilGrid else ()))
+    if _FIRST_TAG in beside and section.number(_FIRST_TAG, 0.0):
+        raise ConfigError(
+            f"{section.where}: {_FIRST_TAG}: {section.get(_FIRST_TAG)} is not supported, tags must be "
+            "numbered from 0; `share calibrate target` prints such a board"
+        )
     for key in section.data:
-        if key not in names and key not in (_TYPE, T_WORLD_TARGET):
+        if key not in names and key not in beside:
             near = difflib.get_close_matches(str(key), names, n=1)
             hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(names)}"
             raise ConfigError(f"{section.where}: unknown key '{key}'; {hint}")

@@ -5,10 +5,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from share.calibration.bundle import View
 from share.calibration.detect import Detection
-from share.errors import DataError
+from share.errors import DataError, UsageError
 from share.geometry.camera import Camera, Rig
 from share.geometry.target import AprilGrid
 from share.io import rig_pictures
@@ -16,6 +17,8 @@ from share.io.board_views import open_pictures
 from share.io.rig_pictures import RigPictures, find_stamped
 
 CORNER = Detection(np.array([3]), np.array([[10.0, 20.0]]))
+
+CAMERA = {"intrinsics": [9.0, 9.0, 6.0, 4.0], "resolution": [12, 8]}
 
 
 def written(folder: Path, *names: str) -> Path:
@@ -29,6 +32,23 @@ def test_a_stamp_with_fewer_digits_goes_first(tmp_path: Path) -> None:
     written(tmp_path / "cam0", "100000000000.png", "99950000000.png", "99900000000.png")
     names = [name for name, _ in open_pictures(str(tmp_path), ("cam0",)).read()]
     assert names == ["99900000000", "99950000000", "100000000000"]
+
+
+def test_where_pictures_are_missing_it_is_said_how_to_do_without(tmp_path: Path) -> None:
+    written(tmp_path / "mono" / "cam0", "1.png", "2.png")
+    with pytest.raises(DataError, match=r"of the same name in cam0 and cam1; give --camera cam0$"):
+        open_pictures(str(tmp_path / "mono"), ("cam0", "cam1"))
+    chain = {"cam0": CAMERA, "cam1": CAMERA | {"T_cn_cnm1": np.eye(4).tolist()}}
+    (tmp_path / "stereo.yaml").write_text(yaml.safe_dump(chain))
+    with pytest.raises(
+        DataError, match=r"in cam0 and cam1; for one camera, give --camera a camchain without"
+    ):
+        rig_pictures.open_rig_pictures(str(tmp_path / "mono"), str(tmp_path / "stereo.yaml"))
+    flat = written(tmp_path / "flat", "1.png")
+    with pytest.raises(
+        UsageError, match=r"flat: has pictures, but no cam0 .*; give a folder with cam0/\*\.png"
+    ):
+        open_pictures(str(flat), ("cam0",))
 
 
 def stamped(monkeypatch: pytest.MonkeyPatch, *names: str) -> rig_pictures.Stamped:

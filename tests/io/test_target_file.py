@@ -31,6 +31,10 @@ def test_kalibrs_file_is_read(tmp_path):
     )
 
 
+def test_kalibrs_newer_file_is_read(tmp_path):
+    assert read_target(written(tmp_path, KALIBR + "codeOffset: 0\n")).rows == 5
+
+
 @pytest.mark.parametrize(
     "target", [AprilGrid(3, 4, 0.05, 0.2), CharucoBoard(5, 4, 0.1, 0.07, "DICT_6X6_250")]
 )
@@ -48,6 +52,8 @@ def test_what_is_written_is_read_again(tmp_path, target):
         (KALIBR.replace("0.088", "-1"), "tagSize: -1 must be positive"),
         (KALIBR.replace("0.3", "3"), "tag_spacing: 3 is a share of the tag's size"),
         (KALIBR.replace("0.3", "wide"), "tagSpacing: expected numbers, found ['wide']"),
+        (KALIBR + "codeOffset: 36\n", "codeOffset: 36 is not supported, tags must be numbered from 0"),
+        ("target_type: charuco\ncodeOffset: 0\n", "unknown key 'codeOffset'"),
         ("- 1", "expected keys and values"),
     ],
 )  # fmt: skip
