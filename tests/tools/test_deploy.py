@@ -58,7 +58,8 @@ def test_a_first_agent_is_copied_set_up_and_started(device):
         "systemctl enable share-agent@ann",
         "systemctl restart share-agent@ann",
     ]
-    assert asked.index("systemctl daemon-reload") < asked.index("systemctl restart share-agent@ann")
+    waited = [asked.index(line) for line in ("udevadm settle -t 10", "systemctl daemon-reload")]
+    assert max(waited) < asked.index("systemctl restart share-agent@ann")
 
 
 def test_the_program_alone_is_there_and_no_service(device):

@@ -131,7 +131,8 @@ switch() { # RELEASE: its program, units, udev rules and settings of the kernel
     cp "$OPT/releases/$1"/deploy/*.service "$UNITS/"
     cmp -s "$OPT/releases/$1"/deploy/*.rules "$RULES/99-share-realsense.rules" || {
         cp "$OPT/releases/$1"/deploy/*.rules "$RULES/99-share-realsense.rules"
-        udevadm control --reload-rules && udevadm trigger || say "udev did not reload"
+        # waited for, or a service that starts before it may open the camera counts as one that fails
+        udevadm control --reload-rules && udevadm trigger && udevadm settle -t 10 || say "udev did not reload"
     }
     set_kernel "$OPT/releases/$1/deploy/$(cat "$ETC/profile" || :).conf"
     ln -sfn /opt/share/current/share "$ROOT/usr/local/bin/share"
