@@ -62,10 +62,13 @@ def camera(
     from share.io.earlier import camchain_path, written
     from share.io.files import atomic_write, writable_dir
     from share.io.json_file import known
+    from share.io.kalibr import to_kalibr
     from share.io.target import named_target
 
     target = named_target(target_name)
     pictures = open_pictures(source, ("cam0", "cam1") if camera == "both" else ("cam0",), calib)
+    if pictures.said is not None:
+        to_kalibr(pictures.said.rig, pictures.said)  # what is kept of it must be sound: said before the work
     writable_dir(out)
     outcome = _calibrated(source, pictures, target, every, most, workers)
     text = json.dumps(known(camera_report.to_json(outcome)), indent=1)

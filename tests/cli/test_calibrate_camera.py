@@ -33,6 +33,20 @@ def test_pictures_without_a_board_are_one_line_and_leave_nothing(
     assert not list((tmp_path / "out").glob("*"))
 
 
+def test_a_calibration_of_which_nothing_can_be_kept_is_refused_first(
+    share: Callable[..., Done], tmp_path: Path
+) -> None:
+    (tmp_path / "pictures" / "cam0").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "pictures" / "cam0" / "1.png"), np.full((120, 160), 90, np.uint8))
+    camera = to_kalibr(Rig(Camera(160, 120, 100.0, 100.0, 80.0, 60.0), np.eye(4)))["cam0"]
+    (tmp_path / "given.yaml").write_text(yaml.safe_dump({"cam0": camera | {"timeshift_cam_imu": 5}}))
+    done = share(
+        "calibrate", "camera", tmp_path / "pictures", "--target", "aprilgrid", "--camera", "cam0",
+        "--calib", tmp_path / "given.yaml", "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert done.code == 2 and "cam0: timeshift_cam_imu: 5 s is more than 1 s" in done.err
+
+
 def _pictures(folder: Path, rng: np.random.Generator, count: int = 14) -> None:
     """`count` of a board all over the image, and one in which a single row of its corners is to be seen."""
     board = CharucoBoard()
