@@ -328,14 +328,15 @@ class Correction:
     """The edge's word on where an agent's odometry lies in the shared map.
 
     map_id: names the map; a pose is comparable only with poses in the same map. revision: rises
-    with every correction to this agent. answers: id of the agent's keyframe that led to it, or -1
-    when another agent's did.
+    with every correction to this agent. about: id of a keyframe of the stretch of odometry that it is about.
+    answers: id of the agent's keyframe that led to it, or -1 when another agent's did.
     """
 
     T_map_odom: F64
     cov: F64
     map_id: str
     revision: int
+    about: int
     answers: int = -1
 
     def __post_init__(self) -> None:

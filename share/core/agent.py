@@ -13,7 +13,7 @@ from typing import Any
 from share.config import Config
 from share.core import events as ev
 from share.core.chain import Chain
-from share.core.clock import ClockFilter
+from share.core.clock import ClockFilter, smoothed
 from share.core.clock_claim import ClockClaim
 from share.core.drift import Drift
 from share.core.ledger import Entry, Ledger
@@ -56,6 +56,8 @@ class Agent:
         self._clock = ClockFilter(config.clock)
         self._hello_timer, self._ping_timer = Every(link.hello_s), Every(link.ping_s)
         self._T_odom_body: F64 | None = None
+        self._stretch = 0  # of odometry, in the order in which they began
+        self._processing_ms: float | None = None  # from a frame's arrival to its keyframe, of late
         self._connected = False
         self._session: int | None = None
         self._sessions: deque[int] = deque(maxlen=_REMEMBERED)
@@ -130,6 +132,7 @@ class Agent:
         if frame.new_stretch:
             self._chain.break_off()
             self._map.forget()
+            self._stretch += 1
         if frame.T_odom_body is not None and frame.state.has_pose:
             self._localised(frame, frame.T_odom_body, now_ns)
         if self._streaming or not frame.keyframe:
@@ -139,6 +142,7 @@ class Agent:
         """Makes a keyframe of a candidate, if the rate allows (drop_rate)."""
         self._counts["candidates"] += 1
         frame, candidate = made.frame, made.candidate
+        self._processing_ms = smoothed(self._processing_ms, (now_ns - frame.arrived_ns) / 1e6)
         self._chain.extend(candidate)
         sent = self._bucket.take(now_ns, self._worth.is_rather_high(candidate.view))
         if sent:
@@ -151,7 +155,7 @@ class Agent:
         self._ledger.add(Entry(keyframe, frame.index, frame.arrived_ns))
         self._drift.sent(keyframe, frame.arrived_ns)
         if self._connected and self._clock.rtt_ms is not None:
-            delay_ms = self._clock.rtt_ms + max(0.0, frame.track_ms)
+            delay_ms = self._clock.rtt_ms + (self._processing_ms or 0.0)
             self._send(m.Evaluation(keyframe.id, delay_ms, self._expected_cm(frame.error_cm, now_ns)))
 
     def _expected_cm(self, local_cm: float | None, now_ns: int) -> float | None:
@@ -164,7 +168,16 @@ class Agent:
         self._T_odom_body = T_odom_body
         T_map_odom = self._map.at(now_ns)
         self._effects.append(
-            ev.Localised(frame.index, frame.stamp_ns, T_odom_body, T_map_odom, self._map.map_id, frame.state)
+            ev.Localised(
+                frame.index,
+                frame.stamp_ns,
+                frame.arrived_ns,
+                self._stretch,
+                T_odom_body,
+                T_map_odom,
+                self._map.map_id,
+                frame.state,
+            )
         )
         if self._connected and not self._streaming:
             self._counts["poses"] += 1
@@ -279,10 +292,8 @@ class Agent:
         )
 
     def _of_stretch(self, correction: Correction) -> bool:
-        """Whether it is about the present stretch of odometry: the edge had a keyframe of it."""
-        last = self._ledger.last_acknowledged
-        known = max(correction.answers, last.keyframe.id if last and correction.answers < 0 else -1)
-        return known >= self._chain.first_of_stretch
+        """Whether it is about the present stretch of odometry."""
+        return correction.about >= self._chain.first_of_stretch
 
     def _tracked_afar(self, answer: m.Tracked, streaming: Streaming, now_ns: int) -> None:
         frame = streaming.tracked(answer, now_ns)

@@ -12,8 +12,13 @@ from share.core.exchange import Exchange
 from share.core.rate import SECOND_NS
 from share.types import F64
 
-_SMOOTHING = 1 / 8  # of the round trip time: RFC 6298, section 2
+_SMOOTHING = 1 / 8  # RFC 6298, section 2
 _SETTLED = 8  # exchanges before the quickest of them counts as one that met no queue
+
+
+def smoothed(before: float | None, now: float) -> float:
+    """As the round trip time of TCP is."""
+    return now if before is None else before + _SMOOTHING * (now - before)
 
 
 class ClockFilter:
@@ -56,7 +61,7 @@ class ClockFilter:
         rtt_ns, offset_ns = exchange.delay_ns, exchange.offset_ns
         middle_ns = (sent_ns + back_ns) // 2
         self._recent_ns.append(rtt_ns)
-        self._smooth(rtt_ns / 1e6)
+        self.rtt_ms = smoothed(self.rtt_ms, rtt_ns / 1e6)
         variance = self._variance(rtt_ns)
         if self._filter is None:
             self._start(offset_ns, middle_ns, variance)
@@ -96,9 +101,6 @@ class ClockFilter:
             "clock_drift_ppm": self.drift_ppm,
             "clock_steps": self.steps,
         }
-
-    def _smooth(self, rtt_ms: float) -> None:
-        self.rtt_ms = rtt_ms if self.rtt_ms is None else self.rtt_ms + _SMOOTHING * (rtt_ms - self.rtt_ms)
 
     def _variance(self, rtt_ns: int) -> float:
         """us^2. Half the round trip is the most that an exchange can be wrong by (RFC 5905, section 8)."""

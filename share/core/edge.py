@@ -48,6 +48,7 @@ class Edge:
         self._config, self._session, self._keeps = config, session, keeps
         self._peers: dict[bytes, Peer] = {}
         self._by_key: dict[str, bytes] = {}
+        self._latest: dict[str, Peer] = {}  # run of each name
         self._began_ns = began_ns
         self._schedule = Schedule(config.control, config.edge.policy)
         self._strangers: Counter[str] = Counter()
@@ -153,11 +154,11 @@ class Edge:
         self._welcome(peer_id, self._peers[peer_id], now_ns)
 
     def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
+        """Who says hello has lost the edge: whatever was on its way to him may be gone, or was not taken."""
         peer.greeted = True
         self._send(peer_id, wire.Welcome(self._session, peer.safe))
-        if peer.missed is not None:
-            missed, peer.missed = peer.missed, None
-            self._correct(peer_id, peer, missed, now_ns)
+        if peer.newest is not None:
+            self._correct(peer_id, peer, peer.newest, now_ns)
 
     def _objection(self, peer_id: bytes, hello: wire.Hello, now_ns: int) -> str | None:
         """Why this run cannot be taken in, if it cannot."""
@@ -185,8 +186,7 @@ class Edge:
         return key
 
     def _enter(self, peer_id: bytes, peer: Peer) -> None:
-        self._peers[peer_id] = peer
-        self._by_key[peer.key] = peer_id
+        self._know(peer_id, peer)
         self._keep(KeepRun(peer.key, peer.hello))
         self._effects.append(Join(peer.key, peer.hello))
 
@@ -194,9 +194,12 @@ class Edge:
         """A run of an earlier life: it is not here, but may go on where it was."""
         peer_id, asked = wire.peer_id(run.hello.run_id), run.next_keyframe
         peer = Peer(run.hello, run.key, 0, InOrder(asked), asked, run.foot, gone=True, greeted=False)
-        peer.missed = run.finding
-        self._peers[peer_id] = peer
-        self._by_key[run.key] = peer_id
+        peer.newest = run.finding
+        self._know(peer_id, peer)
+
+    def _know(self, peer_id: bytes, peer: Peer) -> None:
+        self._peers[peer_id] = self._latest[peer.hello.name] = peer
+        self._by_key[peer.key] = peer_id
 
     # ------------------------------------------------------------------ keyframes
 
@@ -256,9 +259,9 @@ class Edge:
         peer = self._peers[peer_id]
         if finding.correction is None:
             self._record(now_ns, finding.what, peer, finding.reason)
-        elif peer.gone or not peer.greeted:  # who has not been greeted takes us for our predecessor
-            peer.missed = finding
-        else:
+            return
+        peer.newest = finding
+        if not peer.gone and peer.greeted:  # who has not been greeted takes us for our predecessor
             self._correct(peer_id, peer, finding, now_ns)
 
     def _correct(self, peer_id: bytes, peer: Peer, finding: Finding, now_ns: int) -> None:
@@ -295,7 +298,8 @@ class Edge:
 
     def _report_of(self, peer: Peer) -> dict[str, Any]:
         """What is known of it beside what was heard."""
-        return self._schedule.report(peer.hello.name)
+        is_latest = self._latest[peer.hello.name] is peer
+        return self._schedule.report(peer.hello.name) if is_latest else dict.fromkeys(Schedule.REPORTED)
 
     def report(self, mapped: dict[str, Any]) -> dict[str, Any]:
         """edge.json: per agent and in all, but for `series`. mapped: the mapper's report, whose `agents` are
@@ -303,14 +307,13 @@ class Edge:
 
         An agent's earlier runs stand under their run's own key.
         """
-        newest = {peer.hello.name: peer for peer in self._peers.values()}
         of_agents = mapped.get("agents", {})
         return {
             "session": self._session,
             "policy": self._config.edge.policy,
             **mapped,
             "agents": {
-                peer.hello.name if newest[peer.hello.name] is peer else peer.key: peer.report()
+                peer.hello.name if self._latest[peer.hello.name] is peer else peer.key: peer.report()
                 | self._report_of(peer)
                 | of_agents.get(peer.key, {})
                 for peer in self._peers.values()

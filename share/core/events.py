@@ -113,10 +113,13 @@ class TrackedAfar:
 
 @dataclass(frozen=True, eq=False)
 class Localised:
-    """Where the agent is. T_map_odom: in force at this moment (blended), None before a correction."""
+    """Where the agent is. arrived_ns: when its frame came in. stretch: grows where odometry begins anew.
+    T_map_odom: in force at this moment (blended), None before a correction."""
 
     index: int
     stamp_ns: int
+    arrived_ns: int
+    stretch: int
     T_odom_body: F64
     T_map_odom: F64 | None
     map_id: str | None
@@ -143,7 +146,7 @@ class CorrectionApplied:
 
 @dataclass(frozen=True)
 class FrameDone:
-    """One per frame, once it is known whether it is sent; so a candidate's comes after it has waited.
+    """One per frame, once it is known whether it is sent; so a candidate's comes once its keyframe is made.
 
     keyframe: the tracker offered it as one. sent: it was given a keyframe id.
     """

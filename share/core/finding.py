@@ -19,9 +19,13 @@ class Finding:
     correction: Correction | None = None
 
 
-def in_map(agent: str, map_id: str, T_map_odom: F64) -> Finding:
-    """Which map a run is in, before anything moves it there. A map is named after what founded it."""
+def in_map(agent: str, map_id: str, T_map_odom: F64, about: int) -> Finding:
+    """Which map a run is in, before anything moves it there. A map is named after what founded it. about: a
+    keyframe of the stretch."""
     founds = "founds" if map_id.startswith(f"{agent}/") else "is in"
     return Finding(
-        agent, "correction", f"{founds} map {map_id}", Correction(T_map_odom, np.zeros((6, 6)), map_id, 0)
+        agent,
+        "correction",
+        f"{founds} map {map_id}",
+        Correction(T_map_odom, np.zeros((6, 6)), map_id, 0, about),
     )

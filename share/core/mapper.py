@@ -87,7 +87,7 @@ class Mapper:
         number = self._atlas.add_keyframe(agent, keyframe, leads=self._leads(agent))
         self._see(number, agent, keyframe)
         self._lookups.add(agent, served_as(self._config, self._hellos[agent]), number)
-        findings = [] if keyframe.reference >= 0 else [self._founding(agent)]
+        findings = [] if keyframe.reference >= 0 else [self._founding(agent, keyframe)]
         self._thin()
         return findings
 
@@ -121,10 +121,10 @@ class Mapper:
         """Who wears a headset sees a map move, so it is the others' maps that come to his."""
         return form_of(self._config, self._hellos[agent]) is AgentKind.AR
 
-    def _founding(self, agent: str) -> Finding:
+    def _founding(self, agent: str, keyframe: Keyframe) -> Finding:
         T, map_id = self._atlas.T_map_odom(agent), self._atlas.current_map(agent)
         assert T is not None and map_id is not None
-        return in_map(agent, map_id, T)
+        return in_map(agent, map_id, T, keyframe.id)
 
     # ------------------------------------------------------------------ what to work on
 

@@ -150,7 +150,7 @@ class ModelledMapper:
             return []
         run.map_of = run.told = f"{agent}/{keyframe.id}"
         self._T_map_world[run.map_of] = keyframe.T_odom_body @ se3.inverse(T)
-        return [in_map(agent, run.map_of, np.eye(4))]
+        return [in_map(agent, run.map_of, np.eye(4), keyframe.id)]
 
     def next_look(self) -> Step | None:
         if self._looking:
@@ -288,4 +288,4 @@ class ModelledMapper:
         T_odom_body = at.keyframe.T_odom_body
         T_map_odom = se3.orthonormal(T_map_body @ se3.inverse(T_odom_body))
         cov = se3.inverse_cov(T_odom_body, np.diag(sigma**2))
-        return Correction(T_map_odom, cov, run.map_of, 0, answer)
+        return Correction(T_map_odom, cov, run.map_of, 0, at.keyframe.id, answer)

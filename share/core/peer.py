@@ -61,7 +61,7 @@ class Peer:
     counts: Counter[str] = field(default_factory=Counter)
     revision: int = 0
     gone: bool = False
-    missed: Finding | None = None  # the newest correction while it was gone
+    newest: Finding | None = None  # the newest correction; who has been away may not have got it
     greeted: bool = True  # in this life of the edge
 
     def place(self, keyframe: Keyframe) -> tuple[Keyframe, str | None]:
@@ -119,6 +119,6 @@ def known_runs(kept: Kept) -> list[Known]:
             continue
         map_id, T_map_body = there[Key(run.key, found.id)]
         T_map_odom = se3.orthonormal(T_map_body @ se3.inverse(found.T_odom_body))
-        finding = in_map(run.key, map_id, T_map_odom)
+        finding = in_map(run.key, map_id, T_map_odom, found.id)
         out.append(Known(run.key, run.hello, Foot(found.id, found.stamp_ns), found.id + 1, finding))
     return out

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from share.config import ControlConfig
 from share.control.policies import POLICIES
@@ -27,13 +27,17 @@ class Rated(NamedTuple):
 class Schedule:
     """Of one edge. Agents are known by their names here: a new run of one begins anew."""
 
+    REPORTED: ClassVar = ("rate_hz", "qoe")
+
     def __init__(self, config: ControlConfig, policy: str) -> None:
         self._config, self._policy = config, POLICIES[policy](config)
-        self._rated: dict[str, deque[Rated]] = {}
+        self._rated: dict[str, deque[Rated]] = {}  # of all runs of that name
+        self._newest: dict[str, Rated] = {}  # of the present one
 
     def begin(self, agent: str) -> None:
         """A new run; it may send as much as it likes until it is evaluated."""
         self._policy.forget(agent)
+        self._newest.pop(agent, None)
 
     def evaluated(
         self, agent: str, kind: AgentKind, told: Evaluation, now_ns: int, t_s: float
@@ -43,12 +47,13 @@ class Schedule:
         value = qoe(told.delay_ms, told.error_cm, Needs.of(self._config, kind, agent))
         rated = Rated(*(_rounded(x) for x in (t_s, told.delay_ms, told.error_cm, value, rate_hz)))
         self._rated.setdefault(agent, deque(maxlen=_REMEMBERED)).append(rated)
+        self._newest[agent] = rated
         return rate_hz
 
     def report(self, agent: str) -> dict[str, Any]:
-        """edge.json's `rate_hz` and `qoe`, the newest."""
-        rated = self._rated.get(agent)
-        return {name: getattr(rated[-1], name) if rated else None for name in ("rate_hz", "qoe")}
+        """edge.json's `rate_hz` and `qoe`, the newest of its present run."""
+        rated = self._newest.get(agent)
+        return {name: None if rated is None else getattr(rated, name) for name in self.REPORTED}
 
     def series(self, agent: str) -> dict[str, list[float | None]]:
         """edge.json's `series`: a list for each column of `Rated`."""

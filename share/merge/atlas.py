@@ -326,5 +326,6 @@ class Atlas:
             if cov is None or trails.current(agent) != stretch or last not in trails.nodes:
                 continue  # he waits, or that odometry has ended: nothing is left to correct
             placement, name = self._chart.placement(last), self._chart.name(stretch)
-            out[agent] = Correction(placement, cov, name, 0, answers.get(agent, -1))
+            about, answer = trails.nodes[last].key.id, answers.get(agent, -1)
+            out[agent] = Correction(placement, cov, name, 0, about, answer)
         return out

@@ -38,7 +38,7 @@ from share.types import (
 )
 from share.wire import messages as m
 
-VERSION = 3
+VERSION = 4
 MAX_HEADER_BYTES = 4096
 MAX_ARRAYS = 8
 MAX_FRAME_BYTES = MAX_KEYPOINTS * DESCRIPTOR_BYTES  # the largest array of any message but Frame
@@ -254,7 +254,7 @@ _LAYOUTS: dict[type, _Layout] = {
     Correction: _Layout(
         19,
         Correction,
-        _Scalars.of(map_id=Name, revision=Int64, answers=Int64),
+        _Scalars.of(map_id=Name, revision=Int64, about=Int64, answers=Int64),
         (_pose("T_map_odom"), _Array("cov", "<f8", (6, 6))),
     ),
     m.Rate: _Layout(20, m.Rate, _Scalars.of(hz=float)),
@@ -300,14 +300,15 @@ def encode(message: m.Message) -> list[Bytes]:
     return [header, *(array.data.cast("B") if array.size else b"" for array in arrays)]
 
 
-def decode(frames: Sequence[Bytes]) -> m.Message:
-    """The message in `frames`; its arrays may be read-only views on them. Raises WireError only."""
+def decode(frames: Sequence[Bytes], versions: Sequence[int] = (VERSION,)) -> m.Message:
+    """The message in `frames`; its arrays may be read-only views on them. versions: for what was kept, those
+    in which its kind has not changed. Raises WireError only."""
     if not frames:
         raise WireError("empty message")
     if memoryview(frames[0]).nbytes > MAX_HEADER_BYTES:
         raise WireError(f"header of {memoryview(frames[0]).nbytes} bytes, at most {MAX_HEADER_BYTES}")
     try:
-        _check_version(_read_version(frames[0]).version)
+        _check_version(_read_version(frames[0]).version, versions)
         header = _read_header(frames[0])
     except _BAD as error:
         raise _wire_error("header", error) from None
@@ -331,8 +332,8 @@ def _wire_error(where: str, error: Exception) -> WireError:
     return WireError(line[:200])
 
 
-def _check_version(version: int) -> None:
-    if version != VERSION:
+def _check_version(version: int, versions: Sequence[int]) -> None:
+    if version not in versions:
         raise ValueError(f"peer speaks version {version}, this is {VERSION}; update the older one")
 
 

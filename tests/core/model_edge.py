@@ -81,7 +81,7 @@ class ModelEdge:
     def _correct(self, keyframe: Keyframe) -> m.Message:
         self.revision += 1
         T = se3.exp(np.array([0, 0, 0.001, 0.01, 0, 0]) * self.revision)
-        return Correction(T, COV, f"map-{self.session}", self.revision, keyframe.id)
+        return Correction(T, COV, f"map-{self.session}", self.revision, keyframe.id, keyframe.id)
 
 
 @dataclass

@@ -57,7 +57,8 @@ def seen_at(depth: float) -> View:
 
 
 def correction(T: np.ndarray, revision: int, answers: int = -1, map_id: str = "a") -> Correction:
-    return Correction(T, COV, map_id, revision, answers)
+    """About the stretch of the keyframe that it answers, or the first one."""
+    return Correction(T, COV, map_id, revision, max(answers, 0), answers)
 
 
 # ---------------------------------------------------------------- being connected
@@ -246,7 +247,7 @@ def test_keyframes_are_numbered_sent_and_evaluated() -> None:
     effects = handle(agent, tracked(11, pose(1), candidate=True, ms=5), 560 * MS)
     [keyframe] = only(Keyframe, effects, messages=True)
     assert (keyframe.id, keyframe.reference, keyframe.stamp_ns) == (0, -1, 10**15 + 550 * MS)
-    assert only(m.Evaluation, effects, messages=True) == [m.Evaluation(0, 8.0, 0.0)]
+    assert only(m.Evaluation, effects, messages=True) == [m.Evaluation(0, 13.0, 0.0)]
     assert only(ev.FrameDone, effects)[0].sent
 
 
@@ -390,6 +391,34 @@ def test_after_odometry_broke_only_corrections_of_the_new_stretch_count() -> Non
     [applied] = only(ev.CorrectionApplied, tell(agent, correction(pose(7), 3, answers=1), 300 * MS))
     assert applied.keyframe == 1
     np.testing.assert_array_equal(in_force(agent, 300 * MS), pose(7))
+
+
+def test_a_founding_correction_counts_though_it_overtakes_the_acknowledgement() -> None:
+    """The edge acknowledges what its disk has; the map does not wait for that."""
+    agent = welcomed()
+    handle(agent, tracked(0, candidate=True), 4 * MS)
+    tell(agent, correction(pose(1), 1), 8 * MS)
+    np.testing.assert_array_equal(in_force(agent, 50 * MS), pose(1))
+
+
+def test_a_correction_of_the_old_stretch_that_comes_late_is_not_laid_on_the_new_one() -> None:
+    agent = corrected_agent()
+    handle(agent, tracked(4, pose(0), candidate=True, new_stretch=True), 200 * MS)
+    tell(agent, m.Ack(2), 210 * MS)  # the edge has a keyframe of the new one
+    tell(agent, correction(pose(1), 1), 220 * MS)
+    assert in_force(agent, 250 * MS) is None
+
+
+def test_the_delay_is_until_the_keyframe_is_made_and_does_not_jump() -> None:
+    agent = welcomed()
+    [ping] = [p for t in (1, 500) for p in only(m.Ping, handle(agent, ev.Tick(), t * MS), messages=True)][-1:]
+    tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), ping.sent_ns + 6 * MS)
+    delays = []
+    for k, took_ms in enumerate((11, 11, 91, 11), 20):
+        handle(agent, tracked(k, pose(k), candidate=False), k * 50 * MS + 5 * MS)
+        effects = handle(agent, tracked(k, pose(k), candidate=True), k * 50 * MS + took_ms * MS)
+        delays += [told.delay_ms for told in only(m.Evaluation, effects, messages=True)]
+    assert delays == pytest.approx([17.0, 17.0, 27.0, 25.75])
 
 
 def test_a_correction_for_a_replayed_keyframe_is_not_a_latency() -> None:

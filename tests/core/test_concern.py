@@ -13,7 +13,7 @@ def correction(
     shift_m: float = 0.0, turn_deg: float = 0.0, map_id: str = "a/0", answers: int = -1
 ) -> Correction:
     T = se3.exp(np.array([0, 0, np.radians(turn_deg), shift_m, 0, 0]))
-    return Correction(T, np.eye(6), map_id, 0, answers)
+    return Correction(T, np.eye(6), map_id, 0, 0, answers)
 
 
 def test_what_moves_nobody_is_not_sent() -> None:

@@ -138,17 +138,20 @@ def test_a_restarted_agent_is_a_new_run_and_finds_its_old_map():
     }
 
 
-def test_who_was_away_is_told_what_was_missed():
+@pytest.mark.parametrize("silent_ms", [500, 3500])  # not noticed by the edge; noticed, before they meet
+def test_who_was_away_is_told_what_was_missed(silent_ms):
     both = town()
     both.walk(12)
     peer, before = both.peer("bob"), len(both.event(ev.CorrectionApplied, "bob"))
     agent = both.agents.pop(peer)  # its network is down
-    both.run(3500)
+    both.run(silent_ms)
     both.walk(12, ["ann"])  # who follows bob and sees what bob saw
     both.agents[peer] = agent
     both.run(4000)
-    assert any(r["event"] == "back" and r["agent"] == "bob" for r in both.records)
     assert len(both.event(ev.CorrectionApplied, "bob")) == before + 1
+    assert both.event(ev.Localised, "bob")[-1].map_id is not None
+    newest = {n: both.event(ev.CorrectionApplied, n)[-1].map_id for n in ("ann", "bob")}
+    assert newest["ann"] == newest["bob"]
 
 
 # ---------------------------------------------------------------- the protocol, message by message

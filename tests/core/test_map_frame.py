@@ -13,7 +13,7 @@ from share.types import Correction
 
 def placed(cov: np.ndarray, T_map_odom: np.ndarray) -> MapFrame:
     frame = MapFrame(AgentConfig())
-    frame.correct(Correction(T_map_odom, cov, "a", 1), np.eye(4), 0)
+    frame.correct(Correction(T_map_odom, cov, "a", 1, 0), np.eye(4), 0)
     return frame
 
 

@@ -61,6 +61,8 @@ def test_a_new_run_begins_anew() -> None:
         (last,) = rates(edge, 15.0, 0.1, 200 * i)
     edge.handle(ed.Received(b"a", encode(m.Bye())), 4000 * MS)
     edge.handle(ed.Received(b"b", encode(hello_of("ann", 6))), 4001 * MS)
+    reported = edge.report({})["agents"]
+    assert [agent["qoe"] for agent in reported.values()] == [None, None]  # the new run's, and the old one's
     effects = edge.handle(ed.Received(b"b", encode(m.Evaluation(0, 15.0, 0.1))), 4100 * MS)
     (first,) = [decode([bytes(f) for f in e.frames]).hz for e in effects if isinstance(e, ed.Send)]
     assert first > last

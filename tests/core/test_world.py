@@ -9,7 +9,7 @@ import pytest
 from edge_sim import Person, walls
 
 from share.config import Config, EdgeConfig
-from share.core.channel import NETWORKS, Network
+from share.core.channel import NETWORKS
 from share.core.world import Cost, Costs, Seen, World
 from share.geometry import se3
 from share.types import Candidate
@@ -90,5 +90,6 @@ def test_a_slow_tracker_makes_frames_wait_and_a_slow_edge_corrections() -> None:
 def test_an_agent_hears_its_rate() -> None:
     room = world("share")
     report = room.edge.report(room.mapper.report())["agents"]
-    assert all(agent["rate_hz"] is not None for agent in report.values())
-    assert Network().round_trip_ms == 0
+    heard = {name: told["rate_hz"] for name, told in room.reports().items()}
+    assert all(rate is not None for rate in heard.values())
+    assert {name: agent["rate_hz"] for name, agent in report.items()} == pytest.approx(heard, abs=1e-3)

@@ -20,6 +20,7 @@ from share.errors import StoreError, UsageError
 from share.io.map_store import MapStore, is_map, schema
 from share.io.map_store.rows import insert
 from share.merge.join import Key
+from share.wire import codec
 
 
 @pytest.fixture
@@ -300,3 +301,19 @@ def test_the_file_stays_bounded_when_as_many_retire_as_come(path):
         assert len(store.load().keyframes) == 60
     assert max(sizes[10:]) < 1.1 * max(sizes[:10])
     assert path.stat().st_size < 1.5 * 80 * 27_000
+
+
+def test_keyframes_of_an_earlier_wire_version_that_have_not_changed_are_read(path, monkeypatch):
+    with monkeypatch.context() as then:
+        then.setattr(codec, "VERSION", 3)
+        with MapStore.open(path) as store:
+            store.write(small_map())
+            before = told(store.load())
+    assert told(again(path)) == before
+    path.unlink()
+    monkeypatch.setattr(codec, "VERSION", 99)
+    with MapStore.open(path) as store:
+        store.write(small_map())
+    monkeypatch.undo()
+    with pytest.raises(StoreError, match=r"are of wire version 99, this SHARE reads \d+: use the SHARE that"):
+        again(path)

@@ -53,7 +53,7 @@ EXAMPLES: list[m.Message] = [
     m.Welcome(2**62, 3),
     m.Refused("the name 'ann' is taken"),
     m.Ack(4, (6, 7)),
-    Correction(POSE, np.eye(6), "map-1", 5, 3),
+    Correction(POSE, np.eye(6), "map-1", 5, 7, 3),
     m.Rate(4.5),
     m.Pong(1, 1, 2, 3, 2**62),
     frame(True),
@@ -142,7 +142,7 @@ BAD = {
     "empty message": [],
     "header of 4097 bytes": [b"\0" * 4097],
     "header: ": [b""],
-    "peer speaks version 2, this is 3; update the older one": [header(version=2)],
+    "peer speaks version 2, this is 4; update the older one": [header(version=2)],
     "peer speaks version 9": [msgspec.msgpack.encode((9, "some", {"other": "layout"}))],
     "unknown message type 99": [header(code=99)],
     "Ping: Expected `int`": [header(scalars=("a", 2))],
@@ -414,7 +414,7 @@ def test_a_second_camera_stands_somewhere() -> None:
 @pytest.mark.parametrize("bad", [-np.eye(6), np.triu(np.ones((6, 6))), 1e300 * np.eye(6)])
 def test_a_covariance_that_is_none_never_reaches_the_solver(bad: np.ndarray) -> None:
     """Sent by a peer that does not check itself: our own types refuse to build such a message."""
-    good = Correction(np.eye(4), np.eye(6), "map", 1)
+    good = Correction(np.eye(4), np.eye(6), "map", 1, 0)
     frames = [bytes(frame) for frame in codec.encode(good)]
     raw = np.eye(6).tobytes()
     spoiled = [bad.astype("<f8").tobytes() if frame == raw else frame for frame in frames]

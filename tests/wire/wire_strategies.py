@@ -91,7 +91,7 @@ messages = st.one_of(
     st.builds(m.Welcome, int64, ids),
     st.builds(m.Refused, st.text(st.characters(codec="utf-8"), max_size=m.MAX_TEXT)),
     st.builds(m.Ack, ids, st.lists(ids, max_size=m.MAX_HELD).map(tuple)),
-    st.builds(Correction, poses(), covs, names, int64, int64),
+    st.builds(Correction, poses(), covs, names, int64, int64, int64),
     st.builds(m.Rate, st.floats(0, m.MAX_RATE_HZ)),
     st.builds(m.Pong, int64, int64, int64, int64, int64),
     frames(),

@@ -29,6 +29,7 @@ COLUMNS = {
     "poses": ("keys", "T_map_body"),
 }
 
+_READABLE = (3, codec.VERSION)  # wire versions in which a Hello and a Keyframe are what they are now
 _pack = msgspec.msgpack.encode
 _frames = msgspec.msgpack.Decoder(list[bytes]).decode
 _placed = msgspec.msgpack.Decoder(list[tuple[str, int, str]]).decode
@@ -126,12 +127,12 @@ def _message(message: messages.Message) -> bytes:
 
 
 def _decoded(kind: type[M], version: int, data: bytes) -> M:
-    if version != codec.VERSION:
+    if version not in _READABLE:
         raise StoreError(
             f"keyframes in it are of wire version {version}, this SHARE reads {codec.VERSION}: "
             "use the SHARE that wrote it"
         )
-    message = codec.decode(_frames(data))
+    message = codec.decode(_frames(data), _READABLE)
     if not isinstance(message, kind):
         raise ValueError(f"is a {type(message).__name__}")
     return message
