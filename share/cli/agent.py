@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 @click.argument("source")
 @click.option("--name", required=True, help="What this agent is called; unique at its edge.")
 @click.option(
-    "--kind", type=click.Choice(["ar", "robot"]), help="Who is served.  [default: the role of --profile]"
+    "--kind",
+    type=click.Choice(["ar", "robot"]),
+    help="What this agent is: a headset (ar) or a robot.  [default: the role of --profile]",
 )
 @click.option("--edge", "address", metavar="tcp://H:P", required=True, help="Where the edge listens.")
 @options.keys
@@ -42,13 +44,18 @@ if TYPE_CHECKING:
 @click.option(
     "--link", metavar="NAME|FILE", help="Talk through an emulated network: wifi5, wifi-busy, a file."
 )
-@click.option("--link-seed", type=int, default=0, show_default=True, help="Of what that network does.")
+@click.option(
+    "--link-seed", type=int, default=0, show_default=True, help="Of that network's delays and losses."
+)
 @click.option("--streamed", is_flag=True, help="Send raw frames; the edge tracks (policy streamed).")
 @click.option("--true-error", is_flag=True, help="Tell the edge the true error of tracking, for experiments.")
 @options.calib
 @options.frames
 @live.camera
 @click.option("--out", metavar="DIR", help="Write odom.tum, map.tum, latency.csv and report.json here.")
+@click.option(
+    "--poses", metavar="udp://H:P", help="Send every pose to a program that listens there (docs/poses.md)."
+)
 @options.config
 @options.verbose
 @options.as_json
@@ -67,6 +74,7 @@ def agent(
     frames: slice | None,
     camera: live.Asked,
     out: str | None,
+    poses: str | None,
     config_file: str | None,
     verbose: bool,
     as_json: bool,
@@ -81,6 +89,7 @@ def agent(
     Example:  share agent rec/kitchen --name ann --kind ar --edge tcp://127.0.0.1:5555 --out out/ann
     """
     settings = options.load_config(config_file)
+    from share.io.pose_feed import PoseFeed
     from share.run.agent import AgentRun
     from share.run.stop import on_stop
     from share.run.stream import StreamRun
@@ -98,9 +107,10 @@ def agent(
     options.say_notes(opened)
     hello = Hello(options.agent_name(name), served, run_id, opened.rig, streamed)
     errors = None if streamed else _errors(opened, settings, true_error, line.say)
+    feed = None if poses is None else PoseFeed(poses, hello.name)
     folder = None if out is None else Path(out)
     run = (StreamRun if streamed else AgentRun)(
-        opened, hello, settings, through, folder, line.say, line.show, verbose, errors
+        opened, hello, settings, through, folder, line.say, line.show, verbose, errors, feed
     )
     with on_stop(run.stop):
         run.go()

@@ -28,6 +28,7 @@ from share.core.agent import Agent
 from share.core.sequencer import SequencerCounters
 from share.errors import DataError
 from share.io.live import LiveSource
+from share.io.pose_feed import PoseFeed
 from share.io.source import Source
 from share.io.transport import AgentLink
 from share.metrics.runlog import RunLog
@@ -79,14 +80,15 @@ class AgentRun:
         show: Callable[[Status], None] = lambda status: None,
         verbose: bool = False,
         errors: Errors | None = None,
+        poses: PoseFeed | None = None,
     ) -> None:
-        """errors: tells how wrong the tracker is."""
+        """errors: tells how wrong the tracker is. poses: who else is told where this agent is."""
         self._source, self._settings = source, settings
         self._say, self._show, self._verbose = say, show, verbose
         self._machine = Agent(hello, settings)
         self._prepare()
         self._files, self._log = AgentFiles(out, say), RunLog()
-        self._errors = Unknown() if errors is None else errors
+        self._errors, self._poses = Unknown() if errors is None else errors, poses
         self._late = Late(settings.agent.late_ms)
         self._counters = SequencerCounters()
         self._link = connect()  # last: whatever is wrong with the above has been said by now
@@ -119,6 +121,8 @@ class AgentRun:
             self.stop()
             self._files.release()
             self._link.close()
+            if self._poses is not None:
+                self._poses.close()
             tracker.join(timeout=4)
             self._errors.close()
         if self._shared.error is not None:
@@ -205,10 +209,10 @@ class AgentRun:
             case ev.Send():
                 self._link.send(effect.frames)
             case ev.Localised():
-                self._files.odom(effect.stamp_ns, effect.T_odom_body)
-                if effect.T_map_odom is not None and effect.map_id is not None:
-                    self._files.map(effect.stamp_ns, effect.T_map_odom @ effect.T_odom_body, effect.map_id)
+                self._localised(effect)
             case ev.FrameDone():
+                if self._poses is not None and not effect.state.has_pose:
+                    self._poses.tell(effect.stamp_ns, effect.state)
                 self._log.add(effect.stamp_ns, effect.track_ms, effect.state, effect.keyframe, effect.sent)
                 self._show(Status(len(self._log), self._state(effect.state), self._machine.report))
             case ev.CorrectionApplied():
@@ -223,6 +227,15 @@ class AgentRun:
                 raise effect.error
             case ev.Stop():
                 self._ended = True
+
+    def _localised(self, at: ev.Localised) -> None:
+        T_map_body = None if at.T_map_odom is None or at.map_id is None else at.T_map_odom @ at.T_odom_body
+        if self._poses is not None:  # first: somebody waits for it
+            age_ms = (time.monotonic_ns() - at.arrived_ns) / 1e6
+            self._poses.tell(at.stamp_ns, at.state, age_ms, at.stretch, at.T_odom_body, T_map_body, at.map_id)
+        self._files.odom(at.stamp_ns, at.T_odom_body)
+        if T_map_body is not None and at.map_id is not None:
+            self._files.map(at.stamp_ns, T_map_body, at.map_id)
 
     def _state(self, state: TrackState) -> str:
         waits = self._waits if state is TrackState.INITIALISING else None
