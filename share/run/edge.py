@@ -14,7 +14,7 @@ import queue
 import secrets
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -141,11 +141,13 @@ class EdgeRun:
             "refused_handshakes": self._refused.total(),
             "trouble": [*trouble, *(["the map cannot be written"] if failing else [])],
             "uptime_s": round((time.monotonic_ns() - self._began_ns) * 1e-9, 3),
+            **({} if self._solved_at is None else {"last_solve_s": round(now - self._solved_at, 3)}),
         }
 
     def _begin(self) -> None:
         """A new life: agents notice by its number, and send again what it lacks."""
         self._mapped: dict[str, Any] = {}
+        self._solved_at: float | None = None
         self._mapping: Companion | None = None
         self._keeper: Keeper | None = None
         self._trackers = Trackers(self._settings, self._answered)
@@ -201,6 +203,8 @@ class EdgeRun:
                     self._trouble[f"the tracker of {lost.key} {lost.how}"] = time.monotonic() + _UNWELL_S
                     self._handle(lost)
                 case Mapped() as mapped:
+                    if _solved(mapped.report) > _solved(self._mapped):
+                        self._solved_at = time.monotonic()
                     self._mapped = mapped.report
                 case _Said() as said:
                     self._say(said.event, said.text)
@@ -266,3 +270,8 @@ class EdgeRun:
         self._refused[line] += 1
         if self._refused[line] == 1:
             self._say("not let in", line)
+
+
+def _solved(mapped: Mapping[str, Any]) -> int:
+    """How often poses were solved for, by the mapper's report."""
+    return int(mapped.get("solve_ms", {}).get("n", 0))
