@@ -2,9 +2,10 @@
 
     python tools/make_sessions.py --out DIR [--only NAME] [--list]
 
-Names: warehouse-1 to -5 and firestation-1 to -5 (three agents, 60 s, 9 x 6 x 4 m), euroc-v1 and euroc-mh (two
-recorded flights in one room), tumvi-rooms (three recorded motions in one room). A session that is there is
-left; three to eight minutes each on two cores.
+Names: warehouse-1 to -5 and firestation-1 to -5 (three agents, 60 s, ways within 9 x 6 m), euroc-v1 and
+euroc-mh (two recorded flights in one room), tumvi-rooms (three recorded motions in one room). A session
+that is there is left; three to eight minutes each on two cores. The last three want recordings (--data), and
+are left out without.
 """
 
 from __future__ import annotations
@@ -69,12 +70,21 @@ def main() -> int:
 
 def make(chosen: dict[str, Recipe], options: argparse.Namespace) -> None:
     for name, recipe in chosen.items():
+        missing = [folder for folder in recorded(recipe) if not folder.is_dir()]
         if options.list:
             print(f"{name:15} {recipe.scene}, seed {recipe.seed}: {' '.join(recipe.motions)}")
+        elif missing and not options.only:
+            print(f"{name}: left out, there is no {missing[0]} (--data names the folder of recordings)")
         elif not (options.out / name).exists():
             print(name, file=sys.stderr)
             with Stages() as stages:
                 make_session(recipe, options.out / name, options.workers, stages)
+
+
+def recorded(recipe: Recipe) -> list[Path]:
+    """The recordings that its agents move by."""
+    specs = (motion.partition("=")[2].partition(":") for motion in recipe.motions)
+    return [Path(folder) for kind, _, folder in specs if kind in ("euroc", "tumvi")]
 
 
 if __name__ == "__main__":
