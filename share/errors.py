@@ -43,7 +43,7 @@ class StoreError(ShareError):
 
 def not_installed(packages: str, extra: str) -> str:
     """Who wants `packages` is told how to get them: with an extra of SHARE, and not in a frozen program."""
-    how = f"pip install 'share-slam[{extra}]'"
+    how = f"pip install 'share-slam[{extra}]', in a checkout .venv/bin/pip install -e '.[{extra}]'"
     if getattr(sys, "frozen", False):
         return f"this frozen program has no {packages}; use a computer with Python: {how}"
     return f"{packages} is not installed: {how}"

@@ -8,8 +8,9 @@ from share.errors import not_installed
 
 
 def test_what_is_missing_is_told_with_how_to_get_it():
-    assert (
-        not_installed("moderngl", "emulate") == "moderngl is not installed: pip install 'share-slam[emulate]'"
+    assert not_installed("moderngl", "emulate") == (
+        "moderngl is not installed: pip install 'share-slam[emulate]', "
+        "in a checkout .venv/bin/pip install -e '.[emulate]'"
     )
 
 

@@ -56,7 +56,10 @@ def is_session(folder: Path) -> bool:
 
 
 def read_session(folder: Path) -> Session:
-    """Raises ConfigError naming the key that is wrong."""
+    """Raises ConfigError naming the key that is wrong, UsageError where it is no session."""
+    if not is_session(folder):
+        what = f"has no {SESSION}" if folder.is_dir() else "there is no such folder"
+        raise UsageError(f"{folder}: {what}; give a session, by `share emulate` or `share dataset align`")
     top = read_yaml(folder / SESSION)
     schema = top.number("schema")
     if schema != SCHEMA:

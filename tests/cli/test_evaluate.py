@@ -61,6 +61,8 @@ def test_a_run_is_scored_compared_and_never_overwritten(evaluate, plain_session,
         "code": told["record"]["code"],
     }
     assert told["agents"][0]["odom_n"] == 45
+    edge = json.loads((run / "edge" / "edge.json").read_text())
+    assert ("last_solve_s" in edge) == (edge["solve_ms"]["n"] > 0)
     assert told["record"]["machine"]["cores"] >= 1
     assert told["agents"][0]["latency_ms"] == pytest.approx(float(rows[0]["latency_ms"]), rel=1e-5)
 
@@ -95,7 +97,8 @@ def test_what_is_wrong_is_said_before_anything_is_played(evaluate, plain_session
     for arguments, what in (
         (("run", plain_session, "--link", "wifi6", "--out", tmp_path / "r"), "wifi6"),
         (("run", plain_session, "--link", "bob=wifi5", "--out", tmp_path / "r"), "are ar1, ar2, robot"),
-        (("run", tmp_path, "--out", tmp_path / "r"), "session.yaml"),
+        (("run", tmp_path, "--out", tmp_path / "r"), "has no session.yaml; give a session"),
+        (("run", tmp_path / "nosuch", "--out", tmp_path / "r"), "there is no such folder; give a session"),
         (("score", tmp_path), "has no run.json"),
         (("ablation", plain_session, plain_session, "--out", tmp_path / "r"), "two sessions are called"),
     ):
