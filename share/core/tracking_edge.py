@@ -65,8 +65,7 @@ class TrackingEdge(Edge):
             self._complain(peer, str(error), now_ns)
 
     def _enter(self, peer_id: bytes, peer: Peer) -> None:
-        self._peers[peer_id] = peer
-        self._by_key[peer.key] = peer_id
+        self._know(peer_id, peer)
         window = Window(self._config.stream.window)
         self._afar[peer.key] = Afar(peer.key, peer.hello.rig, window)
 

@@ -39,9 +39,9 @@ def ratio(over: ArrayLike, under: ArrayLike, sessions: Sequence[str], rng: np.ra
     """sum(over) / sum(under), (N,) each, of pairs of runs on `sessions` (N); without pairs with a NaN."""
     a, b = np.asarray(over, np.float64), np.asarray(under, np.float64)
     known = np.isfinite(a) & np.isfinite(b)
-    _, of = np.unique(np.array(sessions, str)[known], return_inverse=True)
-    count = int(of.max(initial=-1)) + 1
-    a, b = (np.bincount(of, values[known], count) for values in (a, b))
+    names, of = np.unique(np.array(sessions, str)[known], return_inverse=True)
+    count = len(names)
+    a, b = (np.bincount(of, values[known], count).astype(np.float64) for values in (a, b))
     if not b.sum():
         return Interval(math.nan, math.nan, math.nan)
     value = float(a.sum() / b.sum())
