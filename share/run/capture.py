@@ -18,7 +18,7 @@ from typing import Any
 from share.errors import ShareError, UsageError
 from share.io.feed import Feed
 from share.io.feed_status import FeedStatus
-from share.io.mcap.recorder import Recorder
+from share.io.mcap.recorder import Recorder, left_over, part_of
 
 _TICK_S = 0.1
 _SHOW_S = 1.0
@@ -129,6 +129,8 @@ def _check_disk(out: Path, least: float) -> None:
     """Raises UsageError where a recording is not to begin."""
     if out.exists():
         raise UsageError(f"{out}: exists; give a new name, a recording is never overwritten")
+    if part_of(out).exists():
+        raise left_over(part_of(out))
     out.parent.mkdir(parents=True, exist_ok=True)
     free = shutil.disk_usage(out.parent).free
     if free < least:
@@ -140,5 +142,5 @@ def _check_disk(out: Path, least: float) -> None:
 
 def _size(out: Path) -> int:
     with contextlib.suppress(OSError):
-        return out.with_name(out.name + ".part").stat().st_size
+        return part_of(out).stat().st_size
     return 0

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from capture_bench import PICTURE, WANTED, WRAP_US, Bench, Fake, quick
 
+from share.core.measurement import Measurement
 from share.errors import ShareError, UsageError
 from share.io.feed import Feed
 from share.io.handover import Handover
+from share.io.imu_table import read_imu
 from share.io.mcap.recorder import Recorder
 from share.io.source import open_source
 from share.run.capture import Capture
@@ -112,6 +114,24 @@ def test_a_recording_is_not_overwritten_and_not_begun_on_a_full_disk(tmp_path: P
             run.go()
     assert there.read_bytes() == b"dear"
     assert list(tmp_path.iterdir()) == [there]
+
+
+def test_what_a_power_cut_left_is_not_overwritten(tmp_path: Path) -> None:
+    part, out = tmp_path / "a.mcap.part", tmp_path / "a.mcap"
+    part.write_bytes(b"dear")
+    run = Capture(Feed(_never, None, WANTED.rates_hz(), 10.0, print, Handover()), out, 0.0, print)
+    with pytest.raises(UsageError, match=rf"a\.mcap\.part: is left .* recover {part} --out {out}`, or give"):
+        run.go()
+    assert part.read_bytes() == b"dear"
+
+
+def test_of_two_recordings_of_one_name_the_second_is_refused(tmp_path: Path) -> None:
+    rig = WANTED.profile.rig()
+    with Recorder(tmp_path / "a.mcap", rig, durable=True) as first:
+        with pytest.raises(UsageError, match="or one is going on there"):
+            Recorder(tmp_path / "a.mcap", rig, durable=True)
+        first.write(Measurement("imu", 10**9, np.zeros(6)))
+    assert len(read_imu(str(tmp_path / "a.mcap")).imu.stamps_ns) == 1
 
 
 def _never(serial: str | None, epoch: int) -> Any:

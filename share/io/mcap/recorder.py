@@ -35,21 +35,37 @@ _LATCHED = {  # transient local, so that a player hands it to those who come lat
 }
 
 
+def part_of(path: Path) -> Path:
+    """The name under which the recording `path` grows."""
+    return path.with_name(path.name + ".part")
+
+
+def left_over(part: Path) -> UsageError:
+    """For who would overwrite the `.part` of another recording."""
+    return UsageError(
+        f"{part}: is left of a recording that was cut off (or one is going on there); save it with "
+        f"`share dataset recover {part} --out {part.with_suffix('')}`, or give a new name"
+    )
+
+
 class Recorder:
     """Writes measurements to an MCAP file. Context manager; an exception inside leaves the `.part`.
 
     jpeg: quality to which gray images are compressed; None keeps encoded images byte for byte and
-    raw ones raw. durable: also survives a power cut, at the price of one fdatasync a second.
-    Raises UsageError if the file cannot be made.
+    raw ones raw. durable: of what cannot be made again: survives a power cut, at the price of one fdatasync
+    a second, and overwrites no `.part`. Raises UsageError if the file cannot be made.
     """
 
     def __init__(self, path: Path, rig: Rig, jpeg: int | None = None, durable: bool = False) -> None:
         from mcap.writer import Writer
 
-        self.path, self.part = check_writable(path), path.with_name(path.name + ".part")
+        self.path, self.part = check_writable(path), part_of(path)
         self._rig, self._jpeg, self._durable = rig, jpeg, durable
         try:
-            self._file = open(self.part, "wb")  # noqa: SIM115 -- closed by close() or abort()
+            mode = "xb" if durable else "wb"
+            self._file = open(self.part, mode)  # noqa: SIM115 -- closed by close() or abort()
+        except FileExistsError:
+            raise left_over(self.part) from None
         except OSError as error:
             raise UsageError(f"{self.part}: cannot be written: {error.strerror}") from None
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
