@@ -17,6 +17,10 @@ class UsageError(ShareError):
     exit_code = 2
 
 
+class NotAttachedError(UsageError):
+    """A device that is not plugged in, or not at the moment."""
+
+
 class ConfigError(UsageError):
     """A configuration or calibration file says something that SHARE does not understand."""
 

@@ -15,7 +15,7 @@ from share.core.intake import GYRO, Intake, Sample
 from share.core.measurement import CAM0, Measurement
 from share.core.rate import Every
 from share.core.watchdog import Action, Health, Watchdog
-from share.errors import ShareError
+from share.errors import NotAttachedError, ShareError
 from share.geometry.camera import Rig
 from share.io.feed_status import FeedStatus, Rates, feed_report
 from share.io.handover import Handover
@@ -74,6 +74,7 @@ class Feed:
         self._device: Device | None = None
         self._heard: dict[str, int] = {}
         self._attempts = self._restarts = 0
+        self._reasons: set[str] = set()  # said: why the camera could not be opened again
         self._arrivals: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
         self._rates = Rates()
 
@@ -175,9 +176,17 @@ class Feed:
         try:
             device = self._connect(self.serial, self._attempts)
             device.start(self._take)
-        except ShareError:
+        except ShareError as error:
+            self._explain(error)
             self._watchdog.lost(time.monotonic_ns())
             return
         self._device = device
+        self._reasons.clear()
         self._watchdog.connected(time.monotonic_ns())
         self._say(f"camera {self.serial} is connected again; a new stretch begins")
+
+    def _explain(self, error: ShareError) -> None:
+        """Why a camera that may well be plugged in is still away; each reason once."""
+        if not isinstance(error, NotAttachedError) and str(error) not in self._reasons:
+            self._reasons.add(str(error))
+            self._say(str(error))

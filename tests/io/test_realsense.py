@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from software_camera import BASELINE, T_GYRO_IR, SoftwareCamera
+from software_camera import BASELINE, T_GYRO_IR, Listed, SoftwareCamera
 
 from share.core.intake import Sample
-from share.errors import UsageError
+from share.errors import ShareError, UsageError
 from share.io.profile import profile
+from share.io.realsense import camera as adapter
 from share.io.realsense.camera import RealSense
 from share.io.realsense.devices import Attached, choose
 from share.io.realsense.streams import Wanted
@@ -115,9 +116,41 @@ def test_without_a_camera_one_line_says_so() -> None:
         RealSense(Wanted(D435I), context=rs.context())
 
 
+class Leaving:
+    """A context or device that answers the SDK's questions up to one of them."""
+
+    def __init__(self, of: Any, last: str) -> None:
+        self._of, self._last = of, last
+
+    def __getattr__(self, name: str) -> Any:
+        if name == self._last:
+            raise RuntimeError("get_xu(ctrl=1) failed! Last Error: No such device\nand more")
+        return getattr(self._of, name)
+
+
+@pytest.mark.parametrize("last", ["query_devices", "get_info", "query_sensors"])
+def test_a_camera_that_leaves_while_it_is_asked_is_a_line(camera: SoftwareCamera, last: str) -> None:
+    context = Leaving(Listed([Leaving(camera.device, last)]), last)
+    with pytest.raises(ShareError, match=r"^RealSense camera 0123: cannot be opened: get_xu.*device; plug"):
+        RealSense(Wanted(D435I), "0123", context)
+
+
 def test_a_serial_number_that_is_not_there_lists_those_that_are(camera: SoftwareCamera) -> None:
     with pytest.raises(UsageError, match=r"serial number 99 is attached; there is 0123 \(Intel"):
         RealSense(Wanted(D435I), "99", camera.context)
+
+
+def test_a_camera_that_leaves_as_it_is_started_is_a_line_and_is_let_go(
+    camera: SoftwareCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(opened: object) -> float:
+        raise RuntimeError("gone")
+
+    monkeypatch.setattr(adapter, "_depth_unit", gone)
+    with pytest.raises(ShareError, match=r"^Intel RealSense D435I 0123: cannot be opened: gone; "):
+        RealSense(Wanted(D435I), context=camera.context).start(print)
+    monkeypatch.undo()
+    assert len(read(camera, 1, lambda: camera.turn(1, 0, 0, 0))) == 1
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from share.geometry.camera import Rig
 from share.io.realsense.devices import attached, choose
 from share.io.realsense.factory import factory_rig
 from share.io.realsense.frames import has_dots, to_sample
-from share.io.realsense.sdk import load_sdk
+from share.io.realsense.sdk import load_sdk, opening
 from share.io.realsense.streams import Opened, Wanted, choose_streams
 
 _QUEUE = {True: 2000, False: 32}  # frames between the SDK and us: of the IMU, of images
@@ -39,10 +39,11 @@ class RealSense:
         self, wanted: Wanted, serial: str | None = None, context: Any = None, epoch: int = 0
     ) -> None:
         self._rs = rs = load_sdk()
-        self._context = rs.context() if context is None else context
-        self._device = choose(attached(rs, self._context), serial, wanted.profile.device)
         self._wanted, self._epoch = wanted, epoch
-        self._opened = choose_streams(rs, self._device.handle, wanted)
+        with opening(f"RealSense camera {serial or ''}".rstrip()):
+            self._context = rs.context() if context is None else context
+            self._device = choose(attached(rs, self._context), serial, wanted.profile.device)
+            self._opened = choose_streams(rs, self._device.handle, wanted)
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self.lit = 0
@@ -53,11 +54,20 @@ class RealSense:
         return self._device.serial
 
     @property
+    def _who(self) -> str:
+        return f"{self._device.name} {self.serial}"
+
+    @property
     def rig(self) -> Rig:
-        """The factory calibration, with the profile's IMU noise; of the profile where no images are read."""
+        """The factory calibration, with the profile's IMU noise; of the profile where no images are read.
+
+        Raises ShareError, DataError."""
         stated = self._wanted.profile.rig()
         profiles = {name: profile for one in self._opened for name, profile in one.profiles.items()}
-        return factory_rig(self._rs, profiles, stated.imu) if CAM0 in profiles else stated
+        if CAM0 not in profiles:
+            return stated
+        with opening(self._who):
+            return factory_rig(self._rs, profiles, stated.imu)
 
     def start(self, sink: Sink) -> None:
         """Deliver samples to `sink`, which is called from several threads. Raises ShareError."""
@@ -65,13 +75,14 @@ class RealSense:
             moves = GYRO in one.profiles or ACCEL in one.profiles
             queue = self._rs.frame_queue(_QUEUE[moves], True)
             try:
-                self._set(one.sensor)
-                one.sensor.open(list(one.profiles.values()))
-                one.sensor.start(queue)
-            except RuntimeError as error:
+                with opening(self._who):
+                    self._set(one.sensor)
+                    one.sensor.open(list(one.profiles.values()))
+                    one.sensor.start(queue)
+                    unit = _depth_unit(one)
+            except ShareError:
                 self.stop()
-                raise ShareError(f"{self._device.name} {self.serial}: cannot be opened: {error}") from None
-            unit = _depth_unit(one)
+                raise
             thread = threading.Thread(target=self._pump, args=(queue, sink, unit), daemon=True)
             thread.start()
             self._threads.append(thread)

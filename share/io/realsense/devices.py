@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from share.core.checkup.camera import version
-from share.errors import UsageError
+from share.errors import NotAttachedError, UsageError
 from share.io.profile_types import DeviceFacts
 
 KIND = "realsense"
@@ -48,10 +48,10 @@ def attached(rs: Any, context: Any) -> list[Attached]:
 
 
 def choose(devices: list[Attached], serial: str | None, facts: DeviceFacts) -> Attached:
-    """The device `serial`, or the only one. Raises UsageError if it is not there or cannot be used."""
+    """The device `serial`, or the only one. Raises NotAttachedError, UsageError if it cannot be used."""
     listed = ", ".join(f"{device.serial} ({device.name})" for device in devices)
     if not devices:
-        raise UsageError(
+        raise NotAttachedError(
             "no RealSense camera is attached, or none may be opened; if `lsusb` shows one: `id` must show "
             "plugdev (log in again, replug), and nothing else may use it: sudo systemctl stop 'share-agent@*'"
         )
@@ -62,7 +62,7 @@ def choose(devices: list[Attached], serial: str | None, facts: DeviceFacts) -> A
     for device in devices:
         if device.serial == serial:
             return _usable(device, facts)
-    raise UsageError(f"no RealSense camera with serial number {serial} is attached; there is {listed}")
+    raise NotAttachedError(f"no RealSense camera with serial number {serial} is attached; there is {listed}")
 
 
 def _usable(device: Attached, facts: DeviceFacts) -> Attached:

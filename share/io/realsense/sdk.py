@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import Any
 
-from share.errors import UsageError, not_installed
+from share.errors import ShareError, UsageError, not_installed
 
 
 def load_sdk() -> Any:
@@ -17,3 +19,14 @@ def load_sdk() -> Any:
         hint = " (apt install libusb-1.0-0)" if "libusb" in str(error) else ""
         raise UsageError(f"pyrealsense2 cannot be loaded: {error}{hint}") from None
     return pyrealsense2
+
+
+@contextlib.contextmanager
+def opening(who: str) -> Iterator[None]:
+    """The SDK raises RuntimeError, at any question to a camera that comes or goes: here it becomes a
+    ShareError that names `who`, in one line."""
+    try:
+        yield
+    except RuntimeError as error:
+        reason, mend = str(error).partition("\n")[0], "plug it in anew, or ask `share doctor`"
+        raise ShareError(f"{who}: cannot be opened: {reason}; {mend}") from None
