@@ -32,8 +32,10 @@ class Fake:
 
     resets = 0
 
-    def __init__(self, camera: SoftwareCamera, wanted: Wanted, epoch: int) -> None:
-        self.device = RealSense(wanted, context=camera.context, epoch=epoch)
+    def __init__(
+        self, camera: SoftwareCamera, wanted: Wanted, epoch: int, say: Callable[[str], None]
+    ) -> None:
+        self.device = RealSense(wanted, context=camera.context, epoch=epoch, say=say)
         self.rig, self.serial = self.device.rig, self.device.serial
         self.start, self.stop = self.device.start, self.device.stop
 
@@ -64,7 +66,7 @@ class Bench:
     def connect(self, serial: str | None, epoch: int) -> Fake:
         if not self.there:
             raise UsageError("no camera")
-        fake = Fake(self.camera, self.wanted, epoch)
+        fake = Fake(self.camera, self.wanted, epoch, self.said.append)
         self.connected += 1
         return fake
 
@@ -87,8 +89,11 @@ class Bench:
             assert time.monotonic() < end, f"waited in vain; said: {self.said}"
             time.sleep(0.02)
 
-    def feed(self, begin_us: int, frames: int, imu: bool = True, wrap: bool = False) -> int:
-        """Frames at 30 Hz with IMU at 400 and 250 Hz; gives the stamp after them."""
+    def feed(
+        self, begin_us: int, frames: int, imu: bool = True, wrap: bool = False, host_us: int | None = None
+    ) -> int:
+        """Frames at 30 Hz with IMU at 400 and 250 Hz; gives the stamp after them. host_us: where the host's
+        clock begins, by which images are stamped then."""
         for k in range(frames):
             now = begin_us + k * 33_333
             at = [(now + i * 2500, True) for i in range(13)] + [(now + i * 4000, False) for i in range(8)]
@@ -96,8 +101,12 @@ class Bench:
                 device_us = stamp % WRAP_US if wrap else stamp
                 (self.camera.turn if turns else self.camera.force)(device_us, 0.1, 0.2, 9.8)
             for eye in (0, 1):
-                self.camera.image(eye, now % WRAP_US if wrap else now, PICTURE)
-            time.sleep(0.01)
+                if host_us is not None:
+                    host = self.camera.rs.timestamp_domain.system_time
+                    self.camera.image(eye, host_us + now - begin_us, PICTURE, host)
+                else:
+                    self.camera.image(eye, now % WRAP_US if wrap else now, PICTURE)
+            time.sleep(0.01 if host_us is None else 0.033)
         return begin_us + frames * 33_333
 
     def _go(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +15,8 @@ from share.core.stamps import StampRepair
 
 ACCEL, GYRO = "accel", "gyro"
 _ACCEL_GAP = 3.5  # expected steps of the accelerometer over which it is not interpolated
+_PARTNERS = 8  # placed stamps that are remembered, so that a pair stays one
+_HOLD_NS = 10**9  # so long samples of the host's clock wait for one of the device's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,24 +52,49 @@ class Intake:
     begins and time goes on by as much as the host's clock went on. `foreign` counts samples
     whose stamps are not of the device's clock: they are used, but a person has to know; `wraps`, `jumps`,
     `strays` and `past` are those of `StampRepair`; `streams` has the gaps of every stream of the device.
+
+    The two clocks never meet in one repair. Among samples of the device's clock those of the host's are
+    placed by when they arrived (`placed`, by stream); where the device has no clock, the host's is time.
     """
 
     def __init__(self, rates_hz: Mapping[str, float], max_jump_s: float) -> None:
         """rates_hz: of every stream that is expected."""
         self.foreign = self.stretches = self.restarts = 0
+        self.placed = dict.fromkeys(rates_hz, 0)
         self.streams = {stream: Gaps(rate) for stream, rate in rates_hz.items()}
         gap_s = _ACCEL_GAP / rates_hz.get(ACCEL, 1.0)
         self.join = InertialJoin(int(gap_s * 1e9))
         self._max_jump_s = max_jump_s
-        self._epoch = -1
+        self._source: tuple[int, bool] | None = None  # of time: epoch, and whether it is the device's clock
         self._clocks: list[_Clock] = []
+        self._held: list[Sample] = []  # of the host's clock, until the device's is known
+        self._lately: deque[tuple[int, int]] = deque(maxlen=_PARTNERS)  # (stamp, where it was placed)
         self._restart = Restart()
         self._last: tuple[int, int] | None = None  # (stamp, arrived) of the newest sample
 
     def feed(self, sample: Sample) -> Iterator[Measurement]:
         """What may now be used: mostly this sample, perhaps none or several."""
+        if sample.stream not in self.streams:
+            return
         self.foreign += not sample.hardware
-        if sample.epoch != self._epoch:
+        if sample.hardware or (self._source is not None and not self._source[1]):
+            yield from self._timed(sample)
+        elif self._last is not None:
+            yield from self._place(sample, *self._last)
+        else:
+            self._held.append(sample)
+            if sample.arrived_ns - self._held[0].arrived_ns > _HOLD_NS:
+                yield from self.end()
+
+    def end(self) -> Iterator[Measurement]:
+        """No sample of the device's clock comes: those that waited for one go by the host's."""
+        held, self._held = self._held, []
+        for sample in held:
+            yield from self._timed(sample)
+
+    def _timed(self, sample: Sample) -> Iterator[Measurement]:
+        """A sample of the clock that is time."""
+        if (sample.epoch, sample.hardware) != self._source:
             self._begin(sample)
         clock = self._clocks[-1]
         past = clock.repair.past
@@ -74,6 +102,16 @@ class Intake:
             yield from self._use(stamp, measurement.payload)
         if clock.repair.past > past:
             self._refuse(sample)
+
+    def _place(self, sample: Sample, last_ns: int, arrived_ns: int) -> Iterator[Measurement]:
+        """As long after the newest sample of the device's clock as it arrived after that."""
+        stamp = next((at for raw, at in self._lately if raw == sample.stamp_ns), None)
+        if stamp is None:  # else its partner was placed there
+            stamp = last_ns + sample.arrived_ns - arrived_ns
+            self._lately.append((sample.stamp_ns, stamp))
+        if self.streams[sample.stream].feed(stamp, sample.number):
+            self.placed[sample.stream] += 1
+            yield from self._given(stamp, sample)
 
     def _repaired(self, sample: Sample) -> Iterator[tuple[int, Measurement]]:
         clock = self._clocks[-1]
@@ -93,7 +131,8 @@ class Intake:
             stamp, arrived = self._last
             clock.offset_ns = stamp + (sample.arrived_ns - arrived) - sample.stamp_ns
         self._clocks.append(clock)
-        self._epoch = sample.epoch
+        self._source = (sample.epoch, sample.hardware)
+        self._held = []  # from before the device's clock was known
         self._restart.used()
         self.stretches += 1
 
@@ -104,15 +143,16 @@ class Intake:
             self._begin(sample)
 
     def _use(self, stamp: int, sample: Sample) -> Iterator[Measurement]:
-        gaps = self.streams.get(sample.stream)
-        if gaps is None:
-            return
-        if not gaps.feed(stamp, sample.number):
+        if not self.streams[sample.stream].feed(stamp, sample.number):
             self._refuse(sample)
             return
         self._restart.used()
         if self._last is None or stamp > self._last[0]:
             self._last = (stamp, sample.arrived_ns)
+        yield from self._given(stamp, sample)
+
+    def _given(self, stamp: int, sample: Sample) -> Iterator[Measurement]:
+        """A sample in order: an image as it is, the IMU's joined."""
         if sample.stream == GYRO:
             joined = self.join.gyro(stamp, sample.payload)
         elif sample.stream == ACCEL:

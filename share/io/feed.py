@@ -22,6 +22,7 @@ from share.io.handover import Handover
 
 _TICK_S = 0.1
 _REMEMBERED = 1000  # images whose arrival can be asked for
+_MANY = 30  # stamps of the host's clock in one stream; fewer are exceptions
 _SAID = {
     Action.RESET: "the IMU is silent; the camera is reset once",
     Action.VISION_ONLY: "the IMU stays silent; VISION_ONLY: goes on with images alone",
@@ -75,6 +76,7 @@ class Feed:
         self._heard: dict[str, int] = {}
         self._attempts = self._restarts = 0
         self._reasons: set[str] = set()  # said: why the camera could not be opened again
+        self._mixed = False  # said: some streams are of the host's clock
         self._arrivals: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
         self._rates = Rates()
 
@@ -95,6 +97,7 @@ class Feed:
                 sample = self.queue.get(_TICK_S)
                 if sample is not None:
                     yield from self._used(sample)
+            yield from self.intake.end()
         finally:
             self.close()
 
@@ -146,6 +149,9 @@ class Feed:
         if self.intake.restarts > self._restarts:
             self._restarts = self.intake.restarts
             self._say("the camera's clock began anew; so does a new stretch")
+        if not self._mixed and max(self.intake.placed.values()) >= _MANY:
+            self._mixed = True
+            self._say(_clocks(self.intake.placed))
 
     def _guard(self) -> None:
         """Feed the watchdog, and do what it asks for."""
@@ -190,3 +196,11 @@ class Feed:
         if not isinstance(error, NotAttachedError) and str(error) not in self._reasons:
             self._reasons.add(str(error))
             self._say(str(error))
+
+
+def _clocks(placed: Mapping[str, int]) -> str:
+    """Which streams are of the host's clock, in words. placed: samples of it among those of the camera's."""
+    theirs, ours = (
+        ", ".join(n for n, count in placed.items() if bool(count) is host) for host in (True, False)
+    )
+    return f"{theirs} carry the host's clock, {ours} the camera's: kernel patch missing, see docs/capture.md"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import pytest
 
@@ -40,10 +41,74 @@ def test_a_clock_that_began_anew_goes_on_as_far_as_the_hosts_did() -> None:
     assert intake.stretches == 2
 
 
-def test_stamps_of_another_clock_are_used_and_counted() -> None:
+HOST_NS = 1_760_000_000_000 * MS  # of the host's clock
+
+
+def foreign(at_ms: int, stream: str = "cam0") -> Sample:
+    return Sample(stream, HOST_NS + at_ms * MS, (0, 0, 0), at_ms * MS, hardware=False)
+
+
+def of_imu(at_ms: int, stream: str = "gyro", epoch: int = 0, off_ms: int = 0) -> Sample:
+    """By a clock that is `off_ms` ahead of the time at which it arrives."""
+    return Sample(stream, (at_ms + off_ms) * MS, (0, 0, 0), at_ms * MS, epoch=epoch)
+
+
+def test_where_the_device_has_no_clock_the_hosts_is_time() -> None:
     intake = Intake(RATES, 10.0)
-    assert stamps(intake, Sample("cam0", MS, None, 0, hardware=False)) == [MS]
-    assert intake.counts()["foreign"] == 1
+    assert stamps(intake, *(foreign(at) for at in range(0, 1001, 100))) == []
+    assert stamps(intake, foreign(1100)) == [HOST_NS + at * MS for at in range(0, 1101, 100)]
+    assert stamps(intake, foreign(1200)) == [HOST_NS + 1200 * MS]
+    assert (intake.counts()["foreign"], intake.stretches) == (13, 1)
+    assert not any(intake.placed.values())
+
+
+def test_a_short_recording_by_the_hosts_clock_is_used_at_its_end() -> None:
+    intake = Intake(RATES, 10.0)
+    assert stamps(intake, foreign(0), foreign(33)) == []
+    assert [m.stamp_ns - HOST_NS for m in intake.end()] == [0, 33 * MS]
+    assert list(intake.end()) == []
+
+
+def test_images_of_the_hosts_clock_leave_the_imu_alone_and_keep_to_it() -> None:
+    intake, images, imu = Intake(RATES | {"cam1": 30.0}, 10.0), [], []
+    for at in range(4000):
+        more = [foreign(at), foreign(at, "cam1")] if at % 33 == 0 else []
+        for sample in (*more, of_imu(at, "accel", off_ms=5000), of_imu(at, off_ms=5000)):
+            for m in intake.feed(sample):
+                (imu if m.stream == "imu" else images).append((m.stream, m.stamp_ns // MS))
+    assert [stamp for _, stamp in imu] == list(range(5000, 9000))
+    assert images == [(cam, 5000 + at) for at in range(33, 4000, 33) for cam in ("cam0", "cam1")]
+    counts = intake.counts()
+    assert (counts["jumps"], counts["past"], counts["restarts"], intake.stretches) == (0, 0, 0, 1)
+    assert (intake.placed["cam0"], intake.placed["gyro"], counts["foreign"]) == (121, 0, 244)
+
+
+def test_a_few_images_of_the_hosts_clock_do_not_move_the_cameras() -> None:
+    intake, told = Intake({"cam0": 30.0}, 10.0), []
+    for k in range(3000):
+        at = 33 * k
+        told += stamps(intake, foreign(at) if k % 500 > 497 else of_imu(at, "cam0", off_ms=70_000))
+    assert told == [(70_000 + 33 * k) * MS for k in range(3000)]
+    assert (intake.streams["cam0"].missing, intake.restarts, intake.stretches) == (0, 0, 1)
+
+
+def test_a_clock_of_the_device_that_comes_late_takes_over() -> None:
+    intake = Intake(RATES, 10.0)
+    stamps(intake, *(foreign(at) for at in range(0, 2001, 100)))
+    assert stamps(intake, of_imu(2050, "cam0"), foreign(2100)) == [HOST_NS + 2050 * MS, HOST_NS + 2100 * MS]
+    assert intake.placed["cam0"] == 1
+
+
+def test_after_a_reconnection_images_of_the_hosts_clock_wait_for_nobody() -> None:
+    intake = Intake(RATES, 10.0)
+    told = stamps(
+        intake,
+        of_imu(100, "cam0", off_ms=900),
+        replace(foreign(3000), epoch=1),
+        of_imu(3050, "cam0", epoch=1, off_ms=-3000),
+    )
+    assert told == [1000 * MS, 3900 * MS, 3950 * MS]
+    assert intake.stretches == 2
 
 
 def test_a_stream_that_was_not_asked_for_is_left_out() -> None:

@@ -40,6 +40,30 @@ def test_a_clock_that_begins_anew_without_a_disconnection_begins_a_new_stretch(t
     assert bench.said == ["the camera's clock began anew; so does a new stretch"]
 
 
+def test_images_by_the_hosts_clock_do_not_cost_the_imu(tmp_path: Path) -> None:
+    with Bench(tmp_path / "a.mcap") as bench:
+        bench.feed(1_000_000, 60, host_us=1_760_000_000_000_000)
+    source = open_source(str(tmp_path / "a.mcap"))
+    stamps = source.stamps()
+    assert len(stamps["imu"]) == bench.report["imu"] > 0.95 * 60 * 13
+    assert len(stamps["cam0"]) > 55
+    np.testing.assert_array_equal(stamps["cam1"], stamps["cam0"])
+    assert 0.8 * 10**9 < stamps["cam0"][0] < 3 * 10**9
+    assert bench.said == [
+        "cam0, cam1 carry the host's clock, accel, gyro the camera's: "
+        "kernel patch missing, see docs/capture.md"
+    ]
+
+
+def test_an_interleaved_emitter_without_metadata_is_said_and_all_is_kept(tmp_path: Path) -> None:
+    device = replace(WANTED.profile.device, emitter="interleaved")
+    with Bench(tmp_path / "a.mcap", wanted=Wanted(replace(WANTED.profile, device=device))) as bench:
+        bench.feed(1_000_000, 10)
+    assert bench.report["streams"]["cam0"]["samples"] == 10
+    assert len(bench.said) == 1
+    assert "which of them have dots, so all are kept" in bench.said[0]
+
+
 def test_without_images_the_imu_alone_is_recorded(tmp_path: Path) -> None:
     with Bench(tmp_path / "a.mcap", wanted=replace(WANTED, images=False)) as bench:
         for k in range(400):

@@ -23,6 +23,10 @@ from share.io.realsense.streams import Opened, Wanted, choose_streams
 _QUEUE = {True: 2000, False: 32}  # frames between the SDK and us: of the IMU, of images
 _WAIT_MS = 100
 _DEPTH_UNIT_M = 0.001
+_UNKNOWN_DOTS = (
+    "emitter interleaved: images do not tell which of them have dots, so all are kept: kernel patch missing, "
+    "see docs/capture.md"
+)
 
 Sink = Callable[[Sample], None]
 
@@ -31,15 +35,21 @@ class RealSense:
     """A camera that is connected. `start` reads it in threads of its own, one for each sensor.
 
     Context manager; leaving it disconnects. Frames come through `frame_queue`s of the sensors and not
-    by the SDK's pipeline, which loses IMU samples. `lit` counts images left out for their dots.
+    by the SDK's pipeline, which loses IMU samples. `lit` counts images left out for their dots. `say` is
+    told, in any thread, what a person has to know.
     Raises UsageError where no such camera can be used, ShareError where it cannot be opened.
     """
 
     def __init__(
-        self, wanted: Wanted, serial: str | None = None, context: Any = None, epoch: int = 0
+        self,
+        wanted: Wanted,
+        serial: str | None = None,
+        context: Any = None,
+        epoch: int = 0,
+        say: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._rs = rs = load_sdk()
-        self._wanted, self._epoch = wanted, epoch
+        self._wanted, self._epoch, self._say = wanted, epoch, say
         with opening(f"RealSense camera {serial or ''}".rstrip()):
             self._context = rs.context() if context is None else context
             self._device = choose(attached(rs, self._context), serial, wanted.profile.device)
@@ -47,6 +57,7 @@ class RealSense:
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self.lit = 0
+        self._told = False  # that nobody knows which images have dots
 
     @property
     def serial(self) -> str:
@@ -132,12 +143,20 @@ class RealSense:
             if not there:
                 continue
             sample = to_sample(self._rs, frame, depth_unit_m, time.monotonic_ns(), self._epoch)
-            if not (self._wanted.interleaved and sample.stream in (CAM0, CAM1)):
-                sink(sample)
-            elif has_dots(self._rs, frame):
-                self.lit += 1
-            else:  # numbers count the images with dots too, which are not missing
-                sink(replace(sample, number=None))
+            if self._wanted.interleaved and sample.stream in (CAM0, CAM1):
+                if self._lit(frame):
+                    self.lit += 1
+                    continue
+                sample = replace(sample, number=None)  # it counts those with dots too, which are not missing
+            sink(sample)
+
+    def _lit(self, frame: Any) -> bool:
+        """Whether an image is known to have dots."""
+        dots = has_dots(self._rs, frame)
+        if dots is None and not self._told:
+            self._told = True
+            self._say(_UNKNOWN_DOTS)
+        return bool(dots)
 
 
 def _depth_unit(one: Opened) -> float:

@@ -20,7 +20,7 @@ def feed_of(
 ) -> Feed:
     """What the camera delivers. It is not opened yet."""
     return Feed(
-        lambda serial, epoch: RealSense(wanted, serial, epoch=epoch),
+        lambda serial, epoch: RealSense(wanted, serial, epoch=epoch, say=say),
         serial_of(spec),
         wanted.rates_hz(),
         config.max_jump_s,

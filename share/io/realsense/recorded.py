@@ -85,6 +85,7 @@ class RecordedSource(Source):
         intake = Intake({name: self._rate_of(name) for name in used}, SequencerConfig().max_jump_s)
         for sample in self._file.samples(images):
             yield from intake.feed(sample)
+        yield from intake.end()
 
     def _rate_of(self, stream: str) -> float:
         return float(self._file.told(f"{self._file.streams[stream]}/info").get("fps", "30"))
