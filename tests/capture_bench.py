@@ -36,7 +36,7 @@ class Fake:
         self, camera: SoftwareCamera, wanted: Wanted, epoch: int, say: Callable[[str], None]
     ) -> None:
         self.device = RealSense(wanted, context=camera.context, epoch=epoch, say=say)
-        self.rig, self.serial = self.device.rig, self.device.serial
+        self.rig, self.serial, self.rates_hz = self.device.rig, self.device.serial, self.device.rates_hz
         self.start, self.stop = self.device.start, self.device.stop
 
     def reset(self) -> None:

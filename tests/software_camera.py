@@ -26,7 +26,8 @@ class Listed:
 class SoftwareCamera:
     """Stereo infrared, depth and an IMU with the names and profiles of a D435i. `rs`: pyrealsense2.
 
-    rate_hz: of images; lens: fx, fy, cx, cy of all of them, px; depth: it has a depth stream too."""
+    rate_hz: of images; lens: fx, fy, cx, cy of all of them, px; depth: it has a depth stream too. accel_hz,
+    gyro_hz: all that the IMU offers; it delivers by the first."""
 
     def __init__(
         self,
@@ -37,6 +38,8 @@ class SoftwareCamera:
         rate_hz: int = 30,
         lens: tuple[float, float, float, float] = (385.0, 386.0, 320.5, 239.5),
         depth: bool = False,
+        accel_hz: tuple[int, ...] = (250,),
+        gyro_hz: tuple[int, ...] = (400,),
     ) -> None:
         self.rs, self.device = rs, rs.software_device()
         self._rate_hz, self._lens = rate_hz, lens
@@ -51,8 +54,8 @@ class SoftwareCamera:
         if depth:
             self.stereo.add_read_only_option(rs.option.depth_units, DEPTH_UNIT_M)
         self.depth = self._video(rs.stream.depth, 0) if depth else None
-        self.accel = self._inertial(rs.stream.accel, 3, 250)
-        self.gyro = self._inertial(rs.stream.gyro, 4, 400)
+        self.accel, *_ = [self._inertial(rs.stream.accel, 3, hz) for hz in accel_hz]
+        self.gyro, *_ = [self._inertial(rs.stream.gyro, 4, hz) for hz in gyro_hz]
         self.cam[0].register_extrinsics_to(self.cam[1], self._shift(-BASELINE, 0.0, 0.0))
         if depth:
             self.cam[0].register_extrinsics_to(self.depth, self._shift(0.0, 0.0, 0.0))

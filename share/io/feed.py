@@ -39,6 +39,9 @@ class Device(Protocol):
     @property
     def serial(self) -> str: ...
 
+    @property
+    def rates_hz(self) -> Mapping[str, float]: ...
+
     def start(self, sink: Callable[[Sample], None]) -> None: ...
 
     def stop(self) -> None: ...
@@ -66,9 +69,10 @@ class Feed:
         queue: Handover,
         watchdog: MakeWatchdog = Watchdog,
     ) -> None:
-        """rates_hz: of every stream that is expected."""
+        """rates_hz: of every stream that is expected, until the device says its own."""
         self._connect, self._say, self.queue = connect, say, queue
         self.serial, self.intake = serial, Intake(rates_hz, max_jump_s)
+        self._max_jump_s = max_jump_s
         self._watchdog = watchdog(time.monotonic_ns(), CAM0 in rates_hz, GYRO in rates_hz)
         self._tick = Every(_TICK_S)
         self._stop = threading.Event()
@@ -84,6 +88,7 @@ class Feed:
         """Connect; samples come from now on, and wait. Raises UsageError, ShareError, DataError."""
         device = self._connect(self.serial, 0)
         rig, self.serial = device.rig, device.serial
+        self.intake = Intake(device.rates_hz, self._max_jump_s)
         device.start(self._take)
         self._device = device
         self._watchdog.connected(time.monotonic_ns())

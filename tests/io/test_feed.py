@@ -24,6 +24,7 @@ class Fake:
 
     rig: Rig = field(default_factory=profile("d435i").rig)
     serial: str = "0123"
+    rates_hz: dict[str, float] = field(default_factory=lambda: dict(RATES))
     sink: Callable[[Sample], None] = print
 
     def start(self, sink: Callable[[Sample], None]) -> None:
@@ -78,3 +79,16 @@ def test_why_a_camera_is_still_away_is_said_once_unless_it_is_just_not_there() -
         "is on USB 2.1, too slow",
         "camera 0123 is connected again; a new stretch begins",
     ]
+
+
+def test_gaps_are_told_by_the_rates_that_the_camera_has() -> None:
+    slow = Fake(rates_hz=RATES | {"accel": 100.0})
+    feed = Feed(lambda serial, epoch: slow, None, RATES, 10.0, print, Handover())
+    feed.open()
+    for at_ms in range(0, 1000, 10):
+        for stream in ("accel", "gyro"):
+            slow.sink(Sample(stream, at_ms * 10**6, (0, 0, 0), at_ms * 10**6))
+    feed.stop()
+    joined = list(feed.measurements())
+    assert len(joined) == 100
+    assert (feed.intake.streams["accel"].gaps, feed.intake.streams["gyro"].gaps) == (0, 99)

@@ -111,6 +111,30 @@ def test_a_mode_that_the_camera_lacks_is_named(camera: SoftwareCamera) -> None:
         RealSense(Wanted(D435I, depth=True), context=camera.context)
 
 
+@pytest.mark.parametrize(
+    ("offered", "taken"), [((100, 200), 200), ((63, 100), 100), ((200, 250), 250), ((63,), 63)]
+)
+def test_an_imu_with_other_rates_is_read_at_the_best_of_them(offered: tuple[int, ...], taken: int) -> None:
+    said: list[str] = []
+    with RealSense(
+        Wanted(D435I), context=SoftwareCamera(rs, accel_hz=offered).context, say=said.append
+    ) as one:
+        one.start(print)
+        assert (one.rates_hz["accel"], one.rates_hz["gyro"], one.rates_hz["cam0"]) == (taken, 400, 30)
+    told = [f"the camera has no accel at 250 Hz: takes {taken} Hz"]
+    assert said == ([] if taken == 250 else told)
+
+
+def test_the_rate_of_the_gyroscope_that_is_read_is_in_the_rig() -> None:
+    imu = RealSense(Wanted(D435I), context=SoftwareCamera(rs, gyro_hz=(200,)).context).rig.imu
+    assert imu is not None and imu.rate_hz == 200
+
+
+def test_an_imu_with_none_of_the_rates_is_named() -> None:
+    with pytest.raises(UsageError, match=r"does not offer accel \(250 or 200 or 100 or 63 Hz\)"):
+        RealSense(Wanted(D435I), context=SoftwareCamera(rs, accel_hz=(50,)).context)
+
+
 def test_without_a_camera_one_line_says_so() -> None:
     with pytest.raises(UsageError, match=r"no RealSense camera is attached, or none may.*plugdev.*stop"):
         RealSense(Wanted(D435I), context=rs.context())

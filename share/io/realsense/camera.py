@@ -18,7 +18,7 @@ from share.io.realsense.devices import attached, choose
 from share.io.realsense.factory import factory_rig
 from share.io.realsense.frames import has_dots, to_sample
 from share.io.realsense.sdk import load_sdk, opening
-from share.io.realsense.streams import Opened, Wanted, choose_streams
+from share.io.realsense.streams import Opened, Wanted, choose_streams, rates_hz
 
 _QUEUE = {True: 2000, False: 32}  # frames between the SDK and us: of the IMU, of images
 _WAIT_MS = 100
@@ -65,6 +65,11 @@ class RealSense:
         return self._device.serial
 
     @property
+    def rates_hz(self) -> dict[str, float]:
+        """Of every stream that is read."""
+        return rates_hz(self._opened, self._wanted)
+
+    @property
     def _who(self) -> str:
         return f"{self._device.name} {self.serial}"
 
@@ -74,6 +79,8 @@ class RealSense:
 
         Raises ShareError, DataError."""
         stated = self._wanted.profile.rig()
+        if stated.imu is not None:
+            stated = replace(stated, imu=replace(stated.imu, rate_hz=self.rates_hz[GYRO]))
         profiles = {name: profile for one in self._opened for name, profile in one.profiles.items()}
         if CAM0 not in profiles:
             return stated
@@ -82,6 +89,9 @@ class RealSense:
 
     def start(self, sink: Sink) -> None:
         """Deliver samples to `sink`, which is called from several threads. Raises ShareError."""
+        for name, stated_hz in self._wanted.rates_hz().items():
+            if abs(self.rates_hz[name] - stated_hz) > 1:
+                self._say(f"the camera has no {name} at {stated_hz:g} Hz: takes {self.rates_hz[name]:g} Hz")
         for one in self._opened:
             moves = GYRO in one.profiles or ACCEL in one.profiles
             queue = self._rs.frame_queue(_QUEUE[moves], True)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from share.core.intake import ACCEL, GYRO
 from share.core.measurement import CAM0, CAM1, DEPTH
 from share.errors import UsageError
-from share.io.profile_types import Profile
+from share.io.profile_types import Inertial, Profile
+
+_ENOUGH_HZ = 100  # of an IMU; slower ones are taken only where there is nothing else
+Fits = Callable[[Any], bool]  # whether a profile of the SDK is the one
 
 
 @dataclass(frozen=True)
@@ -49,12 +53,12 @@ class Opened:
 
 def choose_streams(rs: Any, device: Any, wanted: Wanted) -> list[Opened]:
     """Sensors and profiles for all that is wanted. Raises UsageError naming what the device lacks."""
-    missing = {name: _matcher(rs, name, wanted) for name in wanted.rates_hz()}
+    missing = {name: _matchers(rs, name, wanted) for name in wanted.rates_hz()}
     out = []
     for sensor in device.query_sensors():
-        found = {}
-        for name, (fits, _) in list(missing.items()):
-            profile = next((p for p in sensor.get_stream_profiles() if fits(p)), None)
+        found, offered = {}, sensor.get_stream_profiles()
+        for name, (matchers, _) in list(missing.items()):
+            profile = next((p for fits in matchers for p in offered if fits(p)), None)
             if profile is not None:
                 found[name] = profile
                 del missing[name]
@@ -66,14 +70,31 @@ def choose_streams(rs: Any, device: Any, wanted: Wanted) -> list[Opened]:
     return out
 
 
-def _matcher(rs: Any, name: str, wanted: Wanted) -> tuple[Any, str]:
-    """What knows the stream's profile, and words for it."""
+def rates_hz(opened: list[Opened], wanted: Wanted) -> dict[str, float]:
+    """Of every stream as it comes: an IMU may have other rates than the profile states."""
+    inertial = {
+        name: float(profile.fps())
+        for one in opened
+        for name, profile in one.profiles.items()
+        if name in (ACCEL, GYRO)
+    }
+    return wanted.rates_hz() | inertial
+
+
+def preferred_hz(facts: Inertial) -> list[float]:
+    """An IMU's rates, best first: as stated, then the nearest of those that are enough, then the others."""
+    return sorted(
+        facts.rates_hz, key=lambda hz: (hz != facts.rate_hz, hz < _ENOUGH_HZ, abs(hz - facts.rate_hz))
+    )
+
+
+def _matchers(rs: Any, name: str, wanted: Wanted) -> tuple[list[Fits], str]:
+    """What knows the stream's profile, the best first, and words for it."""
     imu = wanted.profile.device.imu
     if name in (ACCEL, GYRO):
-        kind, hz = (
-            (rs.stream.accel, imu.accel.rate_hz) if name == ACCEL else (rs.stream.gyro, imu.gyro.rate_hz)
-        )
-        return lambda p: p.stream_type() == kind and abs(p.fps() - hz) <= 1, f"{hz:g} Hz"
+        kind, facts = (rs.stream.accel, imu.accel) if name == ACCEL else (rs.stream.gyro, imu.gyro)
+        rates = preferred_hz(facts)
+        return [_motion(kind, hz) for hz in rates], f"{' or '.join(f'{hz:g}' for hz in rates)} Hz"
     stream = {CAM0: (rs.stream.infrared, 1), CAM1: (rs.stream.infrared, 2), DEPTH: (rs.stream.depth, 0)}[name]
     form = rs.format.z16 if name == DEPTH else rs.format.y8
     mode, hz = wanted.profile.mode, wanted.profile.rate_hz
@@ -84,4 +105,8 @@ def _matcher(rs: Any, name: str, wanted: Wanted) -> tuple[Any, str]:
         video = p.as_video_stream_profile()
         return bool((video.width(), video.height()) == (mode.width, mode.height))
 
-    return fits, f"{mode.width}x{mode.height}@{hz:g}"
+    return [fits], f"{mode.width}x{mode.height}@{hz:g}"
+
+
+def _motion(kind: Any, hz: float) -> Fits:
+    return lambda p: bool(p.stream_type() == kind and abs(p.fps() - hz) <= 1)
