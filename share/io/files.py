@@ -8,6 +8,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 from share.errors import ShareError, UsageError
 
@@ -112,6 +113,28 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+@contextlib.contextmanager
+def new_file(out: Path) -> Iterator[IO[bytes]]:
+    """A file beside `out` to write into; it is made durable and becomes `out` when the block is done. On
+    error: nothing.
+
+    Raises UsageError if `out` is there or cannot be made; ShareError if the disk is full or fails.
+    """
+    if check_writable(out).exists():
+        raise UsageError(f"{out}: exists and is not overwritten; give a new name")
+    handle, name = tempfile.mkstemp(prefix=f".{out.name}.", dir=out.parent)
+    try:
+        with writing(out), os.fdopen(handle, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+            os.chmod(name, 0o666 & ~_umask())  # mkstemp makes it private
+            os.replace(name, out)
+    finally:
+        Path(name).unlink(missing_ok=True)
+    sync_folder(out.parent)
 
 
 @contextlib.contextmanager

@@ -79,7 +79,8 @@ def open_source(spec: str, calib: str | None = None, frames: slice | None = None
             return reader.open(path, calibration, frames)
     _existing(path, "SOURCE")
     if path.name.endswith(".mcap.part"):
-        raise UsageError(f"{path}: was not closed; `share dataset recover {path} --out {path.stem}` saves it")
+        saves = f"`share dataset recover {path} --out {path.with_suffix('')}` saves it"
+        raise UsageError(f"{path}: was not closed; {saves}")
     if is_session(path):
         agents = ", ".join(str(path / name) for name in read_session(path).agents)
         raise UsageError(f"{spec}: is a session; name one of its agents: {agents}")

@@ -61,6 +61,7 @@ def test_convert_and_recover(walk, tmp_path):
     text = good("recover", first, "--out", saved)
     assert text.startswith(f"{saved}: ")
     assert json.loads(good("info", saved, "--json"))["streams"]["cam0"]["count"] == 6
+    assert "exists and is not overwritten" in bad(2, "recover", first, "--out", saved)
 
 
 def test_convert_to_euroc_and_jpeg(walk, tmp_path):

@@ -1,5 +1,7 @@
 """Recordings that were cut off or damaged: refused with a hint, and recovered as far as they are whole."""
 
+import errno
+import io
 import os
 import signal
 import subprocess
@@ -10,7 +12,7 @@ import pytest
 from live import RIG, frames, live
 from recordings import STEP_NS, make_tum
 
-from share.errors import DataError, UsageError
+from share.errors import DataError, ShareError, UsageError
 from share.io.convert import to_mcap
 from share.io.mcap.recorder import Recorder
 from share.io.mcap.recover import recover
@@ -75,6 +77,70 @@ def test_a_flipped_bit_costs_one_chunk(tmp_path):
     assert 60 < left < 100
 
 
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (OSError(errno.EIO, "Input/output error"), "Input/output error"),
+        (MemoryError(), "damaged: MemoryError"),
+    ],
+)
+def test_a_disk_that_cannot_be_read_to_its_end_costs_what_is_behind(tmp_path, monkeypatch, error, says):
+    path = record(tmp_path / "whole.mcap", 100)
+    half = path.stat().st_size // 2
+
+    class Worn(io.FileIO):
+        def readinto(self, buffer):
+            if self.tell() + len(buffer) > half:
+                raise error
+            return super().readinto(buffer)
+
+    monkeypatch.setattr("builtins.open", lambda name, mode: io.BufferedReader(Worn(name, mode)))
+    result = recover(path, tmp_path / "good.mcap")
+    monkeypatch.undo()
+    assert says in result.reason
+    assert 0.3 * path.stat().st_size < result.lost_bytes < 0.8 * path.stat().st_size
+    assert open_source(str(tmp_path / "good.mcap")).images_count > 20
+
+
+def test_a_chunk_that_takes_more_memory_than_there_is_is_left_out(tmp_path, monkeypatch):
+    from mcap import stream_reader
+
+    path, opened, chunks = record(tmp_path / "whole.mcap", 100), stream_reader.breakup_chunk, iter(range(99))
+
+    def greedy(chunk, validate_crc):
+        if next(chunks) == 3:
+            raise MemoryError
+        return opened(chunk, validate_crc)
+
+    monkeypatch.setattr(stream_reader, "breakup_chunk", greedy)
+    assert recover(path, tmp_path / "good.mcap").reason == "damaged: MemoryError"
+    assert 60 < open_source(str(tmp_path / "good.mcap")).images_count < 100
+
+
+def test_other_recordings_are_left_alone(tmp_path):
+    whole = record(tmp_path / "whole.mcap", 20)
+    other, part = tmp_path / "a.mcap", tmp_path / "b.mcap.part"
+    other.write_bytes(b"dear")
+    part.write_bytes(b"dear too")
+    with pytest.raises(UsageError, match=r"a\.mcap: exists and is not overwritten; give a new name"):
+        recover(whole, other)
+    recover(whole, tmp_path / "b.mcap")
+    assert (other.read_bytes(), part.read_bytes()) == (b"dear", b"dear too")
+    assert sorted(os.listdir(tmp_path)) == ["a.mcap", "b.mcap", "b.mcap.part", "whole.mcap"]
+    assert (tmp_path / "b.mcap").stat().st_mode & 0o777 == whole.stat().st_mode & 0o777
+
+
+def test_a_full_disk_is_not_taken_for_a_broken_recording(tmp_path, monkeypatch):
+    def full(*arguments):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    whole = record(tmp_path / "whole.mcap", 20)
+    monkeypatch.setattr("mcap.writer.Writer.add_message", full)
+    with pytest.raises(ShareError, match=r"good\.mcap: cannot be written: No space left"):
+        recover(whole, tmp_path / "good.mcap")
+    assert os.listdir(tmp_path) == ["whole.mcap"]
+
+
 def test_sigkill_leaves_a_file_that_can_be_recovered(tmp_path):
     """A real recorder in a real process, killed in mid-run: at most the last second is missing."""
     out = tmp_path / "walk.mcap"
@@ -96,7 +162,7 @@ def test_sigkill_leaves_a_file_that_can_be_recovered(tmp_path):
     process.wait()
     process.stdout.close()
     assert os.listdir(tmp_path) == ["walk.mcap.part"]
-    with pytest.raises(UsageError, match="was not closed; `share dataset recover"):
+    with pytest.raises(UsageError, match=f"was not closed; `share dataset recover {out}.part --out {out}`"):
         open_source(str(out) + ".part")
     recover(tmp_path / "walk.mcap.part", out)
     stamps = open_source(str(out)).stamps()["cam0"]

@@ -29,13 +29,24 @@ class Topic(NamedTuple):
 
 
 def damage() -> tuple[type[Exception], ...]:
-    """What the mcap library raises on a damaged file."""
+    """What the mcap library raises on a damaged file, and the system on a damaged disk."""
     import zstandard
     from mcap.exceptions import McapError
     from mcap.stream_reader import CRCValidationError
 
     return (McapError, CRCValidationError, zstandard.ZstdError, zlib.error, struct.error, UnicodeDecodeError,
-            EOFError, RuntimeError, KeyError, OverflowError)  # fmt: skip
+            EOFError, RuntimeError, KeyError, OverflowError, OSError, MemoryError)  # fmt: skip
+
+
+def check_magic(path: Path) -> None:
+    """Raises UsageError for a file that cannot be read, DataError for one that is no MCAP."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(len(MAGIC))
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    if head != MAGIC:
+        raise DataError(f"{path}: is not an MCAP file, or is empty")
 
 
 class McapFile:
@@ -43,13 +54,7 @@ class McapFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            with open(path, "rb") as file:
-                head = file.read(len(MAGIC))
-        except OSError as error:
-            raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
-        if head != MAGIC:
-            raise DataError(f"{path}: is not an MCAP file, or is empty")
+        check_magic(path)
         self._check_index()
 
     @cached_property
@@ -103,9 +108,7 @@ class McapFile:
         with open(self.path, "rb") as file:
             try:
                 return self._reader(file).get_summary()
-            except damage():
-                raise self._broken("it has no end") from None
-            except OSError:  # shorter than a footer
+            except damage():  # OSError: it is shorter than a footer
                 raise self._broken("it has no end") from None
 
     def _check_index(self) -> None:

@@ -9,11 +9,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import IO, Any, BinaryIO, NamedTuple
 
 from share.errors import DataError, UsageError
-from share.io.files import check_writable, sync_folder, writing
-from share.io.mcap.file import MAGIC, damage
+from share.io.files import new_file
+from share.io.mcap.file import check_magic, damage
 
 
 class Recovered(NamedTuple):
@@ -27,44 +27,33 @@ class Recovered(NamedTuple):
 def recover(path: Path, out: Path, progress: Callable[[int], None] = lambda _: None) -> Recovered:
     """Copy what is whole from `path` to `out`; `progress` is told how many more bytes are read.
 
-    Raises UsageError for paths that cannot be used, DataError if nothing can be saved.
+    Raises UsageError for paths that cannot be used, DataError if nothing can be saved, ShareError if the disk
+    of `out` is full or fails.
     """
+    check_magic(path)
     if out.exists() and out.samefile(path):
         raise UsageError(f"--out {out}: is the broken file itself; give another name")
-    part = check_writable(out).with_name(out.name + ".part")
-    if part.exists() and part.samefile(path):
-        part = out.with_name(out.name + ".recovering")
-    try:
-        with writing(out):
-            result = _copy(path, part, progress)
+    with open(path, "rb") as file, new_file(out) as target:
+        result = _copy(file, target, progress)
         if not result.messages:
             raise DataError(f"{path}: holds no complete message ({result.reason or 'it is empty'})")
-        os.replace(part, out)
-        sync_folder(out.parent)
-    finally:
-        part.unlink(missing_ok=True)
     return result
 
 
-def _copy(path: Path, part: Path, progress: Callable[[int], None]) -> Recovered:
+def _copy(file: BinaryIO, target: IO[bytes], progress: Callable[[int], None]) -> Recovered:
     from mcap.writer import Writer
 
-    with open(path, "rb") as file, open(part, "wb") as target:
-        if file.read(len(MAGIC)) != MAGIC:
-            raise DataError(f"{path}: is not an MCAP file, or is empty")
-        file.seek(0)
-        writer = Writer(target, chunk_size=256 * 1024)
-        writer.start(profile="ros2", library="share")
-        copier = _Copier(writer)
-        lost, reason = _copy_records(file, copier, progress)
-        writer.finish()
-        target.flush()
-        os.fsync(target.fileno())
+    writer = Writer(target, chunk_size=256 * 1024)
+    writer.start(profile="ros2", library="share")
+    copier = _Copier(writer)
+    lost, reason = _copy_records(file, copier, progress)
+    writer.finish()
     return Recovered(copier.counts, lost, reason)
 
 
 def _copy_records(file: BinaryIO, copier: _Copier, progress: Callable[[int], None]) -> tuple[int, str]:
-    """Up to the first record that is broken; a chunk that is broken inside is left out alone."""
+    """Up to the first record that is broken or cannot be read; of a chunk that is broken inside only that is
+    left out. Raises OSError where the copy cannot be written."""
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader, breakup_chunk
 
@@ -80,6 +69,8 @@ def _copy_records(file: BinaryIO, copier: _Copier, progress: Callable[[int], Non
         try:
             for part in breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]:
                 copier.copy(part)
+        except OSError:  # nothing is read here
+            raise
         except damage() as error:
             lost, reason = lost + file.tell() - good, reason or _why(error)
         progress(file.tell() - good)
@@ -87,7 +78,10 @@ def _copy_records(file: BinaryIO, copier: _Copier, progress: Callable[[int], Non
 
 
 def _why(error: Exception) -> str:
-    return "the file ends too soon" if type(error).__name__ == "EndOfFile" else f"damaged: {error}"
+    if isinstance(error, OSError):
+        return f"cannot be read any further: {error.strerror}"
+    name = type(error).__name__
+    return "the file ends too soon" if name == "EndOfFile" else f"damaged: {str(error) or name}"
 
 
 class _Copier:
