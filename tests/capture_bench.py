@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from software_camera import SoftwareCamera
 from share.config import SequencerConfig
 from share.core.watchdog import Watchdog
 from share.errors import UsageError
-from share.io.feed import Feed
+from share.io.feed import Feed, MakeWatchdog
 from share.io.handover import Handover
 from share.io.profile import profile
 from share.io.realsense.camera import RealSense
@@ -50,7 +50,7 @@ class Bench:
     def __init__(
         self,
         out: Path,
-        watchdog: Callable[[int, bool, bool], Watchdog] = Watchdog,
+        watchdog: MakeWatchdog = Watchdog,
         wanted: Wanted = WANTED,
         most_images: int = 60,
     ) -> None:
@@ -113,5 +113,5 @@ class Bench:
         self.report = self.run.go()
 
 
-def quick(now_ns: int, has_images: bool, has_imu: bool) -> Watchdog:
-    return Watchdog(now_ns, has_images, has_imu, silent_ms=600, warm_up_ms=800, retry_ms=100)
+def quick(now_ns: int, streams: Collection[str]) -> Watchdog:
+    return Watchdog(now_ns, streams, silent_ms=600, warm_up_ms=800, retry_ms=100)

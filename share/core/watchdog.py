@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from enum import Enum
 
 from share.core.intake import ACCEL, GYRO
-from share.core.measurement import IMU
-
-_MOTION = (IMU, ACCEL, GYRO)
 
 
 class Action(Enum):
@@ -30,23 +28,25 @@ class Health(Enum):
 
 class Watchdog:
     """Silence of the IMU while images come: one reset, then vision only. Silence of the images, or a device
-    that is gone: reconnect, again and again. Silence is not counted in the first warm_up_ms after a
-    connection. `resets` and `reconnections` are counted.
+    that is gone: reconnect, again and again. The IMU is silent if one of accel and gyro is, the images if one
+    of their streams is. Silence is not counted in the first warm_up_ms after a connection. `resets` and
+    `reconnections` are counted.
     """
 
     def __init__(
         self,
         now_ns: int,
-        has_images: bool = True,
-        has_imu: bool = True,
+        streams: Collection[str],
         silent_ms: float = 1000.0,
         warm_up_ms: float = 4000.0,
         retry_ms: float = 1000.0,
     ) -> None:
+        """streams: that are expected."""
         self.health = Health.OK
         self.resets = 0
         self._connections = 0
-        self._has_images, self._has_imu = has_images, has_imu
+        self._motion = [name for name in streams if name in (ACCEL, GYRO)]
+        self._images = [name for name in streams if name not in (ACCEL, GYRO)]
         self._silent_ns, self._warm_up_ns = int(silent_ms * 1e6), int(warm_up_ms * 1e6)
         self._retry_ns = int(retry_ms * 1e6)
         self._listen(now_ns)
@@ -64,7 +64,7 @@ class Watchdog:
 
     def _listen(self, now_ns: int) -> None:
         patience = now_ns + self._warm_up_ns - self._silent_ns
-        self._imu_ns = self._image_ns = patience
+        self._heard_ns = dict.fromkeys([*self._motion, *self._images], patience)
 
     def lost(self, now_ns: int) -> None:
         """The device is gone, or cannot be opened."""
@@ -72,23 +72,26 @@ class Watchdog:
         self._try_ns = now_ns + self._retry_ns
 
     def heard(self, stream: str, now_ns: int) -> None:
-        """A sample of the stream came. cam0, cam1, depth count as images."""
-        if stream in _MOTION:
-            self._imu_ns = max(self._imu_ns, now_ns)
-        else:
-            self._image_ns = max(self._image_ns, now_ns)
+        """A sample of the stream came."""
+        if stream in self._heard_ns:
+            self._heard_ns[stream] = max(self._heard_ns[stream], now_ns)
 
     def tick(self, now_ns: int) -> Action:
         """What to do now."""
         if self.health is Health.AWAY:
             return self._retry(now_ns)
-        if self._has_images and now_ns - self._image_ns > self._silent_ns:
+        image_ns = self._since(self._images, now_ns)
+        if now_ns - image_ns > self._silent_ns:
             self.lost(now_ns)
             return Action.RECONNECT
-        if self._has_imu:
-            latest_ns = self._image_ns if self._has_images else now_ns  # all fall silent: it is gone
-            return self._watch_imu(now_ns, latest_ns - self._imu_ns > self._silent_ns)
-        return Action.NOTHING
+        if not self._motion:
+            return Action.NOTHING
+        # by the last image and not by now: where all fall silent, it is gone
+        return self._watch_imu(now_ns, image_ns - self._since(self._motion, now_ns) > self._silent_ns)
+
+    def _since(self, streams: list[str], now_ns: int) -> int:
+        """Until when all of them were heard; now, if there are none."""
+        return min((self._heard_ns[name] for name in streams), default=now_ns)
 
     def _retry(self, now_ns: int) -> Action:
         if now_ns < self._try_ns:
@@ -108,7 +111,7 @@ class Watchdog:
             self.resets = 1
             self.lost(now_ns)
             return Action.RESET
-        if not self._has_images:  # nothing is left to go on with
+        if not self._images:  # nothing is left to go on with
             self.lost(now_ns)
             return Action.RECONNECT
         self.health = Health.VISION_ONLY

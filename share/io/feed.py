@@ -8,10 +8,10 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, Protocol
 
-from share.core.intake import GYRO, Intake, Sample
+from share.core.intake import Intake, Sample
 from share.core.measurement import CAM0, Measurement
 from share.core.rate import Every
 from share.core.watchdog import Action, Health, Watchdog
@@ -50,7 +50,7 @@ class Device(Protocol):
 
 
 Connect = Callable[[str | None, int], Device]  # serial number (None: any), how often it was tried before
-MakeWatchdog = Callable[[int, bool, bool], Watchdog]
+MakeWatchdog = Callable[[int, Collection[str]], Watchdog]
 
 
 class Feed:
@@ -73,7 +73,7 @@ class Feed:
         self._connect, self._say, self.queue = connect, say, queue
         self.serial, self.intake = serial, Intake(rates_hz, max_jump_s)
         self._max_jump_s = max_jump_s
-        self._watchdog = watchdog(time.monotonic_ns(), CAM0 in rates_hz, GYRO in rates_hz)
+        self._watchdog = watchdog(time.monotonic_ns(), rates_hz)
         self._tick = Every(_TICK_S)
         self._stop = threading.Event()
         self._device: Device | None = None

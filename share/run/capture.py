@@ -53,6 +53,7 @@ class Capture:
         self._say, self._show = say, show
         self._stop = threading.Event()
         self._error: BaseException | None = None
+        self._written = 0  # measurements
         self._shown = (time.monotonic(), 0)  # when, and bytes by then
         self.ended = "stopped"
 
@@ -86,17 +87,26 @@ class Capture:
         writer.join()
         if self._error is not None:
             recorder.abort()
-        elif not any(gaps.samples for gaps in self._feed.intake.streams.values()):
+        elif not self._written:
             recorder.abort()
             recorder.part.unlink()
-            self._error = ShareError(f"camera {self._feed.serial}: no sample came; nothing was recorded")
+            self._error = ShareError(f"camera {self._feed.serial}: {self._came()}; nothing was recorded")
         else:
             recorder.close()
+
+    def _came(self) -> str:
+        """What came where nothing could be written: not all of an IMU, or nothing."""
+        counts = {name: gaps.samples for name, gaps in self._feed.intake.streams.items()}
+        if not any(counts.values()):
+            return "no sample came"
+        told = ", ".join(f"{count} of {name}" for name, count in counts.items())
+        return f"samples came ({told}), but the IMU needs both accel and gyro"
 
     def _write(self, recorder: Recorder) -> None:
         try:
             for measurement in self._feed.measurements():
                 recorder.write(measurement)
+                self._written += 1
         except BaseException as error:
             self._error = error
             self._feed.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
 from share.core.intake import Sample
@@ -37,8 +37,8 @@ class Fake:
         pass
 
 
-def quick(now_ns: int, has_images: bool, has_imu: bool) -> Watchdog:
-    return Watchdog(now_ns, has_images, has_imu, silent_ms=100, warm_up_ms=100, retry_ms=10)
+def quick(now_ns: int, streams: Collection[str]) -> Watchdog:
+    return Watchdog(now_ns, streams, silent_ms=100, warm_up_ms=100, retry_ms=10)
 
 
 def wait(until: Callable[[], bool]) -> None:

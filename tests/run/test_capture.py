@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from capture_bench import PICTURE, WANTED, WRAP_US, Bench, Fake, quick
 
+from share.core.intake import Sample
 from share.core.measurement import Measurement
 from share.errors import ShareError, UsageError
 from share.io.feed import Feed
@@ -132,6 +134,30 @@ def test_of_two_recordings_of_one_name_the_second_is_refused(tmp_path: Path) -> 
             Recorder(tmp_path / "a.mcap", rig, durable=True)
         first.write(Measurement("imu", 10**9, np.zeros(6)))
     assert len(read_imu(str(tmp_path / "a.mcap")).imu.stamps_ns) == 1
+
+
+class Gyroscope:
+    """A camera whose accelerometer says nothing."""
+
+    rig, serial, rates_hz = WANTED.profile.rig(), "0123", {"accel": 250.0, "gyro": 400.0}
+
+    def start(self, sink: Callable[[Sample], None]) -> None:
+        for k in range(100):
+            sink(Sample("gyro", k * 2_500_000, (0, 0, 0), k * 2_500_000))
+
+    def stop(self) -> None:
+        pass
+
+    reset = stop
+
+
+def test_an_imu_alone_without_an_accelerometer_is_no_recording(tmp_path: Path) -> None:
+    feed = Feed(lambda *_: Gyroscope(), None, Gyroscope.rates_hz, 10.0, print, Handover())
+    with pytest.raises(
+        ShareError, match=r"0123: samples came \(0 of accel, 100 of gyro\), but the IMU needs"
+    ):
+        Capture(feed, tmp_path / "a.mcap", 0.0, print).go(0.3)
+    assert list(tmp_path.iterdir()) == []
 
 
 def _never(serial: str | None, epoch: int) -> Any:
