@@ -13,10 +13,13 @@ from software_camera import BASELINE, T_GYRO_IR, Listed, SoftwareCamera
 
 from share.core.intake import Sample
 from share.errors import ShareError, UsageError
+from share.io.mcap import types as ros
+from share.io.mcap.images import to_raw
 from share.io.profile import profile
 from share.io.realsense import camera as adapter
 from share.io.realsense.camera import RealSense
 from share.io.realsense.devices import Attached, choose
+from share.io.realsense.frames import metres
 from share.io.realsense.streams import Wanted
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
@@ -65,6 +68,21 @@ def test_pictures_and_motion_come_out_as_they_went_in(camera: SoftwareCamera) ->
     assert (got["gyro"].stamp_ns, got["gyro"].payload) == (12_345_000, [0.25, -0.5, 1.0])
     assert (got["accel"].stamp_ns, got["accel"].payload) == (23_456_000, [0.5, 9.75, -1.0])
     assert all(sample.hardware for sample in got.values())
+
+
+@pytest.mark.parametrize(
+    ("unit_m", "encoding"), [(0.001, "16UC1"), (0.0001, "32FC1"), (0.0005, "32FC1"), (0.00123, "32FC1")]
+)
+def test_depth_in_millimetres_is_recorded_as_such(unit_m: float, encoding: str) -> None:
+    steps = np.arange(2**16, dtype=np.uint16).reshape(256, 256)
+    told = float(np.float32(unit_m))  # in single precision
+    depth = metres(steps, told)
+    assert depth.dtype == np.float32
+    np.testing.assert_allclose(depth, steps * unit_m, rtol=2e-7)
+    message = to_raw(ros.header(0, "depth"), depth)
+    assert message.encoding == encoding
+    if encoding == "16UC1":
+        np.testing.assert_array_equal(message.data.view(np.uint16).reshape(256, 256), steps)
 
 
 def test_a_thousand_samples_of_the_imu_are_all_there(camera: SoftwareCamera) -> None:

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from share.core.intake import ACCEL, GYRO, Sample
 from share.core.measurement import CAM0, CAM1, DEPTH
 from share.io.images import ArrayImage
+from share.types import F32
+
+_WHOLE = 1e-3  # so far from a whole number a depth unit's inverse may be
 
 
 def to_sample(rs: Any, frame: Any, depth_unit_m: float, arrived_ns: int, epoch: int) -> Sample:
@@ -50,4 +53,13 @@ def _motion(frame: Any) -> list[float]:
 
 def _pixels(frame: Any, stream: str, depth_unit_m: float) -> NDArray[Any]:
     pixels = np.asarray(frame.get_data())
-    return np.asarray(pixels * np.float32(depth_unit_m)) if stream == DEPTH else pixels.copy()
+    return metres(pixels, depth_unit_m) if stream == DEPTH else pixels.copy()
+
+
+def metres(steps: NDArray[np.uint16], unit_m: float) -> F32:
+    """(H, W) depth in m. The unit is told in single precision: one of 1/n m is taken to be just that, and
+    divided by. So whole millimetres come out to the last bit, and are recorded as such."""
+    n = round(1 / unit_m)
+    if n and abs(1 / unit_m - n) < _WHOLE:
+        return np.asarray(steps / np.float32(n))
+    return np.asarray(steps * np.float32(unit_m))
