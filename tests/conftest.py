@@ -14,8 +14,10 @@ from shell import Done  # noqa: E402
 
 from share.cli.main import main  # noqa: E402
 
-# Where tests run in the background of a shell, Ctrl-C is ignored, by all that they start too.
+# Where tests run in the background of a shell, Ctrl-C is ignored, by all that they start too; so is SIGHUP
+# with nohup.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture

@@ -123,7 +123,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _fail(text: str, code: int) -> None:
-    click.echo(f"share: {text}", err=True)
+    with contextlib.suppress(OSError):  # its terminal may be gone
+        click.echo(f"share: {text}", err=True)
     sys.exit(code)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 
 import click
 
@@ -21,26 +21,33 @@ def progress(total: int, label: str) -> Iterator[Callable[[int], None]]:
 
 
 class LiveLine:
-    """One line on a terminal that is written over, cut where that ends; where stderr is none, nothing."""
+    """One line on a terminal that is written over, cut where that ends; where stderr is none, nothing. A
+    terminal that is gone ends nothing."""
 
     def __init__(self) -> None:
         self.seen, self._shown = sys.stderr.isatty(), False
 
     def write(self, text: str) -> None:
         if self.seen:
-            click.echo("\r\x1b[K" + text[: _columns()], err=True, nl=False)
+            _tell("\r\x1b[K" + text[: _columns()], nl=False)
             self._shown = True
 
     def end(self) -> None:
         """Leaves the line as it is; what follows begins on a new one."""
         if self._shown:
-            click.echo("", err=True)
+            _tell("")
         self._shown = False
 
     def say(self, text: str) -> None:
         """A line of its own on stderr, terminal or not."""
         self.end()
-        click.echo(text, err=True)
+        _tell(text)
+
+
+def _tell(text: str, nl: bool = True) -> None:
+    """To whoever still reads stderr."""
+    with suppress(OSError):
+        click.echo(text, err=True, nl=nl)
 
 
 def _columns() -> int | None:

@@ -1,4 +1,4 @@
-"""Ending a live run in good order on Ctrl-C or SIGTERM."""
+"""Ending a live run in good order: on Ctrl-C, SIGTERM, or when its terminal is gone."""
 
 from __future__ import annotations
 
@@ -10,16 +10,25 @@ from types import FrameType
 
 @contextmanager
 def on_stop(stop: Callable[[], None]) -> Iterator[None]:
-    """Within, the first SIGINT or SIGTERM calls `stop`; a second one interrupts at once."""
+    """Within, the first SIGINT, SIGTERM or SIGHUP calls `stop`; then SIGINT and SIGTERM interrupt at once.
+
+    SIGHUP is ignored from then on, also afterwards: kernel and shell may both send it for one terminal, and
+    there may be files to write. Where it was ignored before (nohup), it ends nothing.
+    """
 
     def handler(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
         stop()
 
-    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    caught = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        caught.append(signal.SIGHUP)
+    before = {number: signal.signal(number, handler) for number in caught}
     try:
         yield
     finally:
         for number, old in before.items():
-            signal.signal(number, old)
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, old)

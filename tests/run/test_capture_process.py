@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import pty
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -43,7 +46,7 @@ def grown(part: Path, size: int) -> None:
         time.sleep(0.05)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_person_ends_it_and_the_file_is_whole(tmp_path: Path, number: int) -> None:
     out = tmp_path / "a.mcap"
     with capturing(out, "--json") as child:
@@ -54,6 +57,25 @@ def test_a_person_ends_it_and_the_file_is_whole(tmp_path: Path, number: int) -> 
     report = json.loads(told)
     assert report["ended"] == "stopped"
     assert len(open_source(str(out)).stamps()["cam0"]) == report["streams"]["cam0"]["samples"] > 10
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_a_terminal_that_is_closed_costs_nothing_of_the_recording(tmp_path: Path) -> None:
+    ours, terminal = pty.openpty()
+    child = subprocess.Popen(
+        [sys.executable, str(CHILD), str(tmp_path / "a.mcap")],
+        env=ENV, stdin=terminal, stdout=terminal, stderr=terminal, start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    )  # fmt: skip
+    try:
+        os.close(terminal)
+        grown(tmp_path / "a.mcap.part", 10_000_000)
+        os.close(ours)
+        assert child.wait(timeout=20) == 1  # the table had no reader
+    finally:
+        child.kill()
+        child.wait()
+    assert len(open_source(str(tmp_path / "a.mcap")).stamps()["cam0"]) > 10
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 

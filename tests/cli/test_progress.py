@@ -1,0 +1,27 @@
+"""A live line, also on a terminal that is gone."""
+
+from __future__ import annotations
+
+import errno
+import io
+
+import pytest
+
+from share.cli.progress import LiveLine
+
+
+class Gone(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+    def write(self, text: str) -> int:
+        raise OSError(errno.EIO, "Input/output error")
+
+
+def test_a_terminal_that_is_gone_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stderr", Gone())
+    line = LiveLine()
+    assert line.seen
+    line.write("1 frame")
+    line.say("the camera is away")
+    line.end()
