@@ -16,20 +16,20 @@ from share.mocap.mocap import Mocap
 _NOWHERE = (0, 0, 0, 0, 0, 0, 1)  # x y z qx qy qz qw
 
 
-def read_mocap(path: Path) -> Mocap:
-    """`.csv`: t[ns], x y z, qw qx qy qz, and more that is not read; else TUM: t[s] x y z qx qy qz qw. Rows
-    with NaN, or a quaternion of zeros, are the body not seen: a gap.
+def read_mocap(path: Path, unseen: bool = True) -> Mocap:
+    """`.csv`: t[ns], x y z, qw qx qy qz, and more that is not read; else TUM: t[s] x y z qx qy qz qw.
 
+    unseen: rows with NaN, or a quaternion of zeros, are the body not seen, a gap; else they are damage.
     Raises UsageError without such a file, DataError that names it for what is damaged.
     """
     if not path.is_file():
         raise UsageError(f"{path}: no such file of motion capture")
     if path.suffix.lower() == ".csv":
-        stamps, values = tables.read_table(path, 8, nan=True)
+        stamps, values = tables.read_table(path, 8, nan=unseen)
         values = values[:, [0, 1, 2, 4, 5, 6, 3]]
     else:
-        stamps, values = read_tum_table(path, nan=True)
-    seen = ~np.isnan(values).any(1) & (values[:, 3:] != 0).any(1)
+        stamps, values = read_tum_table(path, nan=unseen)
+    seen = ~np.isnan(values).any(1) & (values[:, 3:] != 0).any(1) | (not unseen)
     if not seen.any():
         raise DataError(f"{path}: the body was never seen: no pose, NaN and zeros only")
     values[~seen] = _NOWHERE  # still there, so that a complaint counts the poses of the file

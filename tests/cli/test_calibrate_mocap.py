@@ -9,7 +9,10 @@ import pytest
 from field_sim import RATE_HZ, export
 from mocap_sim import BODY, NOISE, START_NS, TILT, Motion, record_imu, record_mocap, stamps
 
+from share.core.measurement import IMU, Measurement
 from share.geometry import se3
+from share.geometry.camera import Camera, Rig
+from share.io.mcap.recorder import Recorder
 from share.io.mocap_file import read_mocap
 from share.io.section import read_yaml
 from share.io.trajectory import Trajectory, format_tum
@@ -79,6 +82,20 @@ def test_csv_and_tum_are_read_alike(room):
     assert np.array_equal(tum.stamps_ns, csv.stamps_ns) and np.allclose(tum.T, csv.T, atol=1e-8)
 
 
+@pytest.mark.parametrize(
+    ("name", "order"), [("mocap.tum", [0, 1, 2, 3, 7, 4, 5, 6]), ("mocap.csv", [0, 1, 2, 3, 5, 6, 7, 4])]
+)
+def test_a_quaternion_in_the_order_of_the_other_form_is_refused(share, room, tmp_path, name, order):
+    """It turns by the same angles, so the clocks are found; but about other axes."""
+    between = "," if name.endswith(".csv") else " "
+    rows = [line.split(between) for line in (room / name).read_text().splitlines()]
+    (tmp_path / name).write_text("".join(between.join(row[k] for k in order) + "\n" for row in rows))
+    done = share(*found(room, tmp_path / name, "--out", tmp_path / "out"))
+    assert done.code == 1 and done.err.count("\n") == 1
+    assert "the order of quaternions (TUM: qx qy qz qw; .csv: qw qx qy qz)" in done.err
+    assert not list((tmp_path / "out").iterdir())
+
+
 def test_a_body_of_vicons_export_is_found_by_another_clock(share, room, tmp_path):
     """Its clock counts frames from nought; another body is in the file."""
     mine, other = (record_mocap(Motion(seed), 14, LATE_NS, hz=RATE_HZ).T for seed in (1, 4))
@@ -88,6 +105,21 @@ def test_a_body_of_vicons_export_is_found_by_another_clock(share, room, tmp_path
     assert refused.code == 2 and "give --body BODY); it has Hat, Mine" in refused.err
     assert share(*told, "--body", "Mine").code == 0
     turned, shifted = error_of(read_yaml(tmp_path / "out" / "mocap.yaml").pose("T_body_mocap"))
+    assert turned < 0.05 and shifted < 0.0015
+
+
+def test_a_recording_of_the_imu_alone_will_do(share, room, tmp_path):
+    """As `share capture --imu-only` makes it: it carries the noise."""
+    rig = Rig(Camera(64, 48, 40.0, 40.0, 31.5, 23.5), np.eye(4), imu=NOISE)
+    imu = record_imu(Motion(), 14)
+    with Recorder(tmp_path / "imu.mcap", rig) as recorder:
+        for stamp, *values in zip(imu.stamps_ns.tolist(), *imu.gyro.T, *imu.accel.T, strict=True):
+            recorder.write(Measurement(IMU, stamp, values))
+    done = share(
+        "calibrate", "mocap", tmp_path / "imu.mcap", "--truth", room / "mocap.tum", "--out", tmp_path
+    )
+    assert (done.code, done.err) == (0, "")
+    turned, shifted = error_of(read_yaml(tmp_path / "mocap.yaml").pose("T_body_mocap"))
     assert turned < 0.05 and shifted < 0.0015
 
 

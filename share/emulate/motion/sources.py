@@ -79,7 +79,7 @@ def open_recording(
     if files.truth.parent.name in _RAW:
         options = TUMVI
     T_body_cam0, noise = files.mounting()
-    imu, mocap = _read_imu(files.imu), read_mocap(files.truth)
+    imu, mocap = _read_imu(files.imu), read_mocap(files.truth, unseen=False)
     first, last = _span(folder, imu, mocap, start, seconds)
     margin = round(_MARGIN_S * 1e9)
     near = _imu_between(imu, first - margin, last + margin)
