@@ -19,13 +19,13 @@ class Finding:
     correction: Correction | None = None
 
 
-def in_map(agent: str, map_id: str, T_map_odom: F64, about: int) -> Finding:
+def in_map(agent: str, map_id: str, T_map_odom: F64, about: int, cov: F64 | None = None) -> Finding:
     """Which map a run is in, before anything moves it there. A map is named after what founded it. about: a
-    keyframe of the stretch."""
+    keyframe of the stretch. cov (6, 6): of T_map_odom; exact where it is the map's own gauge."""
     founds = "founds" if map_id.startswith(f"{agent}/") else "is in"
     return Finding(
         agent,
         "correction",
         f"{founds} map {map_id}",
-        Correction(T_map_odom, np.zeros((6, 6)), map_id, 0, about),
+        Correction(T_map_odom, np.zeros((6, 6)) if cov is None else cov, map_id, 0, about),
     )

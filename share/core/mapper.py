@@ -84,7 +84,7 @@ class Mapper:
 
     def add(self, agent: str, keyframe: Keyframe) -> list[Finding]:
         """A keyframe, in order, each once."""
-        number = self._atlas.add_keyframe(agent, keyframe, leads=self._leads(agent))
+        number = self._atlas.add_keyframe(agent, keyframe, rank=self._rank(agent))
         self._see(number, agent, keyframe)
         self._lookups.add(agent, served_as(self._config, self._hellos[agent]), number)
         findings = [] if keyframe.reference >= 0 else [self._founding(agent, keyframe)]
@@ -99,8 +99,8 @@ class Mapper:
         poses = {} if kept.poses is None else dict(zip(kept.poses.keys, kept.poses.T_map_body, strict=True))
         founders = set[str]() if kept.poses is None else set(kept.poses.maps)
         agents = [name.rpartition("/")[0] for name in kept.stretches]
-        leads = [name in founders for name in kept.stretches] if founders else map(self._leads, agents)
-        stretches = list(zip(agents, leads, strict=True))
+        ranks = [self._rank(a, name in founders) for a, name in zip(agents, kept.stretches, strict=True)]
+        stretches = list(zip(agents, ranks, strict=True))
         placed = [
             _placed(found, edge_to(found, kept.links), found.at in kept.links) for found in kept.keyframes
         ]
@@ -117,9 +117,11 @@ class Mapper:
         self._sights[number] = Sight(keyframe.view, hello.rig.cam0.focal, hello.rig.T_body_cam0, keyframe.up)
         self._index.add(number, keyframe.view.descriptors)
 
-    def _leads(self, agent: str) -> bool:
-        """Who wears a headset sees a map move, so it is the others' maps that come to his."""
-        return form_of(self._config, self._hellos[agent]) is AgentKind.AR
+    def _rank(self, agent: str, founded: bool = False) -> int:
+        """Who wears a headset sees a map move, so it is the others' maps that come to his; all come to one
+        that an earlier life had."""
+        wears = form_of(self._config, self._hellos[agent]) is AgentKind.AR
+        return (0 if wears else 1) + (0 if founded else 2)
 
     def _founding(self, agent: str, keyframe: Keyframe) -> Finding:
         T, map_id = self._atlas.T_map_odom(agent), self._atlas.current_map(agent)

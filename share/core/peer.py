@@ -108,8 +108,10 @@ _COUNTS = (
 )
 
 
-def known_runs(kept: Kept) -> list[Known]:
-    """Of all earlier lives. What comes after a run's last keyframe that is there is asked for."""
+def known_runs(kept: Kept, known_m: float) -> list[Known]:
+    """Of all earlier lives. What comes after a run's last keyframe that is there is asked for. known_m: how
+    surely such a run's place in another's map is known until that is solved anew, 1 sigma."""
+    cov = np.diag([0.0, 0.0, 0.0, *[known_m**2 / 3] * 3])
     last = {found.key: found.keyframe for found in kept.keyframes}
     there = placed(kept)
     out = []
@@ -119,6 +121,8 @@ def known_runs(kept: Kept) -> list[Known]:
             continue
         map_id, T_map_body = there[Key(run.key, found.id)]
         T_map_odom = se3.orthonormal(T_map_body @ se3.inverse(found.T_odom_body))
-        finding = in_map(run.key, map_id, T_map_odom, found.id)
+        at_body = None if map_id.startswith(f"{run.key}/") else cov
+        at_odom = None if at_body is None else se3.inverse_cov(found.T_odom_body, at_body)
+        finding = in_map(run.key, map_id, T_map_odom, found.id, at_odom)
         out.append(Known(run.key, run.hello, Foot(found.id, found.stamp_ns), found.id + 1, finding))
     return out

@@ -132,30 +132,30 @@ class Atlas:
 
     # ------------------------------------------------------------ what arrives
 
-    def add_keyframe(self, agent: str, keyframe: Keyframe, leads: bool = True) -> int:
+    def add_keyframe(self, agent: str, keyframe: Keyframe, rank: int = 0) -> int:
         """Its number here. A keyframe without a reference founds a map of its own; of maps that are joined,
-        the oldest of those that lead keeps its name and place, or the oldest of all where none does.
+        the oldest of those of the least rank keeps its name and place.
 
         Raises ValueError for a keyframe known already or whose reference is unknown.
         """
         cov, plumb = self._believed(keyframe.cov), self._plumb(keyframe)
-        return self._chart.add(agent, keyframe, cov, plumb, leads)
+        return self._chart.add(agent, keyframe, cov, plumb, rank)
 
     def restore(
         self,
-        stretches: Sequence[tuple[str, bool]],
+        stretches: Sequence[tuple[str, int]],
         keyframes: Iterable[Placed],
         loops: Iterable[Loop],
         T_map_body: Mapping[Key, F64],
     ) -> list[int]:
         """What an earlier life knew; this one must be empty. stretches: of every one there was, in order, the
-        agent and whether it leads.
+        agent and its rank.
 
         Returns the keyframes' numbers. All maps are due.
         """
         chart, at = self._chart, {}
-        for agent, leads in stretches:
-            stretch = chart.trails.begin(agent, leads)
+        for agent, rank in stretches:
+            stretch = chart.trails.begin(agent, rank)
             at[chart.trails.stretches[stretch].name] = stretch
         numbers = []
         for found in keyframes:
@@ -166,6 +166,9 @@ class Atlas:
             chart.poses[numbers[-1]] = T_map_body.get(found.key, chart.poses[numbers[-1]])
         for loop in loops:
             chart.tie(loop)
+        for agent in {agent for agent, _ in stretches}:
+            if (stretch := chart.trails.current(agent)) is not None:
+                self._surety.remember(stretch, chart.founder[stretch])
         return numbers
 
     def redundant(self, count: int) -> list[int]:
@@ -315,7 +318,7 @@ class Atlas:
             for stretch, last in zip(job.stretches, job.last, strict=True)
             if last in told and last in nodes
         }
-        waiting = self._surety.take(job.stretches[0], found)
+        waiting = self._surety.take(job.stretches[0], job.stretches, found)
         return {trails.stretches[s].agent: spread for s, spread in waiting.items()}
 
     def _corrections(self, job: SolveJob) -> dict[str, Correction]:

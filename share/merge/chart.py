@@ -1,7 +1,7 @@
 """Where everything lies: poses by map, the edges between them, and which stretches are one map.
 
 A map is a set of stretches that loops connect; it is named after its founder, the first to have come of
-those that lead, or of all where none does. The founder's oldest keyframe stays where its odometry says: that
+those of the least rank. The founder's oldest keyframe stays where its odometry says: that
 is the gauge. Maps are derived from the loops alone, so taking a loop back takes its join back.
 """
 
@@ -33,10 +33,10 @@ class Chart:
         self.bonds: Counter[tuple[int, int]] = Counter()  # loops by the two stretches that they tie
         self.unsolved: dict[int, None] = {}  # founders of maps with news, the oldest first
 
-    def add(self, agent: str, keyframe: Keyframe, cov: F64, plumb: F64, leads: bool = True) -> int:
+    def add(self, agent: str, keyframe: Keyframe, cov: F64, plumb: F64, rank: int = 0) -> int:
         """The number of the new node. cov (6, 6): of its step from the one before, as it is believed; so is
-        plumb (3,). leads: a stretch that it begins."""
-        number = self.trails.add(agent, keyframe, leads)
+        plumb (3,). rank: of a stretch that it begins."""
+        number = self.trails.add(agent, keyframe, rank)
         self.place(number, keyframe.T_ref_body, cov, plumb)
         return number
 
@@ -154,9 +154,9 @@ class Chart:
                 return founder
         raise ValueError(f"there is no map {map_id}")
 
-    def rank(self, stretch: int) -> tuple[bool, int]:
+    def rank(self, stretch: int) -> tuple[int, int]:
         """Of the stretches of a map, the least founds it."""
-        return not self.trails.stretches[stretch].leads, stretch
+        return self.trails.stretches[stretch].rank, stretch
 
     def stretches_of(self, founder: int) -> list[int]:
         """Those of a map that have keyframes, its founder first, if that has any."""

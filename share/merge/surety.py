@@ -8,7 +8,7 @@ keyframes with loops: in a large hall, far from where its map began, nothing is 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from share.types import F64
@@ -30,20 +30,29 @@ class Surety:
     def __init__(self, enter_m: float, patience: int) -> None:
         """enter_m: who is known worse waits before another map, for at most so many keyframes with loops."""
         self._enter_m, self._patience = enter_m, patience
-        self._told: dict[int, tuple[int, F64]] = {}  # the founder of the map he was told of, and cov there
+        self._told: dict[int, tuple[int, F64 | None]] = {}  # founder of the map he was told of, cov there
         self._waited: dict[tuple[int, int], set[tuple[int, int]]] = {}  # keyframes, by map left and entered
 
+    def remember(self, stretch: int, founder: int) -> None:
+        """An earlier life has told him of this map; how surely he is known there is yet to be found."""
+        self._told[stretch] = (founder, None)
+
     def told(self, stretch: int, founder: int) -> F64 | None:
-        """cov (6, 6) of T_map_odom, as last found; None if he has not heard of this map."""
+        """cov (6, 6) of T_map_odom, as last found; None if it was not, or he has not heard of this map."""
         known, cov = self._told.get(stretch, (None, None))
         return cov if known == founder else None
 
-    def take(self, founder: int, found: Mapping[int, Found]) -> dict[int, float]:
-        """What a solution of a map says of those whom it was asked for. Returns who waits: his spread, m."""
+    def take(self, founder: int, parts: Collection[int], found: Mapping[int, Found]) -> dict[int, float]:
+        """What a solution of a map, of these stretches, says of those whom it was asked for. Returns who
+        waits: his spread, m."""
+        parted = [(a, b) for a, b in self._waited if b == founder and a not in parts]
+        for pair in parted:  # that join was undone: if it is made again, it is waited for anew
+            del self._waited[pair]
         entering: dict[int, list[int]] = {}
         for s in found:
-            if s != founder and self.told(s, founder) is None:
-                entering.setdefault(self._told[s][0] if s in self._told else s, []).append(s)
+            before = self._told[s][0] if s in self._told else s
+            if s != founder and before != founder and before in parts:  # else the map that he knows is none
+                entering.setdefault(before, []).append(s)
         wait = (who for before, who in entering.items() if self._waits(before, founder, found, who))
         waiting = [s for who in wait for s in who]
         self._told |= {s: (founder, at.cov) for s, at in found.items() if s not in waiting}

@@ -22,12 +22,12 @@ class Node:
 
 @dataclass(eq=False)
 class Stretch:
-    """nodes: their numbers, rising. name: `agent/n`, the n-th of this agent. leads: it founds a map before
-    those that do not, however old they are. count: of all it ever had."""
+    """nodes: their numbers, rising. name: `agent/n`, the n-th of this agent. rank: of a map's stretches the
+    least founds it, the oldest of those that are alike. count: of all it ever had."""
 
     agent: str
     name: str
-    leads: bool = True
+    rank: int = 0
     nodes: list[int] = field(default_factory=list)
     count: int = 0
 
@@ -43,23 +43,23 @@ class Trails:
         self._current: dict[str, int] = {}  # agent -> stretch that it is on
         self._begun: dict[str, int] = {}  # agent -> how many stretches
 
-    def add(self, agent: str, keyframe: Keyframe, leads: bool = True) -> int:
-        """The number of the new node. leads: a stretch that it begins. Raises ValueError for a keyframe known
-        already, or one whose reference is unknown: the caller applies each once and in order."""
+    def add(self, agent: str, keyframe: Keyframe, rank: int = 0) -> int:
+        """The number of the new node. rank: of a stretch that it begins. Raises ValueError for a keyframe
+        known already, or one whose reference is unknown: the caller applies each once and in order."""
         key = Key(agent, keyframe.id)
         if key in self._at:
             raise ValueError(f"keyframe {key} was added before")
         if keyframe.reference < 0:
-            return self.put(key, self.begin(agent, leads), keyframe.T_odom_body)
+            return self.put(key, self.begin(agent, rank), keyframe.T_odom_body)
         before = self.nodes[self.number(Key(agent, keyframe.reference))]
         return self.put(key, before.stretch, keyframe.T_odom_body)
 
-    def begin(self, agent: str, leads: bool = True) -> int:
+    def begin(self, agent: str, rank: int = 0) -> int:
         """A new stretch of this agent, which is on it from now on."""
         count = self._begun.get(agent, 0)
         self._begun[agent] = count + 1
         self._current[agent] = len(self.stretches)
-        self.stretches.append(Stretch(agent, f"{agent}/{count}", leads))
+        self.stretches.append(Stretch(agent, f"{agent}/{count}", rank))
         return len(self.stretches) - 1
 
     def put(self, key: Key, stretch: int, T_odom_body: F64, ordinal: int | None = None) -> int:

@@ -160,7 +160,7 @@ class EdgeRun:
     def _begin_mapping(self) -> None:
         kept = None if self._store is None else self._store.load()
         writable = self._store is not None and self._store.writable
-        known = () if kept is None else known_runs(kept)
+        known = () if kept is None else known_runs(kept, self._settings.merge.enter_m)
         self._machine = Edge(self._settings, secrets.randbits(63), writable, known, self._began_ns)
         self._mapping = Companion("mapping", map_all, (self._settings,), self._answered, self._mapping_lost)
         if kept is not None:

@@ -70,12 +70,16 @@ def again(life: Life, path: Path, config: Config) -> Life:
         kept = store.load()
     second = Life(config)
     second.mapper.restore(kept)
-    for run, name in zip(known_runs(kept), ("ann", "bob"), strict=True):
+    for run, name in zip(known_runs(kept, 0.05), ("ann", "bob"), strict=True):
         told = run.finding  # before the mapper has said anything, and the same as it would
         assert told is not None and told.correction is not None
         assert (told.agent, told.correction.map_id) == (name, second.mapper._atlas.current_map(name))
         T_map_odom = second.mapper._atlas.T_map_odom(name)
         assert np.allclose(told.correction.T_map_odom, T_map_odom, atol=1e-9)
+        T_odom_body = [found.keyframe.T_odom_body for found in kept.keyframes if found.key == name][-1]
+        at_body = se3.compose_cov(T_odom_body, told.correction.cov, np.zeros((6, 6)))
+        known_m = 0.0 if told.correction.map_id.startswith(name) else 0.05  # the gauge is his, or another's
+        assert se3.position_sigma(at_body) == pytest.approx(known_m, abs=1e-9)
     return second
 
 
@@ -117,6 +121,18 @@ def test_a_headset_keeps_its_place_and_a_map_its_founder(
     assert list(second.mapper.report()["maps"]) == [founder]
 
 
+def test_maps_that_meet_only_in_a_second_life_are_joined_as_in_the_first(tmp_path: Path) -> None:
+    """The robot's to the headset's, though it is older."""
+    config = Config()
+    life, people = walked(replace(config, place=replace(config.place, min_matches=10**6)), AgentKind.ROBOT)
+    assert list(life.mapper.report()["maps"]) == ["ann/0", "bob/0"]
+    second = again(life, tmp_path / "room.sqlite", config)
+    for _ in range(STEPS):
+        for person in people:
+            second.step(person)
+    assert list(second.mapper.report()["maps"]) == ["bob/0"]
+
+
 def test_a_run_of_which_nothing_is_left_is_no_obstacle(tmp_path: Path) -> None:
     config = Config()
     life = Life(config)
@@ -125,4 +141,4 @@ def test_a_run_of_which_nothing_is_left_is_no_obstacle(tmp_path: Path) -> None:
         store.write(life.changes)
         kept = store.load()
     Mapper(config).restore(kept)
-    assert [run.finding for run in known_runs(kept)] == [None]
+    assert [run.finding for run in known_runs(kept, 0.05)] == [None]

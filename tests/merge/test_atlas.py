@@ -92,7 +92,7 @@ def test_a_map_that_leads_stays_where_it_is_however_old_the_other_is() -> None:
     atlas, rng = Atlas(CONFIG), np.random.default_rng(0)
     for walker in (robot, ann, bob):
         for keyframe in walker.keyframes:
-            atlas.add_keyframe(walker.name, keyframe, leads=walker is not robot)
+            atlas.add_keyframe(walker.name, keyframe, rank=int(walker is robot))
     joined = [d.joined for x in near_loops(ann, bob, rng) if (d := atlas.propose(x)).joined]
     settle(atlas)
     before = atlas.T_map_odom("ann")

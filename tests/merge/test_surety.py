@@ -11,7 +11,7 @@ from share.merge.atlas import Atlas
 from share.merge.join import Loop
 from share.merge.surety import Found, Surety
 
-ANN, BOB, EVE, ROBOT = range(4)  # stretches, the oldest first
+ANN, BOB, EVE, ROBOT = ALL = range(4)  # stretches, the oldest first
 
 
 def known(cm: float, value: float = 1.0, answers: int | None = None) -> Found:
@@ -24,46 +24,69 @@ def surety() -> Surety:
 
 
 def test_in_his_own_map_everybody_hears_at_once(surety: Surety) -> None:
-    assert surety.take(BOB, {BOB: known(80.0)}) == {}
+    assert surety.take(BOB, ALL, {BOB: known(80.0)}) == {}
     assert surety.told(BOB, BOB) is not None
     assert surety.told(BOB, ANN) is None
 
 
 def test_who_is_surely_known_hears_at_once_and_then_always(surety: Surety) -> None:
-    assert surety.take(ANN, {BOB: known(4.9)}) == {}
-    assert surety.take(ANN, {BOB: known(90.0, 2.0)}) == {}
+    assert surety.take(ANN, ALL, {BOB: known(4.9)}) == {}
+    assert surety.take(ANN, ALL, {BOB: known(90.0, 2.0)}) == {}
     told = surety.told(BOB, ANN)
     assert told is not None and (told == 2 * np.eye(6)).all()
 
 
 def test_who_is_not_waits_and_his_own_map_goes_on(surety: Surety) -> None:
-    surety.take(BOB, {BOB: known(0.0)})
-    assert surety.take(ANN, {BOB: known(7.0)}) == {BOB: pytest.approx(0.07)}
+    surety.take(BOB, ALL, {BOB: known(0.0)})
+    assert surety.take(ANN, ALL, {BOB: known(7.0)}) == {BOB: pytest.approx(0.07)}
     assert surety.told(BOB, ANN) is None
     assert surety.told(BOB, BOB) is not None
-    assert surety.take(ANN, {BOB: known(4.0)}) == {}
+    assert surety.take(ANN, ALL, {BOB: known(4.0)}) == {}
     assert surety.told(BOB, ANN) is not None
 
 
 def test_who_were_in_one_map_hear_together(surety: Surety) -> None:
-    surety.take(BOB, {BOB: known(0.0), EVE: known(1.0)})
+    surety.take(BOB, ALL, {BOB: known(0.0), EVE: known(1.0)})
     found = {BOB: known(2.0), EVE: known(7.0), ROBOT: known(1.0)}
-    assert surety.take(ANN, found).keys() == {BOB, EVE}  # the robot comes from a map of its own
-    assert surety.take(ANN, {BOB: known(2.0), EVE: known(3.0)}) == {}
+    assert surety.take(ANN, ALL, found).keys() == {BOB, EVE}  # the robot comes from a map of its own
+    assert surety.take(ANN, ALL, {BOB: known(2.0), EVE: known(3.0)}) == {}
 
 
 def test_nobody_waits_for_more_than_so_many_keyframes_of_his_own(surety: Surety) -> None:
     for keyframe in (2, 5, 9):
         for answers in (keyframe, keyframe, None):
-            assert surety.take(ANN, {BOB: known(20.0, answers=answers)})
-    assert not surety.take(ANN, {BOB: known(20.0, answers=11)})
+            assert surety.take(ANN, ALL, {BOB: known(20.0, answers=answers)})
+    assert not surety.take(ANN, ALL, {BOB: known(20.0, answers=11)})
     assert surety.told(BOB, ANN) is not None
 
 
 def test_another_map_is_waited_for_anew(surety: Surety) -> None:
     for founder in (EVE, ANN):
         for keyframe in range(3):
-            assert surety.take(founder, {ROBOT: known(20.0, answers=keyframe)})
+            assert surety.take(founder, ALL, {ROBOT: known(20.0, answers=keyframe)})
+
+
+def test_a_join_that_was_undone_is_waited_for_anew(surety: Surety) -> None:
+    for keyframe in range(4):
+        surety.take(ANN, ALL, {BOB: known(20.0, answers=keyframe)})
+    assert surety.told(BOB, ANN) is not None  # his patience was at an end
+    surety.take(ANN, [ANN, EVE], {EVE: known(0.0)})
+    surety.take(BOB, [BOB], {BOB: known(0.0)})
+    assert surety.take(ANN, ALL, {BOB: known(60.0, answers=9)})
+
+
+def test_who_was_told_of_a_map_that_has_proved_false_hears_of_his_own_again(surety: Surety) -> None:
+    surety.take(BOB, [BOB, EVE], {BOB: known(0.0), EVE: known(0.0)})
+    surety.take(ANN, ALL, {BOB: known(1.0), EVE: known(1.0)})
+    assert not surety.take(BOB, [BOB, EVE], {BOB: known(0.0), EVE: known(30.0)})
+    assert surety.told(EVE, BOB) is not None
+
+
+def test_who_was_told_by_an_earlier_life_goes_on_hearing(surety: Surety) -> None:
+    surety.remember(BOB, ANN)
+    assert surety.told(BOB, ANN) is None  # how surely is asked
+    assert not surety.take(ANN, ALL, {BOB: known(30.0)})
+    assert surety.told(BOB, ANN) is not None
 
 
 # ---------------------------------------------------------------- in the atlas
