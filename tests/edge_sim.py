@@ -209,6 +209,9 @@ class Town:
                         self._in(late, lambda peer=peer, copy=copy: self.to_agent(peer, ev.Received(copy)))
                 case ed.Join(key, hello):
                     edge.mapper.join(key, hello)
+                case ed.Present(key, here):
+                    edge.mapper.present(key, here)
+                    self._mapped(edge, [])
                 case ed.Add(key, keyframe):
                     self._mapped(edge, edge.mapper.add(key, keyframe))
                 case ed.Record(fields):

@@ -81,12 +81,13 @@ class Channel:
     def _again_ms(self, packets: int) -> float:
         """Until the last of a message's packets has come through; those that are lost go again at once."""
         lost, late_ms = sum(self._is_lost() for _ in range(packets)), 0.0
-        wait_ms = 2 * self._round_trip_ms + _PROBE_MS
+        wait_ms, burst = 2 * self._round_trip_ms + _PROBE_MS, self._losing
         while lost:
             late_ms += wait_ms
             wait_ms = max(2 * wait_ms, _TIMEOUT_MS)
             self._losing = False  # a burst is over by then
             lost = sum(self._is_lost() for _ in range(lost))
+        self._losing = burst  # for the next message, which is not the one that goes again
         return late_ms
 
     def _is_lost(self) -> bool:

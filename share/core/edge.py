@@ -14,7 +14,20 @@ from typing import Any, ClassVar
 
 from share import __version__
 from share.config import Config
-from share.core.edge_events import Add, Effect, Event, Found, Join, Keep, Kept, Received, Record, Send, Tick
+from share.core.edge_events import (
+    Add,
+    Effect,
+    Event,
+    Found,
+    Join,
+    Keep,
+    Kept,
+    Present,
+    Received,
+    Record,
+    Send,
+    Tick,
+)
 from share.core.finding import Finding
 from share.core.inorder import InOrder
 from share.core.keeping import Change, KeepKeyframe, KeepRun
@@ -128,6 +141,7 @@ class Edge:
         peer.heard_ns = now_ns
         if peer.gone:
             peer.gone = False
+            self._effects.append(Present(peer.key, True))
             self._record(now_ns, "back", peer, "is heard again")
 
     def _notice_silence(self, now_ns: int) -> None:
@@ -137,6 +151,7 @@ class Edge:
 
     def _gone(self, peer: Peer, what: str, reason: str, now_ns: int) -> None:
         peer.gone = True
+        self._effects.append(Present(peer.key, False))
         self._record(now_ns, what, peer, reason)
 
     # ------------------------------------------------------------------ coming in

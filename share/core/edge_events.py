@@ -99,6 +99,14 @@ class Add:
 
 
 @dataclass(frozen=True)
+class Present:
+    """To the mapper: a run is heard, or no longer. Whoever joins is; a run of an earlier life is not yet."""
+
+    key: str
+    here: bool
+
+
+@dataclass(frozen=True)
 class Keep:
     """Make this safe, and answer with `Kept`. Tickets rise."""
 
@@ -141,4 +149,4 @@ class EndTracking:
 
 
 ToTracker = BeginTracking | Track | EndTracking
-Effect = Send | Join | Add | Keep | Record | ToTracker
+Effect = Send | Join | Present | Add | Keep | Record | ToTracker

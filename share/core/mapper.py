@@ -67,6 +67,7 @@ class Mapper:
         self._lookups = Lookups(config.edge)
         self._gating = Gating(config.control, config.edge.policy)
         self._concern = Concern()
+        self._untold: set[tuple[str, str]] = set()  # who has been said to wait to hear of which map
         self._effort = Effort.of(config)
         self._search: Search | None = None
         self._query: Query | None = None  # that the search is about
@@ -81,6 +82,11 @@ class Mapper:
         """A run of an agent, before its first keyframe."""
         self._hellos[agent] = hello
         self._accounts[agent] = _Account()
+        self._atlas.present(agent, True)
+
+    def present(self, agent: str, here: bool) -> None:
+        """Nobody waits for a run that is not heard."""
+        self._atlas.present(agent, here)
 
     def add(self, agent: str, keyframe: Keyframe) -> list[Finding]:
         """A keyframe, in order, each once."""
@@ -96,6 +102,7 @@ class Mapper:
         before headsets that come now. The views are gone through when one is first looked up."""
         for run in kept.runs:
             self.join(run.key, run.hello)
+            self.present(run.key, False)
         poses = {} if kept.poses is None else dict(zip(kept.poses.keys, kept.poses.T_map_body, strict=True))
         founders = set[str]() if kept.poses is None else set(kept.poses.maps)
         agents = [name.rpartition("/")[0] for name in kept.stretches]
@@ -272,10 +279,13 @@ class Mapper:
             for agent, correction in applied.corrections.items()
             if self._concern.concerns(agent, correction)
         ]
+        map_id = step.job.map_id
         untold = [
-            Finding(agent, "not told yet", f"map {step.job.map_id} knows it to {100 * m:.0f} cm only")
+            Finding(agent, "not told yet", f"map {map_id} knows it to {100 * m:.0f} cm only")
             for agent, m in applied.waiting.items()
+            if (agent, map_id) not in self._untold
         ]
+        self._untold |= {(agent, map_id) for agent in applied.waiting}
         return told + untold
 
     def _note(self, made: Decision | Applied) -> None:

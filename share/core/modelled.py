@@ -138,6 +138,9 @@ class ModelledMapper:
     def join(self, agent: str, hello: Hello) -> None:
         self._runs[agent] = _Run(hello)
 
+    def present(self, agent: str, here: bool) -> None:
+        """Everybody is told at once here, so it does not matter."""
+
     def add(self, agent: str, keyframe: Keyframe) -> list[Finding]:
         run, number = self._runs[agent], len(self._stored)
         k = self._which(run.hello.name, keyframe.stamp_ns)

@@ -87,6 +87,7 @@ class AnyMapper(Protocol):
     """`share.core.mapper.Mapper`, or `share.core.modelled.ModelledMapper`."""
 
     def join(self, agent: str, hello: Hello) -> None: ...
+    def present(self, agent: str, here: bool) -> None: ...
     def add(self, agent: str, keyframe: Keyframe) -> list[Finding]: ...
     def next_look(self) -> Any: ...
     def next_solve(self) -> Any: ...
@@ -212,7 +213,7 @@ class World:
             match effect:
                 case ed.Send():
                     self._send_down(effect)
-                case ed.Join() | ed.Add():
+                case ed.Join() | ed.Present() | ed.Add():
                     self._tell_mapper(self._costs.add, partial(self._hear, effect))
                 case ed.Record():
                     self._record(effect.fields)
@@ -222,11 +223,14 @@ class World:
         arrival_ns = member.down.arrival_ns(size(frames), self.now_ns)
         self._in(arrival_ns - self.now_ns, lambda: self._to_agent(member, ev.Received(frames)))
 
-    def _hear(self, message: ed.Join | ed.Add) -> list[Finding]:
+    def _hear(self, message: ed.Join | ed.Present | ed.Add) -> list[Finding]:
         if isinstance(message, ed.Add):
             self.stamps_ns[Key(message.key, message.keyframe.id)] = message.keyframe.stamp_ns
             return self.mapper.add(message.key, message.keyframe)
-        self.mapper.join(message.key, message.hello)
+        if isinstance(message, ed.Present):
+            self.mapper.present(message.key, message.here)
+        else:
+            self.mapper.join(message.key, message.hello)
         return []
 
     # ------------------------------------------------------------------ the mapper, as in share.run.mapping

@@ -64,6 +64,7 @@ class Atlas:
         self._judge = Judge(config, self._chart, Survey(self._chart, {} if sights is None else sights))
         self._answers: dict[str, int] = {}  # agent -> its newest keyframe that a loop came from
         self._surety = Surety(config.enter_m, config.enter_patience)
+        self._absent: set[str] = set()
 
     # ------------------------------------------------------------ what is known
 
@@ -132,6 +133,22 @@ class Atlas:
 
     # ------------------------------------------------------------ what arrives
 
+    def present(self, agent: str, here: bool) -> None:
+        """Who is not heard need not be told where he is, and nobody waits for him. Once he is heard again, a
+        map that he does not know of is due."""
+        if not here:
+            self._absent.add(agent)
+            return
+        stretch = self._chart.trails.current(agent) if agent in self._absent else None
+        self._absent.discard(agent)
+        founder = stretch if stretch is None else self._chart.founder[stretch]
+        if (
+            stretch is not None
+            and founder not in (None, stretch)
+            and self._surety.told(stretch, founder) is None
+        ):
+            self._chart.unsolved[founder] = None
+
     def add_keyframe(self, agent: str, keyframe: Keyframe, rank: int = 0) -> int:
         """Its number here. A keyframe without a reference founds a map of its own; of maps that are joined,
         the oldest of those of the least rank keeps its name and place.
@@ -167,8 +184,8 @@ class Atlas:
         for loop in loops:
             chart.tie(loop)
         for agent in {agent for agent, _ in stretches}:
-            if (stretch := chart.trails.current(agent)) is not None:
-                self._surety.remember(stretch, chart.founder[stretch])
+            if (current := chart.trails.current(agent)) is not None:
+                self._surety.remember(current, chart.founder[current])
         return numbers
 
     def redundant(self, count: int) -> list[int]:
@@ -263,6 +280,7 @@ class Atlas:
             s
             for s in stretches
             if trails.current(agent := trails.stretches[s].agent) == s
+            and agent not in self._absent
             and (agent in self._answers or self._surety.told(s, founder) is None)
         )
 

@@ -34,6 +34,7 @@ from share.core.edge_events import (
     Keep,
     Kept,
     Lost,
+    Present,
     Ready,
     Received,
     Record,
@@ -229,7 +230,7 @@ class EdgeRun:
         match effect:
             case Send():
                 self._link.send(effect.peer, effect.frames)
-            case Join() | Add() if self._mapping is not None:
+            case Join() | Present() | Add() if self._mapping is not None:
                 self._mapping.send(effect)
             case BeginTracking() | Track() | EndTracking():
                 self._trackers.do(effect)

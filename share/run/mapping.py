@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 from share.config import Config, GraphConfig
-from share.core.edge_events import Add, Found, Join
+from share.core.edge_events import Add, Found, Join, Present
 from share.core.finding import Finding
 from share.core.keeping import Kept
 from share.core.mapper import Mapper
@@ -50,7 +50,7 @@ class _Solved:
 
 
 def map_all(inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
-    """For a `Companion`: takes Restore, Join and Add, answers Found and Mapped, until END."""
+    """For a `Companion`: takes Restore, Join, Present and Add, answers Found and Mapped, until END."""
     _Mapping(inbox, answer, settings).go()
 
 
@@ -99,6 +99,8 @@ class _Mapping:
                 self._mapper.restore(message.kept)
             case Join():
                 self._mapper.join(message.key, message.hello)
+            case Present():
+                self._mapper.present(message.key, message.here)
             case Add():
                 self._findings += self._mapper.add(message.key, message.keyframe)
             case _Solved():

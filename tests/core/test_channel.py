@@ -53,7 +53,7 @@ def test_losses_come_in_bursts_and_are_as_many() -> None:
         arrivals(Way(loss=0.02, burst=b), [14_000] * 8_000, every_ms=10_000.0) > 0 for b in (1.0, 5.0)
     )
     assert single.mean() == pytest.approx(1 - 0.98**10, rel=0.06)
-    assert bursts.mean() == pytest.approx(1 - (1 - 0.2 * 0.02 / 0.98) ** 10, rel=0.15)
+    assert bursts.mean() == pytest.approx(1 - 0.98 * (1 - 0.2 * 0.02 / 0.98) ** 9, rel=0.15)
     channel = Channel(Way(loss=0.02, burst=5.0), 4.0, np.random.default_rng(1))
     lost = np.array([channel._is_lost() for _ in range(300_000)])
     assert lost.mean() == pytest.approx(0.02, rel=0.1)
@@ -64,6 +64,16 @@ def test_the_same_seed_the_same_delays() -> None:
     way = NETWORKS["wifi5"].down
     assert (arrivals(way, [500] * 300, 3.0, seed=4) == arrivals(way, [500] * 300, 3.0, seed=4)).all()
     assert (arrivals(way, [500] * 300, 3.0, seed=4) != arrivals(way, [500] * 300, 3.0, seed=5)).any()
+
+
+def test_small_messages_are_lost_as_often_as_large_ones() -> None:
+    """A packet each: a burst goes on from one to the next."""
+    late = arrivals(Way(loss=0.02, burst=4.0), [100] * 60_000, every_ms=10_000.0) > 0
+    assert late.mean() == pytest.approx(0.02, rel=0.12)
+    ends = np.flatnonzero(np.diff(late.astype(int)) == -1)
+    begins = np.flatnonzero(np.diff(late.astype(int)) == 1)
+    runs = min(len(begins), len(ends))
+    assert late.sum() / runs == pytest.approx(4.0, rel=0.12)
 
 
 @pytest.mark.parametrize("wrong", [{"loss": 0.9}, {"burst": 0.5}])

@@ -175,6 +175,22 @@ def test_a_name_in_use_is_refused_until_its_holder_is_silent():
     assert sent(tell(edge, 2, hello(run_id=2), 200 + 3100), m.Welcome)
 
 
+def test_the_mapper_hears_who_is_there():
+    edge = Edge(Config(), 7)
+    tell(edge, 1, hello())
+    told = [
+        [e.here for e in effects if isinstance(e, ed.Present)]
+        for effects in (
+            tell(edge, 1, m.Ping(1, 1), 100),
+            edge.handle(ed.Tick(), 3500 * MS),
+            edge.handle(ed.Tick(), 3600 * MS),
+            tell(edge, 1, m.Ping(2, 2), 4000),
+            tell(edge, 1, m.Bye(), 4100),
+        )
+    ]
+    assert told == [[], [False], [], [True], [False]]
+
+
 def test_a_name_is_free_at_once_after_goodbye():
     edge = Edge(Config(), 7)
     tell(edge, 1, hello())

@@ -118,3 +118,28 @@ def test_a_correction_waits_until_the_map_knows_where_he_is() -> None:
     (applied,) = settle(atlas)
     assert applied.corrections["bob"].map_id == "ann/0"
     assert not applied.waiting
+
+
+def test_nobody_waits_for_who_is_away_and_he_is_told_once_he_is_back() -> None:
+    """As above; Bob is away while the map comes to know him well."""
+    ann, bob = Walker("ann", 0), Walker("bob", 1, n=12, turn=3.5 * np.pi / 59 * 11)
+    config = MergeConfig(join_places=1, near_m=1.0, near_rad=0.52, place_m=0.7, place_rad=0.5)
+    atlas = Atlas(config)
+    for walker in (ann, bob):
+        for keyframe in walker.keyframes:
+            atlas.add_keyframe(walker.name, keyframe)
+    settle(atlas)
+    atlas.present("bob", False)
+    atlas.propose(faint(ann, bob, 0))
+    assert atlas.propose(faint(ann, bob, 1)).joined == ("ann/0", "bob/0")
+    (applied,) = settle(atlas)
+    assert not applied.waiting
+    atlas.propose(loop(ann, 11, bob, 11, np.random.default_rng(0)))
+    (applied,) = settle(atlas)
+    assert list(applied.corrections) == ["ann"]
+    assert not atlas.due()
+    atlas.present("bob", True)
+    (applied,) = settle(atlas)
+    assert applied.corrections["bob"].map_id == "ann/0"
+    atlas.present("bob", True)
+    assert not atlas.due()
