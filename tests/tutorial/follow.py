@@ -76,8 +76,9 @@ def _typed(step: Step, machine: Machine, say: Callable[[str], None], folder: Pat
 
 
 def _elsewhere(line: str, folder: Path) -> str:
-    """As it would be on the machines of the page."""
-    return line.replace(*reversed(ADDRESS)).replace(str(folder), "/home").rstrip()
+    """As it would be on the machines of the page. The edge's own page is for the laptop alone there too."""
+    line = line if "http://" in line else line.replace(*reversed(ADDRESS))
+    return line.replace(str(folder), "/home").rstrip()
 
 
 @click.command()
