@@ -89,10 +89,11 @@ def demo(
     if cores() <= len(folders):
         late = f"{len(folders)} agents and the edge shared {cores()} cores, so frames waited for one another"
         click.echo(f"{late}; on machines of their own they do not")
+    picture = folder / "trajectories.png"
+    picture.unlink(missing_ok=True)  # of an earlier demo
     if result.joint is not None:
         from share.io.picture import draw_trajectories
 
-        picture = folder / "trajectories.png"
         title = f"joint ATE {100 * result.joint.joint.rmse:.2f} cm, causal, one alignment for all"
         paths = {name: (agent.map, agent.truth) for name, agent in result.agents.items()}
         draw_trajectories(picture, paths, result.joint.joint.T_truth_est, title)

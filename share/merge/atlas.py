@@ -138,15 +138,15 @@ class Atlas:
         map that he does not know of is due."""
         if not here:
             self._absent.add(agent)
-            return
-        stretch = self._chart.trails.current(agent) if agent in self._absent else None
-        self._absent.discard(agent)
-        founder = stretch if stretch is None else self._chart.founder[stretch]
-        if (
-            stretch is not None
-            and founder not in (None, stretch)
-            and self._surety.told(stretch, founder) is None
-        ):
+        elif agent in self._absent:
+            self._absent.remove(agent)
+            self._tell_soon(self._chart.trails.current(agent))
+
+    def _tell_soon(self, stretch: int | None) -> None:
+        founder = None if stretch is None else self._chart.founder[stretch]
+        if stretch is None or founder is None or founder == stretch:
+            return  # his own map's place is known
+        if self._surety.told(stretch, founder) is None:
             self._chart.unsolved[founder] = None
 
     def add_keyframe(self, agent: str, keyframe: Keyframe, rank: int = 0) -> int:
