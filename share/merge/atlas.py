@@ -140,13 +140,12 @@ class Atlas:
             self._absent.add(agent)
         elif agent in self._absent:
             self._absent.remove(agent)
-            self._tell_soon(self._chart.trails.current(agent))
+            if (stretch := self._chart.trails.current(agent)) is not None:
+                self._tell_soon(stretch)
 
-    def _tell_soon(self, stretch: int | None) -> None:
-        founder = None if stretch is None else self._chart.founder[stretch]
-        if stretch is None or founder is None or founder == stretch:
-            return  # his own map's place is known
-        if self._surety.told(stretch, founder) is None:
+    def _tell_soon(self, stretch: int) -> None:
+        founder = self._chart.founder[stretch]
+        if founder != stretch and self._surety.told(stretch, founder) is None:
             self._chart.unsolved[founder] = None
 
     def add_keyframe(self, agent: str, keyframe: Keyframe, rank: int = 0) -> int:
