@@ -127,7 +127,8 @@ class Mapper:
     def _rank(self, agent: str, founded: bool = False) -> int:
         """Who wears a headset sees a map move, so it is the others' maps that come to his; all come to one
         that an earlier life had."""
-        wears = form_of(self._config, self._hellos[agent]) is AgentKind.AR
+        hello = self._hellos.get(agent)  # a damaged file may have lost it
+        wears = hello is not None and form_of(self._config, hello) is AgentKind.AR
         return (0 if wears else 1) + (0 if founded else 2)
 
     def _founding(self, agent: str, keyframe: Keyframe) -> Finding:

@@ -10,7 +10,7 @@ import pytest
 from edge_sim import Person, walls
 
 from share.config import Config
-from share.core.keeping import Change, KeepKeyframe, KeepRun
+from share.core.keeping import Change, KeepKeyframe, KeepRun, Kept
 from share.core.mapper import Mapper
 from share.core.peer import known_runs
 from share.geometry import se3
@@ -142,3 +142,8 @@ def test_a_run_of_which_nothing_is_left_is_no_obstacle(tmp_path: Path) -> None:
         kept = store.load()
     Mapper(config).restore(kept)
     assert [run.finding for run in known_runs(kept, 0.05)] == [None]
+
+
+def test_a_stretch_whose_run_was_lost_is_no_obstacle() -> None:
+    """As a damaged file leaves it."""
+    Mapper(Config()).restore(Kept(stretches=("ann/0",)))
