@@ -183,7 +183,8 @@ class Atlas:
         for loop in loops:
             chart.tie(loop)
         for agent in {agent for agent, _ in stretches}:
-            if (current := chart.trails.current(agent)) is not None:
+            current = chart.trails.current(agent)
+            if current is not None and chart.trails.stretches[current].nodes:  # a damaged file may lack them
                 self._surety.remember(current, chart.founder[current])
         return numbers
 
@@ -273,13 +274,14 @@ class Atlas:
         )
 
     def _asked(self, founder: int, stretches: Sequence[int]) -> tuple[int, ...]:
-        """Whose covariance is worth its time: who is answered, or never heard how sure he is in this map."""
+        """Whose covariance is worth its time: who is answered, or never heard how sure he is in this map. Not
+        who is away and would come into it; but who was in it before a restart is told with his welcome."""
         trails = self._chart.trails
         return tuple(
             s
             for s in stretches
             if trails.current(agent := trails.stretches[s].agent) == s
-            and agent not in self._absent
+            and (agent not in self._absent or self._surety.heard(s, founder))
             and (agent in self._answers or self._surety.told(s, founder) is None)
         )
 
@@ -335,6 +337,8 @@ class Atlas:
             for stretch, last in zip(job.stretches, job.last, strict=True)
             if last in told and last in nodes
         }
+        self._surety.parted(self._chart.parted)
+        self._chart.parted.clear()
         waiting = self._surety.take(job.stretches[0], job.stretches, found)
         return {trails.stretches[s].agent: spread for s, spread in waiting.items()}
 

@@ -22,7 +22,8 @@ from share.types import F64, Keyframe
 
 class Chart:
     """poses: T_map_body (4, 4) of every node, by its number. plumb: which way is up there, if it is known
-    (`share.graph.plumb`). founder: of the map of each stretch."""
+    (`share.graph.plumb`). founder: of the map of each stretch. parted: stretches that were left in another
+    map when loops were taken back, since somebody last asked."""
 
     def __init__(self) -> None:
         self.trails = Trails()
@@ -30,6 +31,7 @@ class Chart:
         self.poses: dict[int, F64] = {}
         self.plumb: dict[int, F64] = {}
         self.founder: list[int] = []
+        self.parted: set[int] = set()
         self.bonds: Counter[tuple[int, int]] = Counter()  # loops by the two stretches that they tie
         self.unsolved: dict[int, None] = {}  # founders of maps with news, the oldest first
 
@@ -90,7 +92,9 @@ class Chart:
         stretches = [s for founder in touched for s in self.stretches_of(founder)]
         for number in numbers:
             self.unbind(number)
+        before = self.founder
         self.find_maps()
+        self.parted |= {s for s in stretches if self.founder[s] != before[s]}
         for founder in sorted({self.founder[s] for s in stretches}):
             anchor = self.anchor(founder)
             self.move(founder, self.trails.nodes[anchor].T_odom_body @ se3.inverse(self.poses[anchor]))

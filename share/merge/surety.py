@@ -37,17 +37,22 @@ class Surety:
         """An earlier life has told him of this map; how surely he is known there is yet to be found."""
         self._told[stretch] = (founder, None)
 
+    def heard(self, stretch: int, founder: int) -> bool:
+        """Whether he has heard of this map."""
+        return stretch in self._told and self._told[stretch][0] == founder
+
     def told(self, stretch: int, founder: int) -> F64 | None:
         """cov (6, 6) of T_map_odom, as last found; None if it was not, or he has not heard of this map."""
         known, cov = self._told.get(stretch, (None, None))
         return cov if known == founder else None
 
+    def parted(self, stretches: Collection[int]) -> None:
+        """A join that took these in was undone: if it is made again, it is waited for anew."""
+        self._waited = {pair: who for pair, who in self._waited.items() if pair[0] not in stretches}
+
     def take(self, founder: int, parts: Collection[int], found: Mapping[int, Found]) -> dict[int, float]:
         """What a solution of a map, of these stretches, says of those whom it was asked for. Returns who
         waits: his spread, m."""
-        parted = [(a, b) for a, b in self._waited if b == founder and a not in parts]
-        for pair in parted:  # that join was undone: if it is made again, it is waited for anew
-            del self._waited[pair]
         entering: dict[int, list[int]] = {}
         for s in found:
             before = self._told[s][0] if s in self._told else s

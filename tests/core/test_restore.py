@@ -96,7 +96,12 @@ def test_it_has_the_same_maps_and_goes_on(tmp_path: Path, most: int) -> None:
     there, then = second.mapper.poses(), first.mapper.poses()
     assert (there.keys, there.maps) == (then.keys, then.maps)
     assert np.array_equal(there.T_map_body, then.T_map_body)
-    second.work()  # everything is solved anew, from where it was
+    solve = second.mapper.next_solve()  # everything is solved anew, from where it was
+    assert solve is not None
+    found = second.mapper.done(solve, solve.run(second.solver), 1.0)
+    told = {one.agent: one.correction.map_id for one in found if one.correction is not None}
+    assert told == dict.fromkeys(("ann", "bob"), "ann/0")  # they are not back yet
+    second.work()
     assert np.abs(second.mapper.poses().T_map_body - then.T_map_body).max() < 0.02
     for _ in range(6):
         for person in people:

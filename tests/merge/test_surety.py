@@ -70,7 +70,7 @@ def test_a_join_that_was_undone_is_waited_for_anew(surety: Surety) -> None:
     for keyframe in range(4):
         surety.take(ANN, ALL, {BOB: known(20.0, answers=keyframe)})
     assert surety.told(BOB, ANN) is not None  # his patience was at an end
-    surety.take(ANN, [ANN, EVE], {EVE: known(0.0)})
+    surety.parted({BOB})
     surety.take(BOB, [BOB], {BOB: known(0.0)})
     assert surety.take(ANN, ALL, {BOB: known(60.0, answers=9)})
 
@@ -143,3 +143,23 @@ def test_nobody_waits_for_who_is_away_and_he_is_told_once_he_is_back() -> None:
     assert applied.corrections["bob"].map_id == "ann/0"
     atlas.present("bob", True)
     assert not atlas.due()
+
+
+@pytest.mark.parametrize("solved_between", [True, False])
+def test_a_join_that_was_undone_and_made_again_is_waited_for_anew(solved_between: bool) -> None:
+    """At once too, as where better evidence overthrows it."""
+    ann, bob = Walker("ann", 0), Walker("bob", 1, n=12, turn=3.5 * np.pi / 59 * 11)
+    config = MergeConfig(
+        join_places=1, near_m=1.0, near_rad=0.52, place_m=0.7, place_rad=0.5, enter_patience=1
+    )
+    atlas = Atlas(config)
+    for walker in (ann, bob):
+        for keyframe in walker.keyframes:
+            atlas.add_keyframe(walker.name, keyframe)
+    for first in (0, 2):
+        joined = [atlas.propose(faint(ann, bob, at)).joined for at in (first, first + 1)]
+        assert joined == [None, ("ann/0", "bob/0")]
+        assert settle(atlas)[-1].waiting.keys() == {"bob"}  # one keyframe of his has found loops
+        atlas._chart.drop(list(atlas._chart.ties.loops))
+        if solved_between:
+            settle(atlas)
