@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -110,19 +111,33 @@ _COUNTS = (
 
 def known_runs(kept: Kept, known_m: float) -> list[Known]:
     """Of all earlier lives. What comes after a run's last keyframe that is there is asked for. known_m: how
-    surely such a run's place in another's map is known until that is solved anew, 1 sigma."""
+    surely such a run's place in another's map is known until that is solved anew, 1 sigma.
+
+    Who was in a map that loops have joined to another since poses were kept is told once that is solved.
+    """
     cov = np.diag([0.0, 0.0, 0.0, *[known_m**2 / 3] * 3])
     last = {found.key: found.keyframe for found in kept.keyframes}
     there = placed(kept)
+    joined = _joined_since(
+        [{there[key][0] for key in (loop.a, loop.b) if key in there} for loop in kept.loops]
+    )
     out = []
     for run in kept.runs:
         if (found := last.get(run.key)) is None:
             out.append(Known(run.key, run.hello, None, 0))
             continue
         map_id, T_map_body = there[Key(run.key, found.id)]
+        if map_id in joined:
+            out.append(Known(run.key, run.hello, Foot(found.id, found.stamp_ns), found.id + 1))
+            continue
         T_map_odom = se3.orthonormal(T_map_body @ se3.inverse(found.T_odom_body))
         at_body = None if map_id.startswith(f"{run.key}/") else cov
         at_odom = None if at_body is None else se3.inverse_cov(found.T_odom_body, at_body)
         finding = in_map(run.key, map_id, T_map_odom, found.id, at_odom)
         out.append(Known(run.key, run.hello, Foot(found.id, found.stamp_ns), found.id + 1, finding))
     return out
+
+
+def _joined_since(ties: Sequence[set[str]]) -> set[str]:
+    """Maps that loops tie to others. ties: the maps at the ends of each loop."""
+    return set[str]().union(*(maps for maps in ties if len(maps) > 1))

@@ -152,3 +152,17 @@ def test_a_run_of_which_nothing_is_left_is_no_obstacle(tmp_path: Path) -> None:
 def test_a_stretch_whose_run_was_lost_is_no_obstacle() -> None:
     """As a damaged file leaves it."""
     Mapper(Config()).restore(Kept(stretches=("ann/0",)))
+
+
+def test_a_join_that_poses_were_not_kept_of_is_not_told_as_it_was_before(tmp_path: Path) -> None:
+    """The edge is killed within seconds of a join: loops are kept at once, poses now and then."""
+    config = Config()
+    apart, _ = walked(replace(config, place=replace(config.place, min_matches=10**6)))
+    before = apart.mapper.poses()
+    assert set(before.maps) == {"ann/0", "bob/0"}
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        store.write([*walked(config)[0].changes, before])
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        kept = store.load()
+    assert len(kept.loops) > 0
+    assert [run.finding for run in known_runs(kept, 0.05)] == [None, None]

@@ -74,8 +74,8 @@ class Rounds:
     def kill(self, victim: str, after_s: float) -> None:
         time.sleep(after_s)
         lives = [len(w.lives) for w in self.walkers]
-        until("all three are there", lambda: self._family())
-        pids = self._family()
+        pids: dict[str, int] = {}
+        until("all three are there", lambda: pids.update(self._family()) or pids)
         self.killed[victim] += 1
         began = time.monotonic()
         os.kill(pids[victim], signal.SIGKILL)
