@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from share.core.inorder import InOrder
 from share.core.keeping import Kept, placed
 from share.core.rate import SECOND_NS
 from share.geometry import se3
-from share.merge.join import Key
+from share.merge.join import Key, Loop
 from share.types import Keyframe, TrackState
 from share.wire.messages import Hello
 
@@ -118,9 +118,7 @@ def known_runs(kept: Kept, known_m: float) -> list[Known]:
     cov = np.diag([0.0, 0.0, 0.0, *[known_m**2 / 3] * 3])
     last = {found.key: found.keyframe for found in kept.keyframes}
     there = placed(kept)
-    joined = _joined_since(
-        [{there[key][0] for key in (loop.a, loop.b) if key in there} for loop in kept.loops]
-    )
+    joined = _joined_since(kept.loops, {key: map_id for key, (map_id, _) in there.items()})
     out = []
     for run in kept.runs:
         if (found := last.get(run.key)) is None:
@@ -138,6 +136,7 @@ def known_runs(kept: Kept, known_m: float) -> list[Known]:
     return out
 
 
-def _joined_since(ties: Sequence[set[str]]) -> set[str]:
-    """Maps that loops tie to others. ties: the maps at the ends of each loop."""
-    return set[str]().union(*(maps for maps in ties if len(maps) > 1))
+def _joined_since(loops: Iterable[Loop], map_of: Mapping[Key, str]) -> set[str]:
+    """Maps that loops tie to others."""
+    ends = ({map_of[key] for key in (loop.a, loop.b) if key in map_of} for loop in loops)
+    return set[str]().union(*(maps for maps in ends if len(maps) > 1))

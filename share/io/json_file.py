@@ -38,6 +38,11 @@ def known(value: Any) -> Any:
             return value
 
 
+def plain(value: Any) -> Any:
+    """As it comes back from JSON, in which what that does not know is text."""
+    return json.loads(json.dumps(value, default=str))
+
+
 def with_nan(row: dict[str, Any]) -> dict[str, Any]:
     """What `known` made of a row of numbers, as it was."""
     return {name: math.nan if value is None else value for name, value in row.items()}

@@ -67,16 +67,12 @@ def draw_each(folder: Path, trials: Sequence[Trial]) -> list[Path]:
     """PNG files in `folder`, two a session: its runs over time, by the names of their folders."""
     by_session: dict[Path, dict[str, Trial]] = {}
     for trial in trials:
-        by_session.setdefault(trial.session.folder, {})[_name(trial.folder)] = trial
+        by_session.setdefault(trial.session.folder, {})[trial.folder.resolve().name] = trial
     return [
         path
         for session, runs in by_session.items()
         for path in _over_time(folder, f"{session.name}-", runs).values()
     ]
-
-
-def _name(folder: Path) -> str:
-    return folder.resolve().name
 
 
 def _first(folder: Path, trials: Sequence[Trial]) -> dict[str, Path]:

@@ -19,7 +19,7 @@ from share.core.measurement import CAM0
 from share.errors import DataError, UsageError
 from share.io.code_state import code_state
 from share.io.files import atomic_write, new_folder
-from share.io.json_file import read_json
+from share.io.json_file import plain, read_json
 from share.io.machine import describe_machine
 from share.io.session import Session, read_session
 from share.io.source import open_source
@@ -110,16 +110,11 @@ def read_trial(folder: Path) -> Trial:
     if not Path(session).is_dir():
         raise UsageError(f"{path}: its session {session} is not there any more, and with it the truth")
     opened = read_session(Path(session))
-    if record.get("provenance", _plain(opened.provenance)) != _plain(opened.provenance):
+    if record.get("provenance", plain(opened.provenance)) != plain(opened.provenance):
         raise UsageError(
             f"{path}: its session {session} was made anew since, with another truth; play it again"
         )
     return Trial(folder, opened, terms, record)
-
-
-def _plain(value: Any) -> Any:
-    """As it comes back from JSON."""
-    return json.loads(json.dumps(value, default=str))
 
 
 def settings_of(config: Config, seed: int) -> str:

@@ -18,7 +18,7 @@ from share import __version__
 from share.config import Config
 from share.errors import DataError, UsageError
 from share.io.files import atomic_write
-from share.io.json_file import known, read_json, with_nan
+from share.io.json_file import known, plain, read_json, with_nan
 from share.io.machine import describe_machine
 from share.io.source import Source
 from share.io.trajectory import Trajectory, format_tum
@@ -129,9 +129,8 @@ def rows(
 
 def _made_by(source: Source, contender: Contender) -> dict[str, Any]:
     """As it comes back from JSON."""
-    told = {"recording": source.name, "tracker": contender.title, **contender.about}
-    back: dict[str, Any] = json.loads(json.dumps(told, default=str))
-    return back
+    told: dict[str, Any] = plain({"recording": source.name, "tracker": contender.title, **contender.about})
+    return told
 
 
 def check(name: str, source: Source) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from atlas_sim import Walker, loop, settle
@@ -100,14 +102,20 @@ def faint(ann: Walker, bob: Walker, at: int) -> Loop:
     return Loop(seen.a, seen.b, seen.T_a_b, sigma, 20)
 
 
-def test_a_correction_waits_until_the_map_knows_where_he_is() -> None:
+def apart(**settings: int) -> tuple[Atlas, Walker, Walker]:
+    """Ann and Bob, who see the same, each in a map of his own."""
     ann, bob = Walker("ann", 0), Walker("bob", 1, n=12, turn=3.5 * np.pi / 59 * 11)
     config = MergeConfig(join_places=1, near_m=1.0, near_rad=0.52, place_m=0.7, place_rad=0.5)
-    atlas = Atlas(config)
+    atlas = Atlas(replace(config, **settings))
     for walker in (ann, bob):
         for keyframe in walker.keyframes:
             atlas.add_keyframe(walker.name, keyframe)
     settle(atlas)
+    return atlas, ann, bob
+
+
+def test_a_correction_waits_until_the_map_knows_where_he_is() -> None:
+    atlas, ann, bob = apart()
     assert atlas.propose(faint(ann, bob, 0)).joined is None
     assert atlas.propose(faint(ann, bob, 1)).joined == ("ann/0", "bob/0")
     (applied,) = settle(atlas)
@@ -122,13 +130,7 @@ def test_a_correction_waits_until_the_map_knows_where_he_is() -> None:
 
 def test_nobody_waits_for_who_is_away_and_he_is_told_once_he_is_back() -> None:
     """As above; Bob is away while the map comes to know him well."""
-    ann, bob = Walker("ann", 0), Walker("bob", 1, n=12, turn=3.5 * np.pi / 59 * 11)
-    config = MergeConfig(join_places=1, near_m=1.0, near_rad=0.52, place_m=0.7, place_rad=0.5)
-    atlas = Atlas(config)
-    for walker in (ann, bob):
-        for keyframe in walker.keyframes:
-            atlas.add_keyframe(walker.name, keyframe)
-    settle(atlas)
+    atlas, ann, bob = apart()
     atlas.present("bob", False)
     atlas.propose(faint(ann, bob, 0))
     assert atlas.propose(faint(ann, bob, 1)).joined == ("ann/0", "bob/0")
@@ -148,14 +150,7 @@ def test_nobody_waits_for_who_is_away_and_he_is_told_once_he_is_back() -> None:
 @pytest.mark.parametrize("solved_between", [True, False])
 def test_a_join_that_was_undone_and_made_again_is_waited_for_anew(solved_between: bool) -> None:
     """At once too, as where better evidence overthrows it."""
-    ann, bob = Walker("ann", 0), Walker("bob", 1, n=12, turn=3.5 * np.pi / 59 * 11)
-    config = MergeConfig(
-        join_places=1, near_m=1.0, near_rad=0.52, place_m=0.7, place_rad=0.5, enter_patience=1
-    )
-    atlas = Atlas(config)
-    for walker in (ann, bob):
-        for keyframe in walker.keyframes:
-            atlas.add_keyframe(walker.name, keyframe)
+    atlas, ann, bob = apart(enter_patience=1)
     for first in (0, 2):
         joined = [atlas.propose(faint(ann, bob, at)).joined for at in (first, first + 1)]
         assert joined == [None, ("ann/0", "bob/0")]
