@@ -160,6 +160,7 @@ def bench(source: Source, estimator: Tracker, stages: Stages, most: int | None =
         pose_out = time.process_time()
         if result.keyframe:
             estimator.keyframe(frame)
+            estimator.settle()
         pose_ms.append(1e3 * (pose_out - cpu_began))
         keyframe_ms.append(1e3 * (time.process_time() - pose_out) if result.keyframe else np.nan)
         tracked += result.T_odom_body is not None

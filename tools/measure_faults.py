@@ -161,6 +161,7 @@ def tracked(rig: Rig, frames: list[Frame]) -> Run:
         result = tracker.track(frame)
         if result.keyframe:
             tracker.keyframe(frame)
+            tracker.settle()
         log.add(frame.stamp_ns, 1e3 * (time.process_time() - began), result.state, result.keyframe)
         log.stretches += result.new_stretch
         results.append(result)

@@ -111,6 +111,7 @@ def of_session(name: str, spent: list[float]) -> Row:
         tracks.see(frame.stamp_ns, tracker, room)
         if result.keyframe:
             tracker.keyframe(frame)
+            tracker.settle()
         tracks.begin(frame.stamp_ns, tracker, room)
     return {
         "session": name,

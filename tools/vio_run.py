@@ -76,6 +76,7 @@ def follow(source: Source, settings: Config) -> Told:
         if result.keyframe:
             began = time.process_time()
             tracker.keyframe(frame)
+            tracker.settle()
             told.keyframe_ms.append(1e3 * (time.process_time() - began))
         told.add(frame.stamp_ns, result)
     return told

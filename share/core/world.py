@@ -54,11 +54,12 @@ class Cost:
 
 @dataclass(frozen=True)
 class Costs:
-    """Of a frame and a keyframe at the agent; of a message at the edge's front; of what its mapper and its
-    solver do. Defaults: docs/scheduling.md."""
+    """Of a frame at the agent, a keyframe until it may be sent, and what is left to do of it; of a message at
+    the edge's front; of what its mapper and its solver do. Defaults: docs/scheduling.md."""
 
     frame: Cost = Cost(10.0, 16.0)
-    keyframe: Cost = Cost(5.0, 8.0)
+    keyframe: Cost = Cost(11.0, 12.5)
+    settle: Cost = Cost(13.5, 16.0)
     front: Cost = Cost(0.3, 1.0)
     add: Cost = Cost(0.4, 0.8)
     query: Cost = Cost(3.0, 5.0)
@@ -185,6 +186,7 @@ class World:
             member.busy_ns += self._draw(self._costs.keyframe)
             made = ev.KeyframeMade(frame, candidate)
             self._in(member.busy_ns - self.now_ns, lambda: self._to_agent(member, made))
+            member.busy_ns += self._draw(self._costs.settle)
         self._next_look(member)
 
     def _to_agent(self, member: _Member, event: ev.AgentEvent) -> None:

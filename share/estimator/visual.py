@@ -21,7 +21,7 @@ from share.estimator.pose import PoseEstimate, consensus, refine
 from share.estimator.result import TrackResult, typical
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
-from share.types import F32, F64, I64, U8, Candidate, Footing, Frame, TrackState, Wait
+from share.types import F32, F64, I64, U8, Candidate, Footing, Frame, TrackState, View, Wait
 from share.vision import corners, klt
 from share.vision.view import depth_at, make_view
 
@@ -63,11 +63,13 @@ class VisualTracker:
         self._new_stretch = True  # of the last keyframe
         self._T_shown = np.eye(4)  # T_odom_body of the last keyframe that others were told of
         self._to_anchor = False  # the last frame is to become a keyframe of the local map
+        self._unsettled: tuple[Frame, View] | None = None
         self._lost_since_ns: int | None = None
         self._places_tried = 0
 
     def track(self, frame: Frame) -> TrackResult:
         """The pose of this frame, causal. Frames must come with rising stamps."""
+        self.settle()
         if self._T_odom_cam is None:
             result = self._start(frame)
         elif self._lost_since_ns is not None:
@@ -84,16 +86,24 @@ class VisualTracker:
 
         Apart from `track`, because a headset should have its pose before this is computed.
         """
-        if self._to_anchor:
-            self._anchor(frame)
         view = make_view(frame, self._rig, self._config.view_features)
-        self._map.set_view(view)
+        new_stretch = self._new_stretch and not self._to_anchor
         T_odom_body = self._T_odom_body()
         up = T_odom_body[2, :3] if self._gravity else np.zeros(3)
-        T_last_body = T_odom_body if self._new_stretch else se3.inverse(self._T_shown) @ T_odom_body
+        T_last_body = T_odom_body if new_stretch else se3.inverse(self._T_shown) @ T_odom_body
         self._T_shown = T_odom_body
         cov = se3.compose_cov(self._T_cam_body, self._cov, np.zeros((6, 6)))
-        return Candidate(T_odom_body, T_last_body, cov, up, gravity.SIGMA_RAD, view, self._new_stretch)
+        self._unsettled = frame, view
+        return Candidate(T_odom_body, T_last_body, cov, up, gravity.SIGMA_RAD, view, new_stretch)
+
+    def settle(self) -> None:
+        """See `InertialTracker.settle`."""
+        if self._unsettled is None:
+            return
+        (frame, view), self._unsettled = self._unsettled, None
+        if self._to_anchor:
+            self._anchor(frame)
+        self._map.set_view(view)
 
     def footing(self) -> Footing:
         """Of the frame just tracked, one with a pose."""

@@ -174,6 +174,7 @@ class AgentRun:
         self._waits = result.waits
         if result.keyframe:
             self._post(ev.KeyframeMade(tracked, self._errors.keyframe(frame, self._tracker)))
+            self._tracker.settle()
         self._log.cpu_s += time.thread_time() - cpu
 
     def _post(self, event: ev.AgentEvent) -> None:

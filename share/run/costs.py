@@ -33,6 +33,7 @@ def costs_of(run: Path) -> Costs:
         Costs(**{name: _times(getattr(_USUAL, name), there) for name in ("front", "add", "judge", "apply")}),
         frame=frame,
         keyframe=_times(_USUAL.keyframe, here),
+        settle=_times(_USUAL.settle, here),
         query=query,
         accepted=verify,
         refused=verify,

@@ -41,6 +41,7 @@ def track(source: Source, settings: config.Config, told: Callable[[TrackResult],
         log.add_result(result.new_stretch, result.sound, result.waits)
         if result.keyframe:
             tracker.keyframe(frame)
+            tracker.settle()
         log.cpu_s += time.process_time() - cpu
         log.add(frame.stamp_ns, track_ms, result.state, result.keyframe)
         if result.T_odom_body is not None:

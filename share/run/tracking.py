@@ -73,6 +73,7 @@ def track_all(
         answer(Answered(key, life, _told(frame, result, new_stretch)))
         if result.keyframe:  # after its pose is out; what it shows to others is for nobody
             tracker.keyframe(frame)
+            tracker.settle()
 
 
 def _told(frame: Frame, result: TrackResult, new_stretch: bool) -> Tracked:

@@ -115,6 +115,27 @@ def test_keyframes_tell_the_motion_as_it_is_known_by_now(walk):
     assert np.sqrt((off**2).mean()) < 0.2 * np.sqrt((before**2).mean())
 
 
+def test_others_are_told_before_new_features_are_sought_and_nothing_depends_on_when(walk, tracked):
+    frames, rig, _ = walk
+    tracker, poses, shown, sought = InertialTracker(rig, InertialConfig(), TrackerConfig()), [], [], 0
+    for frame in frames:
+        result = tracker.track(frame)
+        poses.append(result.T_odom_body)
+        if result.keyframe:
+            before = len(tracker.state.ids)
+            shown.append(tracker.keyframe(frame))
+            assert len(tracker.state.ids) == before
+            tracker.settle()
+            sought += len(tracker.state.ids) > before
+    results, candidates, _ = tracked
+    assert sought
+    for mine, result in zip(poses, results, strict=True):
+        np.testing.assert_array_equal(mine, result.T_odom_body)
+    for mine, candidate in zip(shown, candidates, strict=True):
+        np.testing.assert_array_equal(mine.view.points, candidate.view.points)
+        np.testing.assert_array_equal(mine.cov, candidate.cov)
+
+
 class Late:
     """A source whose IMU has a clock of its own, as its calibration says."""
 

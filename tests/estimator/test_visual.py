@@ -50,6 +50,20 @@ def test_tracks_every_frame_to_the_centimetre(walk):
     assert not any(c.new_stretch for c in candidates[1:])
 
 
+def test_what_settles_a_keyframe_may_wait_for_the_next_frame(walk):
+    images, _ = walk
+    tracker, poses = VisualTracker(STEREO, DEFAULT), []
+    for i, (left, right) in enumerate(images[:30]):
+        frame = Frame(stamp(i), i, left, right)
+        result = tracker.track(frame)
+        poses.append(result.T_odom_body)
+        if result.keyframe:
+            tracker.keyframe(frame)
+            tracker.settle()
+    for mine, result in zip(poses, run(images[:30])[0], strict=True):
+        np.testing.assert_array_equal(mine, result.T_odom_body)
+
+
 def test_odom_starts_at_the_origin_with_z_up(walk):
     results, _ = run(walk[0][:1])
     T = results[0].T_odom_body

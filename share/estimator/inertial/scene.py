@@ -50,12 +50,15 @@ class Scene:
         self._next_feature = self._next_keyframe = 0
         self._last: tuple[Sought, NDArray[np.bool_], I64] | None = None  # frame: sought, believed, their ids
 
-    def add_keyframe(self, frame: Frame, rate: F64) -> None:
-        """The frame just tracked: its pose, features seen from about here before, and new ones."""
-        host = ekf.add_keyframe(self.state, self._next_keyframe, rate)
+    def add_keyframe(self, rate: F64) -> None:
+        """The frame just tracked: its pose."""
+        ekf.add_keyframe(self.state, self._next_keyframe, rate)
         self._next_keyframe += 1
+
+    def replenish(self, frame: Frame, rate: F64) -> None:
+        """The newest keyframe, made of `frame`: features seen from about here before, and new ones."""
         self._wake(frame, rate)
-        self._add_features(frame, host)
+        self._add_features(frame, host=len(self.state.keyframes) - 1)
         self._forget()
 
     def step(self, seconds: float, measured: bool) -> None:

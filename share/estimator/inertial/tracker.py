@@ -1,7 +1,8 @@
 """Odometry by cameras and IMU: a headset's own.
 
 A frame's way: IMU -> propagate -> where features should be -> find them by their patches -> gate ->
-update. A keyframe, after its pose is out: the pose joins the state, free corners become its features.
+update. A keyframe, after its pose is out: the pose joins the state and others are told what it shows; after
+that free corners become its features.
 Without the IMU the body is taken to go on as it does, without sight the IMU carries it for a while.
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +33,7 @@ from share.estimator.localmap import LocalKeyframe, LocalMap
 from share.estimator.result import TrackResult, typical
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
-from share.types import F64, U8, Candidate, Footing, Frame, ImuBatch, TrackState, Wait
+from share.types import F64, U8, Candidate, Footing, Frame, ImuBatch, TrackState, View, Wait
 from share.vision import corners
 from share.vision.view import make_view, measures_depth
 
@@ -44,6 +46,12 @@ _REST_RATE, _REST_M_S = 0.03, 0.02  # rad/s of a body at rest; m/s of its veloci
 _SLOW_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to a filter that knows it moves
 _PATIENCE = 10  # frames without a sample of the IMU, after which we begin without
 _LEVEL_RAD = np.radians(3.0)  # sigma of tilt up to which others are told what is up
+
+
+class _Unsettled(NamedTuple):
+    frame: Frame
+    view: View
+    fresh: bool  # its pose joined the state with it, and it has no features yet
 
 
 class InertialTracker:
@@ -68,6 +76,7 @@ class InertialTracker:
         self._ready = False
         self._knows_up = False  # the IMU said so
         self._new_stretch = False  # the next keyframe begins one
+        self._unsettled: _Unsettled | None = None
         self._T_keyframe = np.eye(4)
         self._shown, self._pivot = Shown(), Pivot()
         self._places = LocalMap(places.max_keyframes)  # where to look for oneself when LOST
@@ -86,6 +95,7 @@ class InertialTracker:
 
     def track(self, frame: Frame) -> TrackResult:
         """The pose of this frame, causal. Frames must come with rising stamps."""
+        self.settle()
         self._samples.add(frame.imu)
         result = self._begin(frame) if self._scene is None else self._follow(frame, self._scene)
         self._image, self._stamp_ns = frame.image0, frame.stamp_ns
@@ -95,18 +105,31 @@ class InertialTracker:
         """Make the frame just tracked a keyframe; call it where `track` said so. What it shows to others."""
         scene = self._scene
         assert scene is not None
-        if frame.stamp_ns != self._keyframe_ns:
-            self._anchor(frame, scene)
+        fresh = frame.stamp_ns != self._keyframe_ns
+        if fresh:
+            self._add_pose(frame, scene)
         new_stretch, self._new_stretch = self._new_stretch, False
         s = scene.state
         view = make_view(frame, self._rig, self._places_config.view_features, scene.depths(frame))
-        if not self._straying.suspected:
-            self._places.add_keyframe(frame.image0, s.T @ s.T_body_cam)
-            self._places.set_view(view)
         tilt = self._tilt(s)
         up = s.T[2, :3] if self._knows_up and tilt < _LEVEL_RAD else np.zeros(3)
         T_last_body, cov = self._shown.motion(s, new_stretch)
+        self._unsettled = _Unsettled(frame, view, fresh)
         return Candidate(self._pivot.told(s.T), T_last_body, cov, up, tilt / np.sqrt(2), view, new_stretch)
+
+    def settle(self) -> None:
+        """What `keyframe` left to do, half its work, and nobody waits for: new features, and the place to
+        find oneself by. For when the candidate is on its way; else the next `track` does it first."""
+        todo, self._unsettled = self._unsettled, None
+        if todo is None:
+            return
+        scene = self._scene
+        assert scene is not None
+        if todo.fresh:
+            self._replenish(todo.frame, scene)
+        if not self._straying.suspected:
+            self._places.add_keyframe(todo.frame.image0, scene.state.T @ scene.state.T_body_cam)
+            self._places.set_view(todo.view)
 
     def footing(self) -> Footing:
         """Of the frame just tracked, one with a pose."""
@@ -333,8 +356,15 @@ class InertialTracker:
         )
 
     def _anchor(self, frame: Frame, scene: Scene) -> None:
-        scene.add_keyframe(frame, self._rate)
+        self._add_pose(frame, scene)
+        self._replenish(frame, scene)
+
+    def _add_pose(self, frame: Frame, scene: Scene) -> None:
+        scene.add_keyframe(self._rate)
         self._keyframe_ns, self._T_keyframe = frame.stamp_ns, scene.state.T
+
+    def _replenish(self, frame: Frame, scene: Scene) -> None:
+        scene.replenish(frame, self._rate)
         self._keyframe_count = len(scene.state.ids)
 
     # ------------------------------------------------------------------ beginnings and losses
