@@ -13,6 +13,7 @@ import numpy as np
 
 from share.config import ControlConfig
 from share.control import pid
+from share.control.base_delay import BaseDelay
 from share.control.qoe import DELAY_MS, Needs, factors
 from share.types import AgentKind
 
@@ -75,6 +76,7 @@ class Share(Policy):
     """A PID controller for each agent takes its QoE to what it needs.
 
     With `attribution`, a QoE that is short because of delay lowers the rate: more keyframes would add to it.
+    But not because of a delay that the agent has at any rate, of which 20 ms count.
     """
 
     gated = True
@@ -84,10 +86,13 @@ class Share(Policy):
         super().__init__(config)
         self._gains = pid.Gains.of(config)
         self._states: dict[str, pid.State] = {}
+        self._bases: dict[str, BaseDelay] = {}
 
     def rate(
         self, agent: str, kind: AgentKind, delay_ms: float, error_cm: float | None, now_ns: int
     ) -> float | None:
+        if self._config.attribution:
+            delay_ms = self._avoidable(agent, delay_ms, now_ns)
         needs = self._needs(agent, kind)
         found = factors(delay_ms, error_cm, needs)
         error = needs.target - math.prod(found)
@@ -99,6 +104,12 @@ class Share(Policy):
 
     def forget(self, agent: str) -> None:
         self._states.pop(agent, None)
+        self._bases.pop(agent, None)
+
+    def _avoidable(self, agent: str, delay_ms: float, now_ns: int) -> float:
+        """ms, without what of the least delay of late is beyond 20 ms."""
+        base = self._bases[agent] = self._bases.get(agent, BaseDelay()).after(delay_ms, now_ns)
+        return delay_ms - max(0.0, base.ms - DELAY_MS)
 
     def _needs(self, agent: str, kind: AgentKind) -> Needs:
         return Needs.of(self._config, kind, agent)

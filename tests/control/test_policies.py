@@ -158,7 +158,7 @@ def test_by_attribution_delay_lowers_the_rate_and_error_raises_it() -> None:
     def last(delay_ms: float, error_cm: float, kind: AgentKind, attribution: bool) -> float:
         policy = made("share", replace(CONFIG, attribution=attribution))
         for t in range(30):
-            rate = policy.rate("ann", kind, delay_ms, error_cm, t * S)
+            rate = policy.rate("ann", kind, delay_ms if t else 15.0, error_cm, t * S)
         assert rate is not None
         return rate
 
@@ -167,3 +167,19 @@ def test_by_attribution_delay_lowers_the_rate_and_error_raises_it() -> None:
         assert last(delay_ms, 0.3, kind, attribution=True) == CONFIG.rate_min_hz
         assert last(15.0, 3.0, kind, attribution=True) == CONFIG.rate_max_hz
         assert last(15.0, 0.1, kind, attribution=True) == last(15.0, 0.1, kind, attribution=False) < 6
+
+
+def test_by_attribution_a_delay_that_is_there_at_any_rate_is_nobodys_fault() -> None:
+    """A keyframe may take 30 ms however few there are: the rate then is what the error asks for."""
+
+    def last(told: list[tuple[float, float]]) -> float | None:
+        policy = made("share", replace(CONFIG, attribution=True))
+        for t, (delay_ms, error_cm) in enumerate(told):
+            rate = policy.rate("ann", AgentKind.AR, delay_ms, error_cm, t * S)
+        return rate
+
+    for delay_ms in (15.0, 22.0, 25.0, 30.0, 60.0):
+        assert last([(delay_ms, 0.1)] * 60) == CONFIG.rate_min_hz
+        assert last([(delay_ms, 2.0)] * 60) == CONFIG.rate_max_hz
+    waits = [(30.0, 0.6)] * 60 + [(90.0, 0.6)] * 40
+    assert last(waits[:60]) == CONFIG.rate_max_hz and last(waits) == CONFIG.rate_min_hz
