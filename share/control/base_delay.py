@@ -6,7 +6,9 @@ single minutes, the newest ten: who has come to a worse network is measured by t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 _MINUTE_NS = 60_000_000_000
 _HISTORY = 10  # minutes
@@ -14,18 +16,18 @@ _HISTORY = 10  # minutes
 
 @dataclass(frozen=True)
 class BaseDelay:
-    """Of one agent. minima: (minute, ms), the oldest first; none before the first delay."""
+    """Of one agent. minima: ms by minute; none before the first delay."""
 
-    minima: tuple[tuple[int, float], ...] = ()
+    minima: Mapping[int, float] = field(default_factory=dict)
 
     @property
     def ms(self) -> float:
         """inf where nothing was heard."""
-        return min((least for _, least in self.minima), default=float("inf"))
+        return min(self.minima.values(), default=math.inf)
 
     def after(self, delay_ms: float, now_ns: int) -> BaseDelay:
         """With one more, heard at `now_ns`."""
         minute = now_ns // _MINUTE_NS
-        kept = [(of, least) for of, least in self.minima if minute - _HISTORY < of != minute]
-        least = min((least for of, least in self.minima if of == minute), default=delay_ms)
-        return BaseDelay((*kept, (minute, min(least, delay_ms))))
+        minima = {of: least for of, least in self.minima.items() if minute - of < _HISTORY}
+        minima[minute] = min(delay_ms, minima.get(minute, math.inf))
+        return BaseDelay(minima)
