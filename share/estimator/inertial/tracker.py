@@ -1,8 +1,7 @@
 """Odometry by cameras and IMU: a headset's own.
 
 A frame's way: IMU -> propagate -> where features should be -> find them by their patches -> gate ->
-update. A keyframe, after its pose is out: the pose joins the state and others are told what it shows; after
-that free corners become its features.
+update. After its pose is out, a keyframe (`keyframes`).
 Without the IMU the body is taken to go on as it does, without sight the IMU carries it for a while.
 """
 
@@ -10,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,20 +20,20 @@ from share.estimator.inertial.beginning import first_state, state_by_camera
 from share.estimator.inertial.features import Looks
 from share.estimator.inertial.health import Agreement, Straying
 from share.estimator.inertial.imu import integrate
+from share.estimator.inertial.keyframes import Keyframes
 from share.estimator.inertial.noise import louder, without
 from share.estimator.inertial.pivot import Pivot
 from share.estimator.inertial.samples import Samples, coasting, mean_rate, unclipped
 from share.estimator.inertial.scene import Scene
-from share.estimator.inertial.shown import Shown
 from share.estimator.inertial.state import VELOCITY, State
 from share.estimator.inertial.window import Window, window_for, without_force
 from share.estimator.localmap import LocalKeyframe, LocalMap
 from share.estimator.result import TrackResult, typical
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
-from share.types import F64, U8, Candidate, Footing, Frame, ImuBatch, TrackState, View, Wait
+from share.types import F64, U8, Candidate, Footing, Frame, ImuBatch, TrackState, Wait
 from share.vision import corners
-from share.vision.view import make_view, measures_depth
+from share.vision.view import measures_depth
 
 _READY_RAD, _READY_M_S = np.radians(3.0), 0.3  # sigmas of tilt and velocity: a pose is worth telling
 _FAR_OFF_PX = 1.0  # median residual, from which derivatives are taken anew
@@ -46,12 +44,6 @@ _REST_RATE, _REST_M_S = 0.03, 0.02  # rad/s of a body at rest; m/s of its veloci
 _SLOW_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to a filter that knows it moves
 _PATIENCE = 10  # frames without a sample of the IMU, after which we begin without
 _LEVEL_RAD = np.radians(3.0)  # sigma of tilt up to which others are told what is up
-
-
-class _Unsettled(NamedTuple):
-    frame: Frame
-    view: View
-    fresh: bool  # its pose joined the state with it, and it has no features yet
 
 
 class InertialTracker:
@@ -68,7 +60,7 @@ class InertialTracker:
         self._scene: Scene | None = None
         self._window: Window | None = None  # of a single camera, until its scale is known
         self._image: U8 | None = None
-        self._stamp_ns = self._keyframe_ns = self._keyframe_count = 0
+        self._stamp_ns = 0
         self._rate = np.zeros(3)
         self._straying = Straying(config.weak, config.blind)
         self._agreement, self._surprise = Agreement(), np.zeros(0)  # of the frame
@@ -76,9 +68,7 @@ class InertialTracker:
         self._ready = False
         self._knows_up = False  # the IMU said so
         self._new_stretch = False  # the next keyframe begins one
-        self._unsettled: _Unsettled | None = None
-        self._T_keyframe = np.eye(4)
-        self._shown, self._pivot = Shown(), Pivot()
+        self._keyframes, self._pivot = Keyframes(rig, config, places.view_features), Pivot()
         self._places = LocalMap(places.max_keyframes)  # where to look for oneself when LOST
         self._places_config, self._seed, self._places_tried = places, seed, 0
         self._lost_ns: int | None = None
@@ -105,31 +95,20 @@ class InertialTracker:
         """Make the frame just tracked a keyframe; call it where `track` said so. What it shows to others."""
         scene = self._scene
         assert scene is not None
-        fresh = frame.stamp_ns != self._keyframe_ns
-        if fresh:
-            self._add_pose(frame, scene)
         new_stretch, self._new_stretch = self._new_stretch, False
-        s = scene.state
-        view = make_view(frame, self._rig, self._places_config.view_features, scene.depths(frame))
-        tilt = self._tilt(s)
+        view, T_last_body, cov = self._keyframes.show(frame, scene, self._rate, new_stretch)
+        s, tilt = scene.state, self._tilt(scene.state)
         up = s.T[2, :3] if self._knows_up and tilt < _LEVEL_RAD else np.zeros(3)
-        T_last_body, cov = self._shown.motion(s, new_stretch)
-        self._unsettled = _Unsettled(frame, view, fresh)
         return Candidate(self._pivot.told(s.T), T_last_body, cov, up, tilt / np.sqrt(2), view, new_stretch)
 
     def settle(self) -> None:
         """What `keyframe` left to do, half its work, and nobody waits for: new features, and the place to
         find oneself by. For when the candidate is on its way; else the next `track` does it first."""
-        todo, self._unsettled = self._unsettled, None
-        if todo is None:
-            return
-        scene = self._scene
-        assert scene is not None
-        if todo.fresh:
-            self._replenish(todo.frame, scene)
-        if not self._straying.suspected:
-            self._places.add_keyframe(todo.frame.image0, scene.state.T @ scene.state.T_body_cam)
-            self._places.set_view(todo.view)
+        done = self._keyframes.settle(self._scene, self._rate)
+        if done is not None and self._scene is not None and not self._straying.suspected:
+            s = self._scene.state
+            self._places.add_keyframe(done.frame.image0, s.T @ s.T_body_cam)
+            self._places.set_view(done.view)
 
     def footing(self) -> Footing:
         """Of the frame just tracked, one with a pose."""
@@ -173,10 +152,10 @@ class InertialTracker:
             return self._lose(frame)
         if state is TrackState.LOST:
             return TrackResult(state, None)
-        wanted = textured and self._wants_keyframe(frame, scene, count)
+        wanted = textured and self._keyframes.wanted(frame.stamp_ns, scene.state.T, count)
         if state is TrackState.INITIALISING:
             if wanted:
-                self._anchor(frame, scene)
+                self._keyframes.anchor(frame, scene, self._rate)
             if not self._solved(frame, scene, wanted):
                 return self._initialising(scene.state)
             state, wanted = TrackState.OK, True
@@ -342,31 +321,6 @@ class InertialTracker:
         """At the frame's stamp, IMU time: the state is where the image was taken."""
         return self._pivot.told(se3.exp(-ekf.twist(s, self._rate) * s.offset_s) @ s.T)
 
-    # ------------------------------------------------------------------ keyframes
-
-    def _wants_keyframe(self, frame: Frame, scene: Scene, count: int) -> bool:
-        config = self._config
-        if frame.stamp_ns - self._keyframe_ns < config.keyframe_gap_s * 1e9:
-            return False
-        motion = se3.log(se3.inverse(self._T_keyframe) @ scene.state.T)
-        return bool(
-            np.linalg.norm(motion[3:]) > config.keyframe_m
-            or np.linalg.norm(motion[:3]) > config.keyframe_rad
-            or count < config.keyframe_seen * self._keyframe_count
-        )
-
-    def _anchor(self, frame: Frame, scene: Scene) -> None:
-        self._add_pose(frame, scene)
-        self._replenish(frame, scene)
-
-    def _add_pose(self, frame: Frame, scene: Scene) -> None:
-        scene.add_keyframe(self._rate)
-        self._keyframe_ns, self._T_keyframe = frame.stamp_ns, scene.state.T
-
-    def _replenish(self, frame: Frame, scene: Scene) -> None:
-        scene.replenish(frame, self._rate)
-        self._keyframe_count = len(scene.state.ids)
-
     # ------------------------------------------------------------------ beginnings and losses
 
     def _begin(self, frame: Frame) -> TrackResult:
@@ -387,7 +341,7 @@ class InertialTracker:
             state.T = found @ se3.inverse(self._rig.T_body_cam0)
         scene = Scene(state, self._rig, self._config)
         self._rate = self._samples.all.gyro[-1] - state.bg if len(self._samples.all) else np.zeros(3)
-        self._anchor(frame, scene)
+        self._keyframes.anchor(frame, scene, self._rate)
         if len(state.ids) < self._config.weak:
             return TrackResult(waiting, None, waits=Wait.VIEW)
         self._scene, self._ready = scene, False
@@ -403,7 +357,7 @@ class InertialTracker:
     def _lose(self, frame: Frame) -> TrackResult:
         """What is left of the filter is worth nothing."""
         self._scene, self._straying = None, Straying(self._config.weak, self._config.blind)
-        self._shown.forget()
+        self._keyframes.forget()
         if self._window is not None:  # there was nothing to lose
             return TrackResult(TrackState.INITIALISING, None, waits=Wait.SCALE)
         self._ready, self._lost_ns = False, frame.stamp_ns

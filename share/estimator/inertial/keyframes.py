@@ -1,0 +1,93 @@
+"""Keyframes of a headset's own odometry: when it wants one, what that shows to others, and what can wait.
+
+Others are told as soon as its pose has joined the filter's state. Half the work is for the tracker itself,
+and is done once what others are told is on its way: features of its free corners, and a place to find
+oneself by.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from share.config import InertialConfig
+from share.estimator.inertial.scene import Scene
+from share.estimator.inertial.shown import Shown
+from share.geometry import se3
+from share.geometry.camera import Rig
+from share.types import F64, Frame, View
+from share.vision.view import make_view
+
+
+class Showing(NamedTuple):
+    """Of a keyframe: its view, T_last_body (4, 4) since the one shown before, and its covariance (6, 6)."""
+
+    view: View
+    T_last_body: F64
+    cov: F64
+
+
+class Unsettled(NamedTuple):
+    """A keyframe that others have been told of."""
+
+    frame: Frame
+    view: View
+    fresh: bool  # its pose joined the state with it, and it has no features yet
+
+
+class Keyframes:
+    """Those of one tracker, newest last in its scene."""
+
+    def __init__(self, rig: Rig, config: InertialConfig, view_features: int) -> None:
+        self._rig, self._config, self._view_features = rig, config, view_features
+        self._stamp_ns = self._features = 0  # of the newest
+        self._T_odom_body = np.eye(4)
+        self._shown = Shown()
+        self._unsettled: Unsettled | None = None
+
+    def wanted(self, stamp_ns: int, T_odom_body: F64, seen: int) -> bool:
+        """Whether a frame with so many features seen is to be one: moved, turned, or little left in view."""
+        config = self._config
+        if stamp_ns - self._stamp_ns < config.keyframe_gap_s * 1e9:
+            return False
+        motion = se3.log(se3.inverse(self._T_odom_body) @ T_odom_body)
+        return bool(
+            np.linalg.norm(motion[3:]) > config.keyframe_m
+            or np.linalg.norm(motion[:3]) > config.keyframe_rad
+            or seen < config.keyframe_seen * self._features
+        )
+
+    def anchor(self, frame: Frame, scene: Scene, rate: F64) -> None:
+        """Make the frame just tracked one, all at once: where nobody else is told yet. rate (3,): rad/s."""
+        self._add_pose(frame, scene, rate)
+        self._add_features(frame, scene, rate)
+
+    def show(self, frame: Frame, scene: Scene, rate: F64, new_stretch: bool) -> Showing:
+        """Make the frame just tracked one, if it is not; the rest waits for `settle`."""
+        fresh = frame.stamp_ns != self._stamp_ns
+        if fresh:
+            self._add_pose(frame, scene, rate)
+        view = make_view(frame, self._rig, self._view_features, scene.depths(frame))
+        self._unsettled = Unsettled(frame, view, fresh)
+        return Showing(view, *self._shown.motion(scene.state, new_stretch))
+
+    def settle(self, scene: Scene | None, rate: F64) -> Unsettled | None:
+        """What `show` left to do. The keyframe that it was done for, if there was any."""
+        todo, self._unsettled = self._unsettled, None
+        if todo is not None and todo.fresh:
+            assert scene is not None
+            self._add_features(todo.frame, scene, rate)
+        return todo
+
+    def forget(self) -> None:
+        """The filter begins anew, and numbers its keyframes anew."""
+        self._shown.forget()
+
+    def _add_pose(self, frame: Frame, scene: Scene, rate: F64) -> None:
+        scene.add_keyframe(rate)
+        self._stamp_ns, self._T_odom_body = frame.stamp_ns, scene.state.T
+
+    def _add_features(self, frame: Frame, scene: Scene, rate: F64) -> None:
+        scene.replenish(frame, rate)
+        self._features = len(scene.state.ids)
