@@ -1,0 +1,72 @@
+"""A recording at its own pace: decoded ahead, and never while the tracker works on a frame."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from share.run.arrivals import READ_AHEAD, Played
+from share.run.late import Late
+from share.types import Frame, ImuBatch
+
+_PATIENCE_S = 5.0
+_WHILE_S = 0.3  # in which a thread that is free to decode would
+
+
+class _Recording:
+    """Frames that are all due at once; counts those that were decoded, and fails at number `broken`."""
+
+    def __init__(self, count: int, broken: int = -1) -> None:
+        self._count, self._broken = count, broken
+        self.decoded = 0
+        self.changed = threading.Condition()
+
+    def frames(self) -> Iterator[Frame]:
+        for index in range(self._count):
+            if index == self._broken:
+                raise ValueError("cannot be read on")
+            with self.changed:
+                self.decoded += 1
+                self.changed.notify_all()
+            yield Frame(0, index, np.zeros((2, 2), np.uint8), None, None, ImuBatch.empty())
+
+    def reaches(self, decoded: int, within_s: float = _PATIENCE_S) -> bool:
+        with self.changed:
+            return self.changed.wait_for(lambda: self.decoded >= decoded, within_s)
+
+
+def test_nothing_is_decoded_while_the_tracker_has_a_frame() -> None:
+    recording = _Recording(2 * READ_AHEAD)
+    played = Played(recording.frames, Late(0.0)).each()
+    next(played)
+    assert recording.reaches(READ_AHEAD)
+    assert not recording.reaches(READ_AHEAD + 1, _WHILE_S)
+    next(played)  # it is done with the first
+    assert recording.reaches(READ_AHEAD + 1)
+
+
+def test_every_frame_comes_in_order_and_the_end_ends_it() -> None:
+    count = 3 * READ_AHEAD
+    played = Played(_Recording(count).frames, Late(0.0)).each()
+    assert [frame.index for frame, _ in played] == list(range(count))
+
+
+def test_what_cannot_be_read_on_is_raised_after_the_frames_before_it() -> None:
+    played = Played(_Recording(50, broken=40).frames, Late(0.0)).each()
+    assert [next(played)[0].index for _ in range(40)] == list(range(40))
+    with pytest.raises(ValueError, match="cannot be read on"):
+        next(played)
+
+
+def test_a_stop_ends_it_while_the_reader_waits_for_room() -> None:
+    recording = _Recording(2 * READ_AHEAD)
+    arrivals = Played(recording.frames, Late(0.0))
+    played = arrivals.each()
+    next(played)
+    assert recording.reaches(READ_AHEAD)
+    arrivals.stop()
+    assert list(played) == []
+    assert not [t for t in threading.enumerate() if t.name == "reader"]
