@@ -85,25 +85,22 @@ class LocalMap:
         numbers = np.array(sorted(self.keyframes), np.int64)
         if len(numbers) == 0:
             return []
-        distance, angle = self._apart(T_odom_cam, numbers)
+        (distance,), (angle,) = se3.apart(T_odom_cam[None], self._poses(numbers))
         near = (distance < max_m) & (angle < max_rad)
         cost = distance + angle
         return [int(n) for n in numbers[near][np.argsort(cost[near], kind="stable")]]
 
-    def _apart(self, T_odom_cam: F64, numbers: I64) -> tuple[F64, F64]:
-        T = np.stack([self.keyframes[int(n)].T_odom_cam for n in numbers])
-        distance = np.linalg.norm(T[:, :3, 3] - T_odom_cam[:3, 3], axis=1)
-        trace = np.einsum("nij,ij->n", T[:, :3, :3], T_odom_cam[:3, :3])
-        return distance, np.arccos(np.clip((trace - 1) / 2, -1, 1))
+    def _poses(self, numbers: I64) -> F64:
+        return np.stack([self.keyframes[int(n)].T_odom_cam for n in numbers])
 
     def _most_redundant(self) -> int:
         """The older keyframe of the closest pair."""
         numbers = np.array(sorted(self.keyframes), np.int64)
-        nearest = np.full(len(numbers), np.inf)
-        for i in range(len(numbers) - 1):  # the newest is never dropped
-            distance, angle = self._apart(self.keyframes[int(numbers[i])].T_odom_cam, numbers[i + 1 :])
-            nearest[i] = (distance + angle).min()
-        return int(numbers[np.argmin(nearest)])
+        poses = self._poses(numbers)
+        distance, angle = se3.apart(poses[:-1], poses)  # the newest is never dropped
+        cost = distance + angle
+        cost[np.tril_indices_from(cost)] = np.inf
+        return int(numbers[np.argmin(cost.min(axis=1))])
 
     def _drop(self, number: int) -> None:
         del self.keyframes[number]

@@ -169,6 +169,15 @@ def angle(R: F64) -> F64:
     return out
 
 
+def apart(T: F64, others: F64) -> tuple[F64, F64]:
+    """How far poses (N, 4, 4) are from others (M, 4, 4), m and rad, (N, M) each. For many at a time: what is
+    less than some 1e-8 of how far they are from the origin, or 1e-8 rad, is rounding."""
+    p, q = T[:, :3, 3], others[:, :3, 3]
+    square = (p**2).sum(axis=1)[:, None] + (q**2).sum(axis=1) - 2 * p @ q.T
+    cosine2 = T[:, :3, :3].reshape(-1, 9) @ others[:, :3, :3].reshape(-1, 9).T - 1
+    return np.sqrt(np.maximum(square, 0.0)), np.arccos(np.clip(cosine2 / 2, -1, 1))
+
+
 def orthonormal(T: F64) -> F64:
     """The rigid transform nearest to T (..., 4, 4): removes drift of repeated products."""
     U, _, Vt = np.linalg.svd(T[..., :3, :3])

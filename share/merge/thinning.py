@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from share.geometry import se3
 from share.graph.contract import contract
 from share.graph.posegraph import Edge
 from share.merge.chart import Chart
@@ -89,10 +90,7 @@ def take_out(chart: Chart, number: int, most_loops: int) -> TakenOut:
 
 
 def _unlike(poses: F64, apart_m: float, apart_rad: float) -> F64:
-    p, R = poses[:, :3, 3], poses[:, :3, :3].reshape(-1, 9)
-    square = (p**2).sum(1)
-    shift = np.sqrt(np.maximum(square[:, None] + square - 2 * p @ p.T, 0.0))
-    angle = np.arccos(np.clip((R @ R.T - 1) / 2, -1, 1))
+    shift, angle = se3.apart(poses, poses)
     gap: F64 = shift / apart_m + angle / apart_rad
     return gap
 

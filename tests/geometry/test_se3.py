@@ -86,6 +86,18 @@ def test_angle_is_that_of_the_logarithm_from_nothing_to_half_a_turn() -> None:
         assert abs(se3.angle(se3.so3_exp(radians * axis)) - radians) < 1e-8
 
 
+def test_poses_are_as_far_apart_as_one_by_one(rng):
+    poses, others = (se3.exp(rng.normal(0, 1, (n, 6))) for n in (5, 7))
+    metres, radians = se3.apart(poses, others)
+    for i, T in enumerate(poses):
+        for j, other in enumerate(others):
+            between = se3.inverse(T) @ other
+            assert metres[i, j] == pytest.approx(np.linalg.norm(between[:3, 3]), abs=1e-12)
+            assert radians[i, j] == pytest.approx(float(se3.angle(between)), abs=1e-7)
+    for gap in se3.apart(poses, poses):
+        assert np.diagonal(gap) == pytest.approx(0.0, abs=1e-7)
+
+
 def test_the_spread_of_a_position_is_of_its_translation_alone():
     cov = np.diag([100.0, 100.0, 100.0, 0.04, 0.05, 0.07])
     assert se3.position_sigma(cov) == pytest.approx(0.4)

@@ -67,8 +67,7 @@ class Memory:
     def near(self, state: State, max_m: float, max_rad: float, most: int) -> Asleep | None:
         """Those of the keyframes that look from about here, the nearest ones first until there are `most`;
         their hosts are numbers in the state. None where there are none."""
-        apart = se3.log(se3.inverse(state.poses) @ state.T)
-        far, turned = np.linalg.norm(apart[:, 3:], axis=1), np.linalg.norm(apart[:, :3], axis=1)
+        (far,), (turned,) = se3.apart(state.T[None], state.poses)
         out: Asleep | None = None
         for k in np.argsort(far + turned, kind="stable").tolist():
             mine = self._of.get(int(state.keyframes[k]))

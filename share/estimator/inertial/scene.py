@@ -231,8 +231,8 @@ class Scene:
         leave[-2:] = False
         while len(s.keyframes) - leave.sum() > self._config.max_keyframes:
             left = np.flatnonzero(~leave)
-            apart = se3.log(se3.inverse(s.poses[left, None]) @ s.poses[None, left])
-            cost = np.linalg.norm(apart[..., 3:], axis=-1) + np.linalg.norm(apart[..., :3], axis=-1)
+            distance, angle = se3.apart(s.poses[left], s.poses[left])
+            cost = distance + angle
             cost[np.diag_indices(len(left))] = np.inf
             nearest = cost.min(axis=1) + _FAR * busy[left]
             nearest[-2:] = np.inf
