@@ -29,15 +29,12 @@ class Arrivals(Protocol):
 class Played:
     """A recording at its own pace, decoded ahead in a thread of its own, which waits for room (`block`).
 
-    There is room for one more only when the tracker is done with a frame: decoding, which no camera asks
-    for, takes nothing from the frame that somebody waits for. What cannot be read on is raised after the
-    frames before it.
+    What cannot be read on is raised after the frames before it.
     """
 
     def __init__(self, frames: Frames, late: Late) -> None:
         self._frames, self._late = frames, late
-        self._queue: queue.SimpleQueue[Frame | None] = queue.SimpleQueue()
-        self._room = threading.Semaphore(READ_AHEAD)
+        self._queue: queue.Queue[Frame | None] = queue.Queue(READ_AHEAD)
         self._stop = threading.Event()
         self._error: BaseException | None = None
 
@@ -72,23 +69,25 @@ class Played:
             behind_ns, another = time.monotonic_ns() - due, not self._queue.empty()
             if (taken := self._late.take(frame, behind_ns, another)) is not None:
                 yield taken, due
-            self._room.release()
 
     def _read(self) -> None:
         try:
-            frames = self._frames()
-            while self._has_room() and (frame := next(frames, None)) is not None:
-                self._queue.put(frame)
+            for frame in self._frames():
+                if not self._put(frame):
+                    return
         except BaseException as error:
             self._error = error
         finally:
-            self._queue.put(None)
+            self._put(None)
 
-    def _has_room(self) -> bool:
-        """Waits for it; False when the run is over."""
+    def _put(self, frame: Frame | None) -> bool:
+        """Wait for room, unless the run is over."""
         while not self._stop.is_set():
-            if self._room.acquire(timeout=_WAIT_S):
+            try:
+                self._queue.put(frame, timeout=_WAIT_S)
                 return True
+            except queue.Full:
+                continue
         return False
 
 
