@@ -59,7 +59,7 @@ class Costs:
 
     frame: Cost = Cost(10.0, 16.0)
     keyframe: Cost = Cost(11.0, 12.5)
-    settle: Cost = Cost(13.5, 16.0)
+    settle: Cost = Cost(10.0, 12.0)
     front: Cost = Cost(0.3, 1.0)
     add: Cost = Cost(0.4, 0.8)
     query: Cost = Cost(3.0, 5.0)

@@ -15,7 +15,7 @@ def command(*arguments: str) -> list[str]:
     """The command line that runs `share ARGUMENTS` with this very program."""
     if getattr(sys, "frozen", False):
         return [sys.executable, *arguments]
-    return [sys.executable, "-m", "share", *arguments]
+    return [sys.executable, "-P", "-m", "share", *arguments]  # -P: not a folder `share` of whoever calls
 
 
 @contextlib.contextmanager

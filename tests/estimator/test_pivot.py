@@ -10,6 +10,8 @@ import pytest
 from share.estimator.inertial.pivot import Pivot
 from share.geometry import se3
 
+BEGAN = np.array([1.0, 0.0, 0.0])
+
 
 @dataclass
 class State:
@@ -43,7 +45,7 @@ def turned(phi: tuple[float, float, float], about: float = 1.0) -> np.ndarray:
 def pivot() -> Pivot:
     out = Pivot()
     first = State(T=at(1.0))
-    out.begin(first, anew=True)
+    out.begin(first, BEGAN, anew=True)
     out.after(State())
     assert (out.told(State().T) == State().T).all()
     return out
@@ -56,6 +58,14 @@ def test_a_body_stays_where_it_was_when_up_is_learnt(pivot):
     told = pivot.told(learnt.T)
     assert told[:3, 3] == pytest.approx([5, 0, 0], abs=1e-9)
     assert (told[:3, :3] == learnt.T[:3, :3]).all()  # up is right at once
+
+
+def test_the_filter_turns_about_where_it_began_not_where_it_was_first_told():
+    pivot = Pivot()
+    pivot.begin(State(), BEGAN, anew=True)  # 4 m from there
+    learnt = State().moved(turned((0.0, 0.05, 0.0)))
+    pivot.after(learnt)
+    assert pivot.told(learnt.T)[:3, 3] == pytest.approx([5, 0, 0], abs=1e-9)
 
 
 def test_what_follows_goes_on_from_there(pivot):
@@ -88,7 +98,7 @@ def test_after_a_loss_odom_is_the_same_and_anew_it_is_not(pivot):
     pivot.after(learnt)
     shift = pivot.shift
     assert np.linalg.norm(shift) > 0.1
-    pivot.begin(State(), anew=False)
+    pivot.begin(State(), BEGAN, anew=False)
     assert (pivot.shift == shift).all()
-    pivot.begin(State(), anew=True)
+    pivot.begin(State(), BEGAN, anew=True)
     assert (pivot.shift == 0).all()

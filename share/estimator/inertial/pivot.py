@@ -26,10 +26,10 @@ class Pivot:
         self._about = np.zeros(3)
         self._keyframes, self._R = np.zeros(0, np.int64), np.zeros((0, 3, 3))
 
-    def begin(self, s: State, anew: bool) -> None:
-        """A filter begins, at `s`. anew: so does odom."""
+    def begin(self, s: State, about: F64, anew: bool) -> None:
+        """Poses are told from `s` on, by a filter that began at `about` (3,). anew: so does odom."""
         self.shift = np.zeros(3) if anew else self.shift
-        self._about = s.T[:3, 3].copy()
+        self._about = about
         self._remember(s)
 
     def after(self, s: State) -> None:

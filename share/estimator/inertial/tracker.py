@@ -23,9 +23,10 @@ from share.estimator.inertial.imu import integrate
 from share.estimator.inertial.keyframes import Keyframes
 from share.estimator.inertial.noise import louder, without
 from share.estimator.inertial.pivot import Pivot
+from share.estimator.inertial.readiness import converged, tilt, waits_for, worth_telling
 from share.estimator.inertial.samples import Samples, coasting, mean_rate, unclipped
 from share.estimator.inertial.scene import Scene
-from share.estimator.inertial.state import VELOCITY, State
+from share.estimator.inertial.state import State
 from share.estimator.inertial.window import Window, window_for, without_force
 from share.estimator.localmap import LocalKeyframe, LocalMap
 from share.estimator.result import TrackResult, typical
@@ -35,7 +36,6 @@ from share.types import F64, U8, Candidate, Footing, Frame, ImuBatch, TrackState
 from share.vision import corners
 from share.vision.view import measures_depth
 
-_READY_RAD, _READY_M_S = np.radians(3.0), 0.3  # sigmas of tilt and velocity: a pose is worth telling
 _FAR_OFF_PX = 1.0  # median residual, from which derivatives are taken anew
 _MINORITY, _MAJORITY = 0.3, 0.7  # of what is found: believed by the filter; agreeing among itself
 _GAP_NS = 250_000_000  # between frames: more than an IMU of this sort is modelled for,
@@ -65,6 +65,7 @@ class InertialTracker:
         self._straying = Straying(config.weak, config.blind)
         self._agreement, self._surprise = Agreement(), np.zeros(0)  # of the frame
         self._waited = 0  # frames, for the IMU
+        self._begun_ns, self._begun_at = 0, np.zeros(3)
         self._ready = False
         self._knows_up = False  # the IMU said so
         self._new_stretch = False  # the next keyframe begins one
@@ -97,9 +98,9 @@ class InertialTracker:
         assert scene is not None
         new_stretch, self._new_stretch = self._new_stretch, False
         view, T_last_body, cov = self._keyframes.show(frame, scene, self._rate, new_stretch)
-        s, tilt = scene.state, self._tilt(scene.state)
-        up = s.T[2, :3] if self._knows_up and tilt < _LEVEL_RAD else np.zeros(3)
-        return Candidate(self._pivot.told(s.T), T_last_body, cov, up, tilt / np.sqrt(2), view, new_stretch)
+        s, unsure = scene.state, tilt(scene.state)
+        up = s.T[2, :3] if self._knows_up and unsure < _LEVEL_RAD else np.zeros(3)
+        return Candidate(self._pivot.told(s.T), T_last_body, cov, up, unsure / np.sqrt(2), view, new_stretch)
 
     def settle(self) -> None:
         """What `keyframe` left to do, half its work, and nobody waits for: new features, and the place to
@@ -172,13 +173,13 @@ class InertialTracker:
         if imu is None or window.full or measures_depth(frame, self._rig):
             self._scene = self._window = None  # begin anew
             return False
-        return window.solved(scene, imu, anchored) and self._converged(s)
+        return window.solved(scene, imu, anchored) and converged(s)
 
     def _told(self, s: State, state: TrackState, wanted: bool, count: int) -> TrackResult:
         first, self._ready, self._window = not self._ready, True, None
         new_stretch = first and self._new_stretch
         if first:
-            self._pivot.begin(s, new_stretch)
+            self._pivot.begin(s, self._begun_at, new_stretch)
         else:
             self._pivot.after(s)
         sound = self._agreement.sound
@@ -287,7 +288,7 @@ class InertialTracker:
 
     def _judge(self, s: State, count: int, heard: bool) -> TrackState:
         config = self._config
-        if self._window is not None or (heard and not self._ready and not self._converged(s)):
+        if self._window is not None or (heard and not self._ready and not self._worth_telling(s)):
             return TrackState.INITIALISING
         if count < config.blind:
             return TrackState.INERTIAL_ONLY if heard else TrackState.LOST
@@ -304,18 +305,12 @@ class InertialTracker:
             and ekf.drift_m(s) < self._config.lost_m
         )
 
-    def _converged(self, s: State) -> bool:
-        fast = np.sqrt(np.trace(s.cov[VELOCITY, VELOCITY]))
-        return bool(self._tilt(s) < _READY_RAD and fast < _READY_M_S)
+    def _worth_telling(self, s: State) -> bool:
+        return worth_telling(s, (s.stamp_ns - self._begun_ns) * 1e-9, self._new_stretch)
 
     def _initialising(self, s: State) -> TrackResult:
-        waits = Wait.TILT if self._tilt(s) >= _READY_RAD else Wait.SPEED
-        waits = waits if self._window is None else Wait.SCALE
+        waits = Wait.SCALE if self._window is not None else waits_for(s)
         return TrackResult(TrackState.INITIALISING, None, waits=waits)
-
-    def _tilt(self, s: State) -> float:
-        """Sigma, rad."""
-        return float(np.sqrt(s.cov[0, 0] + s.cov[1, 1]))
 
     def _pose(self, s: State) -> F64:
         """At the frame's stamp, IMU time: the state is where the image was taken."""
@@ -345,12 +340,13 @@ class InertialTracker:
         if len(state.ids) < self._config.weak:
             return TrackResult(waiting, None, waits=Wait.VIEW)
         self._scene, self._ready = scene, False
+        self._begun_ns, self._begun_at = frame.stamp_ns, state.T[:3, 3].copy()
         self._window = window_for(state, self._rig.cam0, self._noise, self._config, self._common)
         self._new_stretch = found is None
         if found is None:
             self._places = LocalMap(self._places_config.max_keyframes)
         self._lost_ns = None
-        if self._window is not None or not self._converged(state):
+        if self._window is not None or not self._worth_telling(state):
             return self._initialising(state)
         return self._told(state, TrackState.OK, True, len(state.ids))
 

@@ -1,0 +1,36 @@
+"""When a filter that has begun knows enough for its first pose to be told."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from share.estimator.inertial.state import VELOCITY, State
+from share.types import Wait
+
+_TILT_RAD, _SPEED_M_S = np.radians(3.0), 0.3  # sigmas
+_CARRIED_M_S, _CARRIED_S = 0.03, 3.0  # a tilt carries nobody off faster than this; or he has waited so long
+
+
+def tilt(s: State) -> float:
+    """Sigma of what is up, rad."""
+    return float(np.sqrt(s.cov[0, 0] + s.cov[1, 1]))
+
+
+def converged(s: State) -> bool:
+    """Tilt and velocity are known; a bias of the accelerometer alone (`accel_bias`) leaves 2.5 degrees."""
+    return tilt(s) < _TILT_RAD and bool(np.sqrt(np.trace(s.cov[VELOCITY, VELOCITY])) < _SPEED_M_S)
+
+
+def worth_telling(s: State, waited_s: float, anew: bool) -> bool:
+    """Whether a first pose is, `waited_s` after the filter began; anew: so does odom.
+
+    Who begins at rest is told it at once. Who begins at a run would be told a path that climbs or sinks by
+    the tilt that a bias looks like, until a second or two of turning have parted the two.
+    """
+    carried = tilt(s) * np.linalg.norm(s.v) > _CARRIED_M_S
+    return converged(s) and not (carried and anew and waited_s < _CARRIED_S)
+
+
+def waits_for(s: State) -> Wait:
+    """What a pose that is not told yet waits for."""
+    return Wait.SPEED if tilt(s) < _TILT_RAD and not converged(s) else Wait.TILT
