@@ -17,7 +17,7 @@ def load_sdk() -> Any:
         raise UsageError(f"a RealSense camera: {not_installed('pyrealsense2', 'realsense')}") from None
     except ImportError as error:
         hint = " (apt install libusb-1.0-0)" if "libusb" in str(error) else ""
-        raise UsageError(f"pyrealsense2 cannot be loaded: {error}{hint}") from None
+        raise UsageError(f"a RealSense camera: pyrealsense2 cannot be loaded: {error}{hint}") from None
     return pyrealsense2
 
 
