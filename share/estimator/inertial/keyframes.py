@@ -72,11 +72,10 @@ class Keyframes:
         self._unsettled = Unsettled(frame, view, fresh)
         return Showing(view, *self._shown.motion(scene.state, new_stretch))
 
-    def settle(self, scene: Scene | None, rate: F64) -> Unsettled | None:
+    def settle(self, scene: Scene, rate: F64) -> Unsettled | None:
         """What `show` left to do. The keyframe that it was done for, if there was any."""
         todo, self._unsettled = self._unsettled, None
         if todo is not None and todo.fresh:
-            assert scene is not None
             self._add_features(todo.frame, scene, rate)
         return todo
 

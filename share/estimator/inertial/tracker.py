@@ -105,9 +105,10 @@ class InertialTracker:
     def settle(self) -> None:
         """What `keyframe` left to do, half its work, and nobody waits for: new features, and the place to
         find oneself by. For when the candidate is on its way; else the next `track` does it first."""
-        done = self._keyframes.settle(self._scene, self._rate)
-        if done is not None and self._scene is not None and not self._straying.suspected:
-            s = self._scene.state
+        if self._scene is None:
+            return
+        s, done = self._scene.state, self._keyframes.settle(self._scene, self._rate)
+        if done is not None and not self._straying.suspected:
             self._places.add_keyframe(done.frame.image0, s.T @ s.T_body_cam)
             self._places.set_view(done.view)
 
@@ -340,7 +341,7 @@ class InertialTracker:
         if len(state.ids) < self._config.weak:
             return TrackResult(waiting, None, waits=Wait.VIEW)
         self._scene, self._ready = scene, False
-        self._begun_ns, self._begun_at = frame.stamp_ns, state.T[:3, 3].copy()
+        self._begun_ns, self._begun_at = state.stamp_ns, state.T[:3, 3].copy()  # by the IMU's clock
         self._window = window_for(state, self._rig.cam0, self._noise, self._config, self._common)
         self._new_stretch = found is None
         if found is None:
