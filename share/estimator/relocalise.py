@@ -19,6 +19,24 @@ MAX_HAMMING = 64  # of 256 bits
 RATIO = 0.8  # the best match must be so much nearer than the second (Lowe 2004)
 
 
+class Turns:
+    """Some of the keyframes at a frame, others at the next: looking at all of them would make a live
+    camera's frames late. count: at a time."""
+
+    def __init__(self, count: int) -> None:
+        self._count, self._tried = count, 0
+
+    def begin(self) -> None:
+        """Lost anew."""
+        self._tried = 0
+
+    def next(self, numbers: Sequence[int]) -> Sequence[int]:
+        """Of `numbers`, the likeliest first, those whose turn it is."""
+        first = self._tried % max(len(numbers), 1)
+        self._tried += self._count
+        return numbers[first : first + self._count]
+
+
 def find(
     keyframes: Sequence[LocalKeyframe], frame: Frame, rig: Rig, config: TrackerConfig, seed: int
 ) -> F64 | None:

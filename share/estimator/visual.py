@@ -19,6 +19,7 @@ from share.estimator import gravity, relocalise
 from share.estimator.localmap import LocalKeyframe, LocalMap
 from share.estimator.pose import PoseEstimate, consensus, refine
 from share.estimator.result import TrackResult, typical
+from share.estimator.spacing import Spacing
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
 from share.types import F32, F64, I64, U8, Candidate, Footing, Frame, TrackState, View, Wait
@@ -57,15 +58,14 @@ class VisualTracker:
         self._T_odom_cam: F64 | None = None  # last believed pose
         self._velocity = np.zeros(6)  # body twist of the camera, rad/s and m/s
         self._cov = np.zeros((6, 6))  # of the last pose against the local map, camera frame
-        self._keyframe_ns = 0
-        self._keyframe_tracks = 0
-        self._T_odom_keyframe = np.eye(4)
+        c = config
+        self._newest = Spacing(c.keyframe_gap_s, c.keyframe_m, c.keyframe_rad, c.keyframe_tracked)
         self._new_stretch = True  # of the last keyframe
         self._T_shown = np.eye(4)  # T_odom_body of the last keyframe that others were told of
         self._to_anchor = False  # the last frame is to become a keyframe of the local map
         self._unsettled: tuple[Frame, View] | None = None
         self._lost_since_ns: int | None = None
-        self._places_tried = 0
+        self._turns = relocalise.Turns(config.relocalise_hosts)
 
     def track(self, frame: Frame) -> TrackResult:
         """The pose of this frame, causal. Frames must come with rising stamps."""
@@ -135,13 +135,14 @@ class VisualTracker:
         tracks = self._find(frame.image0, T_predicted)
         estimate, tracks = self._pose(tracks)
         if estimate is None or not self._plausible(T_last, estimate, dt):
-            self._lost_since_ns, self._velocity, self._places_tried = frame.stamp_ns, np.zeros(6), 0
+            self._lost_since_ns, self._velocity = frame.stamp_ns, np.zeros(6)
+            self._turns.begin()
             return TrackResult(TrackState.LOST, None)
         T_odom_cam = se3.inverse(estimate.T)
         self._velocity = se3.log(se3.inverse(T_last) @ T_odom_cam) / dt
         self._tracks, self._T_odom_cam = tracks, T_odom_cam
         self._cov = se3.inverse_cov(estimate.T, estimate.cov)
-        wanted = self._wants_keyframe(frame, T_odom_cam)
+        wanted = self._newest.wanted(frame.stamp_ns, T_odom_cam, len(tracks.ids))
         if wanted:
             self._reobserve(frame)
             self._to_anchor = True
@@ -189,25 +190,14 @@ class VisualTracker:
 
     # ------------------------------------------------------------------ keyframes
 
-    def _wants_keyframe(self, frame: Frame, T_odom_cam: F64) -> bool:
-        config = self._config
-        if frame.stamp_ns - self._keyframe_ns < config.keyframe_gap_s * 1e9:
-            return False
-        motion = se3.log(se3.inverse(self._T_odom_keyframe) @ T_odom_cam)
-        return bool(
-            np.linalg.norm(motion[3:]) > config.keyframe_m
-            or np.linalg.norm(motion[:3]) > config.keyframe_rad
-            or len(self._tracks.ids) < config.keyframe_tracked * self._keyframe_tracks
-        )
-
     def _anchor(self, frame: Frame, new_stretch: bool = False) -> None:
         """Make this frame a keyframe of the local map, and its free corners points."""
         assert self._T_odom_cam is not None
         host = self._map.add_keyframe(frame.image0, self._T_odom_cam)
         self._add_corners(frame, host)
-        self._keyframe_ns, self._keyframe_tracks = frame.stamp_ns, len(self._tracks.ids)
-        self._T_odom_keyframe, self._new_stretch = self._T_odom_cam, new_stretch
-        self._to_anchor = False
+        newest = self._newest
+        newest.stamp_ns, newest.T, newest.features = frame.stamp_ns, self._T_odom_cam, len(self._tracks.ids)
+        self._new_stretch, self._to_anchor = new_stretch, False
 
     def _reobserve(self, frame: Frame) -> None:
         """Take up points of earlier keyframes that lie where they should.
@@ -293,13 +283,10 @@ class VisualTracker:
         return TrackResult(TrackState.WEAK, self._T_odom_body(), True, len(self._tracks.ids), found is None)
 
     def _next_places(self) -> list[LocalKeyframe]:
-        """Some of the local map's keyframes, nearest to where we were first, others at the next frame:
-        looking at all of them would make a live camera's frames late."""
+        """Of the local map's keyframes, nearest to where we were first."""
         assert self._T_odom_cam is not None
-        hosts = self._map.hosts_near(self._T_odom_cam, np.inf, np.inf)
-        first = self._places_tried % max(len(hosts), 1)
-        self._places_tried += self._config.relocalise_hosts
-        return [self._map.keyframes[n] for n in hosts[first : first + self._config.relocalise_hosts]]
+        nearest = self._map.hosts_near(self._T_odom_cam, np.inf, np.inf)
+        return [self._map.keyframes[n] for n in self._turns.next(nearest)]
 
     def _T_odom_body(self) -> F64:
         assert self._T_odom_cam is not None

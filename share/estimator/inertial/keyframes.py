@@ -9,12 +9,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from share.config import InertialConfig
 from share.estimator.inertial.scene import Scene
 from share.estimator.inertial.shown import Shown
-from share.geometry import se3
+from share.estimator.spacing import Spacing
 from share.geometry.camera import Rig
 from share.types import F64, Frame, View
 from share.vision.view import make_view
@@ -40,23 +38,15 @@ class Keyframes:
     """Those of one tracker, newest last in its scene."""
 
     def __init__(self, rig: Rig, config: InertialConfig, view_features: int) -> None:
-        self._rig, self._config, self._view_features = rig, config, view_features
-        self._stamp_ns = self._features = 0  # of the newest
-        self._T_odom_body = np.eye(4)
+        self._rig, self._view_features = rig, view_features
+        c = config
+        self._newest = Spacing(c.keyframe_gap_s, c.keyframe_m, c.keyframe_rad, c.keyframe_seen)
         self._shown = Shown()
         self._unsettled: Unsettled | None = None
 
     def wanted(self, stamp_ns: int, T_odom_body: F64, seen: int) -> bool:
-        """Whether a frame with so many features seen is to be one: moved, turned, or little left in view."""
-        config = self._config
-        if stamp_ns - self._stamp_ns < config.keyframe_gap_s * 1e9:
-            return False
-        motion = se3.log(se3.inverse(self._T_odom_body) @ T_odom_body)
-        return bool(
-            np.linalg.norm(motion[3:]) > config.keyframe_m
-            or np.linalg.norm(motion[:3]) > config.keyframe_rad
-            or seen < config.keyframe_seen * self._features
-        )
+        """Whether a frame with so many features seen is to be one."""
+        return self._newest.wanted(stamp_ns, T_odom_body, seen)
 
     def anchor(self, frame: Frame, scene: Scene, rate: F64) -> None:
         """Make the frame just tracked one, all at once: where nobody else is told yet. rate (3,): rad/s."""
@@ -65,7 +55,7 @@ class Keyframes:
 
     def show(self, frame: Frame, scene: Scene, rate: F64, new_stretch: bool) -> Showing:
         """Make the frame just tracked one, if it is not; the rest waits for `settle`."""
-        fresh = frame.stamp_ns != self._stamp_ns
+        fresh = frame.stamp_ns != self._newest.stamp_ns
         if fresh:
             self._add_pose(frame, scene, rate)
         view = make_view(frame, self._rig, self._view_features, scene.depths(frame))
@@ -85,8 +75,8 @@ class Keyframes:
 
     def _add_pose(self, frame: Frame, scene: Scene, rate: F64) -> None:
         scene.add_keyframe(rate)
-        self._stamp_ns, self._T_odom_body = frame.stamp_ns, scene.state.T
+        self._newest.stamp_ns, self._newest.T = frame.stamp_ns, scene.state.T
 
     def _add_features(self, frame: Frame, scene: Scene, rate: F64) -> None:
         scene.replenish(frame, rate)
-        self._features = len(scene.state.ids)
+        self._newest.features = len(scene.state.ids)

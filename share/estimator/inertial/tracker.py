@@ -28,7 +28,7 @@ from share.estimator.inertial.samples import Samples, coasting, mean_rate, uncli
 from share.estimator.inertial.scene import Scene
 from share.estimator.inertial.state import State
 from share.estimator.inertial.window import Window, window_for, without_force
-from share.estimator.localmap import LocalKeyframe, LocalMap
+from share.estimator.localmap import LocalMap
 from share.estimator.result import TrackResult, typical
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
@@ -71,7 +71,8 @@ class InertialTracker:
         self._new_stretch = False  # the next keyframe begins one
         self._keyframes, self._pivot = Keyframes(rig, config, places.view_features), Pivot()
         self._places = LocalMap(places.max_keyframes)  # where to look for oneself when LOST
-        self._places_config, self._seed, self._places_tried = places, seed, 0
+        self._places_config, self._seed = places, seed
+        self._turns = relocalise.Turns(places.relocalise_hosts)
         self._lost_ns: int | None = None
 
     @property
@@ -364,9 +365,6 @@ class InertialTracker:
         """T_odom_cam (4, 4) of a LOST frame by its ORB features."""
         if self._lost_ns is None or not self._places.keyframes:
             return None
-        numbers = sorted(self._places.keyframes, reverse=True)
-        count = self._places_config.relocalise_hosts
-        first = self._places_tried * count % len(numbers)
-        self._places_tried += 1
-        chosen: list[LocalKeyframe] = [self._places.keyframes[n] for n in numbers[first : first + count]]
+        turn = self._turns.next(sorted(self._places.keyframes, reverse=True))
+        chosen = [self._places.keyframes[n] for n in turn]
         return relocalise.find(chosen, frame, self._rig, self._places_config, self._seed)
