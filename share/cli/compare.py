@@ -116,7 +116,7 @@ def _write(out: Path, found: Sequence[Row], lacking: Sequence[str]) -> None:
     text = markdown(found, lacking)
     atomic_write(out / "table.md", text)
     atomic_write(out / "table.csv", csv_of(found))
-    atomic_write(out / "report.html", page("Trackers side by side", text, draw(out, found)))
+    atomic_write(out / "report.html", page("Trackers side by side", f"{text}\n{draw(out, found)}", out))
     click.echo(text)
     click.echo(f"report: {out / 'report.html'}   tables: {out / 'table.md'}, {out / 'table.csv'}")
 

@@ -177,7 +177,7 @@ def ablation(
     from share.run.play import Terms
 
     policies = chosen or tuple(policy for policy in POLICIES if policy != "streamed")
-    also = [annex(path) for path in annexes]
+    also = [annex(path, number) for number, path in enumerate(annexes, 1)]
     opened = [read_session(folder) for folder in sessions]
     config = settings(config_file, told, opened)
     planned = plan(opened, policies, range(seeds), Terms("", **told), out / "runs", config)
@@ -200,13 +200,13 @@ def _write(out: Path, trials: list[Trial], failed: list[str], also: list[Annex])
     found = [figures(trial) for trial in trials]
     names = policies(found)
     base = BASE if BASE in names else names[0]
-    report = "\n".join([markdown(found, trials, base, failed), *(one.text for one in also)])
+    shown = draw(out, found, trials, base)
+    report = "\n".join([markdown(found, trials, base, failed, shown), *(one.text for one in also)])
+    for name, path in (named for one in also for named in one.pictures.items()):
+        atomic_write(out / name, path.read_bytes())
     atomic_write(out / "agents.csv", agents_csv(found))
     atomic_write(out / "runs.csv", runs_csv(found))
     atomic_write(out / "report.md", report)
-    pictures = draw(out, found, trials, base)
-    for one in also:
-        pictures |= one.pictures
-    atomic_write(out / "report.html", page("Policies compared", report, pictures))
-    click.echo(report)
+    atomic_write(out / "report.html", page("Policies compared", report, out))
+    click.echo(markdown(found, trials, base, failed))
     click.echo(f"report: {out / 'report.html'}, {out / 'report.md'}   tables: {out}/*.csv")

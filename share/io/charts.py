@@ -1,4 +1,4 @@
-"""Figures of an evaluation: bars side by side, parts of a base and their intervals, lines, heat maps."""
+"""Figures of an evaluation: bars, parts of a base and their intervals, lines, ways from above, heat maps."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from share.types import F64
 
 _NOTHING = Interval(float("nan"), float("nan"), float("nan"))
 _COLOURS = ("#00798c", "#d1495b", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
+_ABREAST = 3  # panels
 
 
 def draw_bars(
@@ -50,8 +51,13 @@ def draw_bars(
     pyplot.close(figure)
 
 
-def draw_parts(path: Path, series: Mapping[str, Mapping[str, Interval]], base: str) -> None:
-    """PNG: for each of `series` a bar a measure, as parts of `base`, which is 1; whiskers are intervals."""
+def draw_parts(
+    path: Path, series: Mapping[str, Mapping[str, Interval]], base: str, names: Sequence[str]
+) -> None:
+    """PNG: for each of `series` a bar a measure, as parts of `base`, which is 1; whiskers are intervals.
+
+    names: of all that have a colour, those of `series` among them, so that they have it in every picture.
+    """
     pyplot = _pyplot()
     measures = list(dict.fromkeys(name for values in series.values() for name in values))
     figure, axis = pyplot.subplots(figsize=(9, 0.5 + 0.5 * len(measures)), layout="constrained")
@@ -61,7 +67,8 @@ def draw_parts(path: Path, series: Mapping[str, Mapping[str, Interval]], base: s
         value, low, high = (np.array([getattr(one, of) for one in here]) for of in ("value", "low", "high"))
         off = np.nan_to_num(np.stack([value - low, high - value])).clip(0)
         y = at + (k - (len(series) - 1) / 2) * wide
-        axis.barh(y, value, wide, xerr=off, label=name, color=_COLOURS[k % len(_COLOURS)], ecolor="#555")
+        colour = _COLOURS[names.index(name) % len(_COLOURS)]
+        axis.barh(y, value, wide, xerr=off, label=name, color=colour, ecolor="#555")
     axis.axvline(1, color="black", linewidth=1, linestyle="--")
     axis.set_yticks(at, measures)
     axis.invert_yaxis()
@@ -89,6 +96,35 @@ def draw_lines(
         axis.grid(alpha=0.3)
     axes[-1, 0].set_xlabel(across)
     handles = [pyplot.Line2D([], [], color=_COLOURS[k % len(_COLOURS)]) for k in range(len(names))]
+    figure.legend(handles, names, loc="outside upper right", ncols=max(1, len(names)), fontsize=8)
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
+
+
+def draw_ways(path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]]) -> None:
+    """PNG, a panel for each of `panels`, from above: {series: (its way (N, 2) m, dots on it (M, 2) m)}."""
+    pyplot = _pyplot()
+    across = min(_ABREAST, len(panels))
+    down = -(-len(panels) // across)
+    wide, high = np.ptp(
+        [xy for series in panels.values() for way, _ in series.values() for xy in way], axis=0
+    )
+    size = 3.2 * across, (3.0 * np.clip(high / max(wide, 1e-9), 0.3, 2) + 0.5) * down + 0.5
+    figure, axes = pyplot.subplots(down, across, figsize=size, layout="constrained", sharex=True, sharey=True)
+    flat = np.atleast_1d(axes).ravel()
+    names = list(dict.fromkeys(name for series in panels.values() for name in series))
+    colours = {name: _COLOURS[k % len(_COLOURS)] for k, name in enumerate(names)}
+    for axis, (title, series) in zip(flat, panels.items(), strict=False):
+        for name, (way, dots) in series.items():
+            axis.plot(*way.T, color=colours[name], linewidth=0.6, alpha=0.6)
+            axis.scatter(*dots.T, color=colours[name], s=9, alpha=0.35, linewidths=0)
+        axis.set(title=title, aspect="equal")
+        axis.grid(alpha=0.3)
+    for axis in flat[len(panels) :]:
+        axis.set_visible(False)
+    figure.supxlabel("m")
+    figure.supylabel("m")
+    handles = [pyplot.Line2D([], [], color=colour, marker="o") for colour in colours.values()]
     figure.legend(handles, names, loc="outside upper right", ncols=max(1, len(names)), fontsize=8)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)

@@ -1,10 +1,11 @@
-"""A report as one HTML page that opens offline: its text, in Markdown, and its pictures inside."""
+"""A report as one HTML page that opens offline: its text, in Markdown, with its pictures inside."""
 
 from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Mapping
+import re
+from functools import partial
 from pathlib import Path
 
 _STYLE = """
@@ -18,24 +19,27 @@ th:first-child, td:first-child { text-align: left; } th { background: #f3f3f3; }
 tbody tr:hover { background: #f8f8f0; }
 figure { margin: 1.5rem 0; } img { max-width: 100%; } figcaption { color: #555; font-size: 14px; }
 """
+_PICTURE = re.compile(r'<p><img alt="([^"]*)" src="([^"]*)" ?/?></p>')
 
 
-def page(title: str, text: str, pictures: Mapping[str, Path]) -> str:
-    """HTML. text: Markdown, whose own HTML is shown, not taken; pictures: PNG files by what is below each."""
+def page(title: str, text: str, folder: Path) -> str:
+    """HTML. text: Markdown, whose own HTML is shown, not taken; its pictures are PNG files in `folder`,
+    each a paragraph of its own, with what is said of it below."""
     from markdown import markdown
     from markdown.extensions.tables import TableExtension  # by its class, so that a freezer sees it
 
     body = markdown(html.escape(text, quote=False), extensions=[TableExtension()])
-    figures = "\n".join(_figure(caption, path) for caption, path in pictures.items())
+    body = _PICTURE.sub(partial(_figure, folder), body)
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width">\n<title>{html.escape(title)}</title>\n'
-        f"<style>{_STYLE}</style>\n</head>\n<body>\n{body}\n{figures}\n</body>\n</html>\n"
+        f"<style>{_STYLE}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
     )
 
 
-def _figure(caption: str, path: Path) -> str:
-    data, said = base64.b64encode(path.read_bytes()).decode(), html.escape(caption)
+def _figure(folder: Path, found: re.Match[str]) -> str:
+    said, name = found[1], html.unescape(found[2])
+    data = base64.b64encode((folder / name).read_bytes()).decode()
     return (
         f'<figure>\n<img alt="{said}" src="data:image/png;base64,{data}">\n'
         f"<figcaption>{said}</figcaption>\n</figure>"

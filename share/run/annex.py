@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from share.errors import UsageError
+from share.run.as_text import picture
 from share.train.score import read_scores, table
 
 SWEEP, HEAT = "sweep.md", "heat.png"
@@ -13,15 +14,15 @@ SWEEP, HEAT = "sweep.md", "heat.png"
 
 @dataclass(frozen=True)
 class Annex:
-    """text: Markdown with a heading. pictures: PNG files by what is below each."""
+    """text: Markdown with a heading. pictures: PNG files that it shows, by the names that it has for them."""
 
     text: str
     pictures: dict[str, Path]
 
 
-def annex(path: Path) -> Annex:
-    """Of a folder by `share evaluate sweep`, or a file by `share train compare --json`. Raises UsageError for
-    anything else, DataError for a damaged one."""
+def annex(path: Path, number: int) -> Annex:
+    """Of a folder by `share evaluate sweep`, or a file by `share train compare --json`: a report's first or
+    `number`th. Raises UsageError for anything else, DataError for a damaged one."""
     if path.is_file():
         return Annex(f"## Models of the error\n\n{table(read_scores(path))}\n", {})
     if not (path / SWEEP).is_file():
@@ -30,5 +31,8 @@ def annex(path: Path) -> Annex:
             f"or a file by `share train compare --json`"
         )
     heat = path / HEAT
-    pictures = {f"Settings tried: {path.name}": heat} if heat.is_file() else {}
-    return Annex(f"## Settings tried: {path.name}\n\n{(path / SWEEP).read_text()}", pictures)
+    text = f"## Settings tried: {path.name}\n\n{(path / SWEEP).read_text()}"
+    if not heat.is_file():
+        return Annex(text, {})
+    name = f"heat-{number}.png"
+    return Annex(f"{text}\n{picture('Means over the first two settings', name)}\n", {name: heat})

@@ -35,5 +35,10 @@ def bullets(texts: Iterable[str]) -> str:
     return "\n".join(f"* {text[0].upper()}{text[1:]}." for text in texts)
 
 
+def picture(said: str, name: str) -> str:
+    """Of Markdown, a paragraph of its own. name: of a file beside it."""
+    return f"![{said}]({name})"
+
+
 def number(value: float, form: str = ".3g") -> str:
     return "–" if math.isnan(value) else format(value, form)

@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from share.io.charts import draw_bars, draw_lines, draw_parts
+from share.io.charts import draw_bars, draw_lines, draw_parts, draw_ways
 from share.metrics.comparison import compare, policies
 from share.metrics.figures import RunFigures
 from share.metrics.latency import NOTICED_MS
-from share.run.report import mean_of
-from share.run.traces import merges, traces
+from share.run.as_text import picture
+from share.run.report import Shown, mean_of
+from share.run.traces import Merges, merges, traces, truths
 from share.run.trial import Trial
+from share.types import F64
 
 _PARTS = (
     "AR latency",
@@ -27,20 +29,13 @@ _PARTS = (
 )
 
 
-def draw(folder: Path, runs: Sequence[RunFigures], trials: Sequence[Trial], base: str) -> dict[str, Path]:
-    """PNG files in `folder`, by what is to be said of each. trials: as `runs`, in order."""
+def draw(folder: Path, runs: Sequence[RunFigures], trials: Sequence[Trial], base: str) -> Shown:
+    """PNG files in `folder`. trials: as `runs`, in order."""
     names, sessions = policies(runs), list(dict.fromkeys(run.conditions.session for run in runs))
     agents = list(dict.fromkeys(agent.agent for run in runs for agent in run.agents))
-    out = {}
-    for file, field, unit, line, said in (
-        (
-            "latency.png",
-            "latency_ms",
-            "ms",
-            NOTICED_MS,
-            "Latency of each agent; the line is at 20 ms",
-        ),
-        ("ate.png", "ate_cm", "cm", None, "ATE of each agent in the shared map"),
+    for file, field, unit, line in (
+        ("latency.png", "latency_ms", "ms", NOTICED_MS),
+        ("ate.png", "ate_cm", "cm", None),
     ):
         panels = {
             agent: {
@@ -49,22 +44,36 @@ def draw(folder: Path, runs: Sequence[RunFigures], trials: Sequence[Trial], base
             for agent in agents
         }
         draw_bars(folder / file, panels, sessions, unit, line)
-        out[said] = folder / file
-    others = [name for name in names if name != base]
-    if others:
-        compared = {
-            name: {
-                one.measure.name: one.ratio for one in compare(runs, name, base) if one.measure.name in _PARTS
+    return Shown(
+        _parts(folder, runs, names, base),
+        _shown(
+            {
+                "Latency of each agent; the line is at 20 ms": "latency.png",
+                "ATE of each agent in the shared map": "ate.png",
             }
-            for name in others
-        }
-        draw_parts(folder / "parts.png", compared, base)
-        out[f"What each policy comes to, as a part of {base}; whiskers: 95 %"] = folder / "parts.png"
-    return out | _first(folder, trials)
+        ),
+        _course(folder, trials),
+    )
+
+
+def _parts(folder: Path, runs: Sequence[RunFigures], names: Sequence[str], base: str) -> str:
+    compared = {
+        name: {one.measure.name: one.ratio for one in compare(runs, name, base) if one.measure.name in _PARTS}
+        for name in names
+        if name != base
+    }
+    if not compared:
+        return ""
+    draw_parts(folder / "parts.png", compared, base, names)
+    return _shown({f"What each policy comes to, as a part of {base}; whiskers: 95 %": "parts.png"})
+
+
+def _shown(files: Mapping[str, str]) -> str:
+    return "\n\n".join(picture(said, file) for said, file in files.items())
 
 
 def draw_each(folder: Path, trials: Sequence[Trial]) -> list[Path]:
-    """PNG files in `folder`, two a session: its runs over time, by the names of their folders."""
+    """PNG files in `folder`, three a session: its runs over time, by the names of their folders."""
     by_session: dict[Path, dict[str, Trial]] = {}
     for trial in trials:
         by_session.setdefault(trial.session.folder, {})[trial.folder.resolve().name] = trial
@@ -75,7 +84,7 @@ def draw_each(folder: Path, trials: Sequence[Trial]) -> list[Path]:
     ]
 
 
-def _first(folder: Path, trials: Sequence[Trial]) -> dict[str, Path]:
+def _course(folder: Path, trials: Sequence[Trial]) -> str:
     """Of the first session, with its first seed, by every policy."""
     first = trials[0]
     same = {
@@ -83,7 +92,8 @@ def _first(folder: Path, trials: Sequence[Trial]) -> dict[str, Path]:
         for trial in trials
         if (trial.session.folder, trial.terms.seed) == (first.session.folder, first.terms.seed)
     }
-    return _over_time(folder, "", same)
+    files = {said: path.name for said, path in _over_time(folder, "", same).items()}
+    return f"## How a run goes: {first.session.folder.name}\n\n{_shown(files)}"
 
 
 def _over_time(folder: Path, prefix: str, trials: Mapping[str, Trial]) -> dict[str, Path]:
@@ -100,12 +110,24 @@ def _over_time(folder: Path, prefix: str, trials: Mapping[str, Trial]) -> dict[s
         for what in ("QoE", "rate")
     }
     units = ["" if title.startswith("QoE") else "Hz" for title in panels]
-    over_time, along = folder / f"{prefix}over-time.png", folder / f"{prefix}merges.png"
+    over_time, along, above = (folder / f"{prefix}{name}.png" for name in ("over-time", "merges", "where"))
     draw_lines(over_time, panels, "s", units)
     done = {name: merges(trial) for name, trial in trials.items()}
-    counted = {name: (metres, np.arange(1.0, len(metres) + 1)) for name, metres in done.items()}
+    counted = {name: (of.metres, np.arange(1.0, len(of.metres) + 1)) for name, of in done.items()}
     draw_lines(along, {f"merges on {where}": counted}, "m that all agents have gone", [""])
+    seen = {
+        f"{name}: {len(done[name].metres)} merges": _from_above(trial, done[name])
+        for name, trial in trials.items()
+    }
+    draw_ways(above, seen)
     return {
         f"QoE, and the rate that the edge allows, over time: {where}": over_time,
         f"Merges along the way: {where}": along,
+        f"Where they were, from above: {where}; a dot is a merge that an agent's keyframe led to": above,
     }
+
+
+def _from_above(trial: Trial, done: Merges) -> dict[str, tuple[F64, F64]]:
+    """By agent: its way (N, 2), and where it was at its merges (M, 2), m."""
+    ways = {name: truth.T[:, :2, 3] for name, truth in truths(trial).items()}
+    return {name: (way, done.xy.get(name, way[:0])) for name, way in ways.items()}

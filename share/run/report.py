@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from share.metrics.bootstrap import Interval
 from share.metrics.comparison import MEASURES, Compared, compare, no_worse, no_worse_on_average, policies
@@ -65,8 +65,23 @@ def sweep_markdown(
     return "\n\n".join([provenance(runs, trials), markdown_table([head, *body]), _DRAWN]) + "\n"
 
 
+class Shown(NamedTuple):
+    """Markdown that shows pictures: of all policies compared, of every agent, of how a run goes."""
+
+    compared: str
+    agents: str
+    course: str
+
+
+_NOTHING_SHOWN = Shown("", "", "")
+
+
 def markdown(
-    runs: Sequence[RunFigures], trials: Sequence[Trial], base: str, failed: Sequence[str] = ()
+    runs: Sequence[RunFigures],
+    trials: Sequence[Trial],
+    base: str,
+    failed: Sequence[str] = (),
+    shown: Shown = _NOTHING_SHOWN,
 ) -> str:
     """All policies against `base`. failed: runs that came to nothing, by name."""
     names = policies(runs)
@@ -77,12 +92,13 @@ def markdown(
         _comparison(runs, names, base),
         "Values: means over all runs that have one. Parts: of pairs of runs of one session, link and seed; "
         f"(n of N): not both have it in all pairs. {_DRAWN}",
+        shown.compared,
     ]
     others = [name for name in names if name != names[0]]
     if others:
         parts += [f"## Errors by `{names[0]}`", *(_wins(runs, names[0], other) for other in others)]
-    parts += ["## Every agent", _every_agent(runs, names)]
-    return "\n\n".join(parts) + "\n"
+    parts += ["## Every agent", shown.agents, _every_agent(runs, names), shown.course]
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def provenance(runs: Sequence[RunFigures], trials: Sequence[Trial], failed: Sequence[str] = ()) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from share.io.json_file import read_json, read_json_lines
-from share.io.trajectory import read_tum
+from share.io.trajectory import Trajectory, read_tum
 from share.run.trial import Trial
 from share.types import F64
 
@@ -42,22 +42,40 @@ def began_s(events: list[dict[str, Any]]) -> float:
     return next((e["t_s"] for e in events if e["event"] == "joined the edge"), 0.0)
 
 
-def merges(trial: Trial) -> F64:
-    """How far all agents together had gone by each merge, m (M,). Raises DataError on damaged files."""
+@dataclass(frozen=True, eq=False)
+class Merges:
+    """metres (M,): how far all agents together had gone by each. xy: where each agent was at those that its
+    keyframes led to, m (K, 2), by agent."""
+
+    metres: F64
+    xy: dict[str, F64]
+
+
+def merges(trial: Trial) -> Merges:
+    """Where they were done. Raises DataError on damaged files."""
     events = read_json_lines(trial.folder / "edge" / "events.jsonl")
     began = began_s(events)
-    done_s = np.array([e["t_s"] - began for e in events if e["event"] in _MERGES], float)
-    truths = {
-        name: (read_tum(trial.session.folder / "truth" / f"{name}.tum"), agent.clock_offset_ns)
-        for name, agent in trial.session.agents.items()
-    }
-    first_ns = min(truth.stamps_ns[0] - offset_ns for truth, offset_ns in truths.values())
-    gone = np.zeros(len(done_s))
-    for truth, offset_ns in truths.values():
+    done = [event for event in events if event["event"] in _MERGES]
+    done_s = np.array([event["t_s"] - began for event in done], float)
+    who = np.array([event["agent"] for event in done], str)
+    found = truths(trial)
+    offsets_ns = {name: agent.clock_offset_ns for name, agent in trial.session.agents.items()}
+    first_ns = min(truth.stamps_ns[0] - offsets_ns[name] for name, truth in found.items())
+    gone, xy = np.zeros(len(done_s)), {}
+    for name, truth in found.items():
         # in real time all recordings begin at once, in virtual time when they did
-        start_ns = first_ns + offset_ns if trial.terms.virtual else truth.stamps_ns[0]
-        gone += np.interp(done_s, (truth.stamps_ns - start_ns) * 1e-9, truth.way)
-    return gone
+        start_ns = first_ns + offsets_ns[name] if trial.terms.virtual else truth.stamps_ns[0]
+        seconds = (truth.stamps_ns - start_ns) * 1e-9
+        gone += np.interp(done_s, seconds, truth.way)
+        mine = done_s[who == name]
+        xy[name] = np.stack([np.interp(mine, seconds, truth.T[:, k, 3]) for k in (0, 1)], axis=1)
+    return Merges(gone, xy)
+
+
+def truths(trial: Trial) -> dict[str, Trajectory]:
+    """By agent, each by its own clock. Raises DataError."""
+    folder = trial.session.folder / "truth"
+    return {name: read_tum(folder / f"{name}.tum") for name in trial.session.agents}
 
 
 def _numbers(values: list[float | None]) -> F64:

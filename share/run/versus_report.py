@@ -13,7 +13,7 @@ import numpy as np
 from share import __version__
 from share.io.charts import draw_bars
 from share.io.machine import describe_machine
-from share.run.as_text import bullets, csv_text, markdown_table, number
+from share.run.as_text import bullets, csv_text, markdown_table, number, picture
 from share.run.versus import Row
 
 PROTOCOL = (
@@ -70,8 +70,8 @@ def _cells(row: Row) -> list[str]:
     return [row.recording, row.tracker, *cm, f"{100 * row.told:.1f}", *cpu]
 
 
-def draw(folder: Path, found: Sequence[Row]) -> dict[str, Path]:
-    """PNG files in `folder`, by what is to be said of each."""
+def draw(folder: Path, found: Sequence[Row]) -> str:
+    """PNG files in `folder`; the Markdown that shows them."""
     recordings, trackers = (
         list(dict.fromkeys(getattr(r, f) for r in found)) for f in ("recording", "tracker")
     )
@@ -91,4 +91,5 @@ def draw(folder: Path, found: Sequence[Row]) -> dict[str, Path]:
     )
     causal = {tracker: told for tracker, told in values("cpu_mean_ms").items() if not np.isnan(told).all()}
     draw_bars(folder / "cpu.png", {"CPU a frame, mean": causal}, recordings, "ms")
-    return {"Errors of each tracker": folder / "errors.png", "What they take": folder / "cpu.png"}
+    errors, cpu = picture("Errors of each tracker", "errors.png"), picture("What they take", "cpu.png")
+    return f"{errors}\n\n{cpu}\n"

@@ -34,8 +34,11 @@ def test_a_run_is_scored_compared_and_never_overwritten(evaluate, plain_session,
     (run,) = (out / "runs").iterdir()
     assert {"config.yaml", "run.json", "edge", "ar1", "robot"} <= {path.name for path in run.iterdir()}
     assert "| AR latency, ms |" in (out / "report.md").read_text()
-    assert (out / "report.md").read_text().strip() in done.out
-    pictures = {"latency.png", "ate.png", "over-time.png", "merges.png"}
+    text = (out / "report.md").read_text()
+    pictures = {"latency.png", "ate.png", "over-time.png", "merges.png", "where.png"}
+    assert {name for name in pictures if f"]({name})" in text} == pictures
+    assert text[: text.index("![")].strip() in done.out  # pictures are not for a terminal
+    assert "![" not in done.out
     assert {path.name for path in out.glob("*.png")} == pictures
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") == len(pictures)
@@ -47,6 +50,7 @@ def test_a_run_is_scored_compared_and_never_overwritten(evaluate, plain_session,
     assert {path.name for path in (tmp_path / "plots").iterdir()} == {
         f"{plain_session.name}-over-time.png",
         f"{plain_session.name}-merges.png",
+        f"{plain_session.name}-where.png",
     }
     rows = rows_of(tmp_path / "one.csv")
     assert [row["agent"] for row in rows] == ["ar1", "ar2", "robot"]

@@ -8,14 +8,24 @@ import pytest
 
 from share.io.page import page
 
-TEXT = "# Two < three\n\n| a | b |\n| --- | --- |\n| 1 | <script>alert(1)</script> |\n\n* one\n* two\n"
+TEXT = """# Two < three
+
+| a | b |
+| --- | --- |
+| 1 | <script>alert(1)</script> |
+
+![what it <shows>](one.png)
+
+* one
+* two
+"""
 PNG = b"\x89PNG and so on"
 
 
 @pytest.fixture
 def made(tmp_path: Path) -> str:
     (tmp_path / "one.png").write_bytes(PNG)
-    return page("R & D", TEXT, {"what it <shows>": tmp_path / "one.png"})
+    return page("R & D", TEXT, tmp_path)
 
 
 def test_text_and_tables_are_html(made):
@@ -29,4 +39,8 @@ def test_it_opens_offline_and_runs_nothing(made):
     assert "<script" not in made
     assert not re.search(r'(?:src|href)="(?!data:)', made)
     assert f'src="data:image/png;base64,{base64.b64encode(PNG).decode()}"' in made
-    assert "what it &lt;shows&gt;" in made
+    assert "<figcaption>what it &lt;shows&gt;</figcaption>" in made
+
+
+def test_a_picture_stands_where_the_text_has_it(made):
+    assert made.index("</table>") < made.index("<figure>") < made.index("<li>one")

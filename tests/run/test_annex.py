@@ -20,7 +20,7 @@ def test_models_of_the_error(tmp_path):
     first, second = read_scores(file)
     assert math.isnan(first.ms)
     assert second == SCORES[1]
-    made = annex(file)
+    made = annex(file, 1)
     assert made.text.startswith("## Models of the error\n")
     assert "| ours | 1.500 | 0.500 | 0.80 | 0.100 | 90 % | 1.20 |" in made.text
     assert made.pictures == {}
@@ -31,17 +31,19 @@ def test_scores_that_are_damaged_are_named(tmp_path, text):
     file = tmp_path / "scores.json"
     file.write_text(text)
     with pytest.raises(DataError, match=r"scores\.json: is not by `share train compare --json`, or damaged"):
-        annex(file)
+        annex(file, 1)
 
 
 def test_settings_tried(tmp_path):
     folder = tmp_path / "gains"
     folder.mkdir()
     with pytest.raises(UsageError, match="give a folder by `share evaluate sweep`"):
-        annex(folder)
+        annex(folder, 1)
     (folder / "sweep.md").write_text("| control.kp |\n|---|\n| 0.8 |\n")
-    assert annex(folder).pictures == {}
+    assert annex(folder, 1).pictures == {}
     (folder / "heat.png").write_bytes(b"")
-    made = annex(folder)
-    assert made.text == "## Settings tried: gains\n\n| control.kp |\n|---|\n| 0.8 |\n"
-    assert made.pictures == {"Settings tried: gains": folder / "heat.png"}
+    made = annex(folder, 2)
+    text, shown = made.text.split("\n![")
+    assert text == "## Settings tried: gains\n\n| control.kp |\n|---|\n| 0.8 |\n"
+    assert shown == "Means over the first two settings](heat-2.png)\n"
+    assert made.pictures == {"heat-2.png": folder / "heat.png"}

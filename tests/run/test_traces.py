@@ -31,10 +31,10 @@ def trial(tmp_path):
     events = [
         {"t_s": 2.0, "event": "joined the edge"},
         {"t_s": 2.5, "event": "joined the edge"},
-        {"t_s": 4.0, "event": "loop accepted"},
-        {"t_s": 5.0, "event": "loop refused"},
-        {"t_s": 6.0, "event": "maps joined"},
-        {"t_s": 99.0, "event": "loop accepted"},
+        {"t_s": 4.0, "event": "loop accepted", "agent": "ann"},
+        {"t_s": 5.0, "event": "loop refused", "agent": "ann"},
+        {"t_s": 6.0, "event": "maps joined", "agent": "bob"},
+        {"t_s": 99.0, "event": "loop accepted", "agent": "ann"},
     ]
     (edge / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
     agents = {"ann": SimpleNamespace(clock_offset_ns=0), "bob": SimpleNamespace(clock_offset_ns=0)}
@@ -54,7 +54,9 @@ def test_what_an_agent_was_told_over_time(trial):
 
 
 def test_merges_lie_where_all_had_gone_by_then(trial):
-    assert merges(trial).tolist() == pytest.approx([2 * 1.5, 4 * 1.5, 15.0])
+    assert merges(trial).metres.tolist() == pytest.approx([2 * 1.5, 4 * 1.5, 15.0])
+    assert merges(trial).xy["ann"].tolist() == [[2.0, 0.0], [10.0, 0.0]]
+    assert merges(trial).xy["bob"].tolist() == [[2.0, 0.0]]
 
 
 def test_who_began_later_has_gone_less_in_virtual_time_alone(trial):
@@ -62,6 +64,6 @@ def test_who_began_later_has_gone_less_in_virtual_time_alone(trial):
     later = read_tum(bob)
     bob.write_text(format_tum(Trajectory(later.stamps_ns + 103 * S, later.T)))
     trial.session.agents["bob"].clock_offset_ns = 100 * S  # by the session's clock 3 s after Ann
-    assert merges(trial).tolist() == pytest.approx([2 * 1.5, 4 * 1.5, 15.0])
+    assert merges(trial).metres.tolist() == pytest.approx([2 * 1.5, 4 * 1.5, 15.0])
     trial.terms.virtual = True
-    assert merges(trial).tolist() == pytest.approx([2.0, 4 + 0.5, 15.0])
+    assert merges(trial).metres.tolist() == pytest.approx([2.0, 4 + 0.5, 15.0])
