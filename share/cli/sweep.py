@@ -86,6 +86,7 @@ def sweep(
 def _write(out: Path, axes: list[Axis], points: list[Point], trials: list[Trial]) -> None:
     from share.io.charts import draw_heat
     from share.io.files import atomic_write
+    from share.metrics.comparison import MEASURES
     from share.run.figures import figures
     from share.run.report import sweep_csv, sweep_markdown
     from share.run.sweep import heat, table
@@ -98,7 +99,7 @@ def _write(out: Path, axes: list[Axis], points: list[Point], trials: list[Trial]
     click.echo(report)
     told = f"report: {out / 'sweep.md'}   table: {out / 'sweep.csv'}"
     if len(axes) > 1 and not any(axis.is_range for axis in axes):
-        maps = {measure: heat(axes, rows, measure) for measure in _HEAT}
+        maps = {one.titled: heat(axes, rows, one.name) for one in MEASURES if one.name in _HEAT}
         draw_heat(out / "heat.png", maps, (axes[0].name, axes[0].values), (axes[1].name, axes[1].values))
         told += f"   picture: {out / 'heat.png'}"
     click.echo(told)

@@ -28,6 +28,11 @@ class Measure:
     unit: str
     of: Callable[[RunFigures], float]
 
+    @property
+    def titled(self) -> str:
+        """With its unit."""
+        return f"{self.name}, {self.unit}" if self.unit else self.name
+
 
 def _mean(kind: str, value: Callable[[AgentFigures], float]) -> Callable[[RunFigures], float]:
     """Over agents of a kind that have it; NaN without any."""

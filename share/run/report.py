@@ -57,7 +57,8 @@ def sweep_markdown(
     rows: Sequence[Mapping[str, Any]], runs: Sequence[RunFigures], trials: Sequence[Trial]
 ) -> str:
     """The same for a reader, with intervals, and of what."""
-    head = [*rows[0]["settings"], "runs", *rows[0]["means"]]
+    titles = {measure.name: measure.titled for measure in MEASURES}
+    head = [*rows[0]["settings"], "runs", *(titles[name] for name in rows[0]["means"])]
     body = [
         [*row["settings"].values(), str(row["runs"]), *(_wide(m) for m in row["means"].values())]
         for row in rows
@@ -144,7 +145,7 @@ def _comparison(runs: Sequence[RunFigures], names: Sequence[str], base: str) -> 
             one = found[name][k]
             ratio = "" if name == base else f"; {_part(one)}"
             cells.append(number(one.value.value) + ratio)
-        rows.append([f"{measure.name}{', ' + measure.unit if measure.unit else ''}", *cells])
+        rows.append([measure.titled, *cells])
     return markdown_table(rows)
 
 
