@@ -24,7 +24,7 @@ def annex(path: Path, number: int) -> Annex:
     """Of a folder by `share evaluate sweep`, or a file by `share train compare --json`: a report's first or
     `number`th. Raises UsageError for anything else, DataError for a damaged one."""
     if path.is_file():
-        return Annex(f"## Models of the error\n\n{table(read_scores(path))}\n", {})
+        return Annex(f"## Models of the error: {path.stem}\n\n{table(read_scores(path))}\n", {})
     if not (path / SWEEP).is_file():
         raise UsageError(
             f"--with {path}: give a folder by `share evaluate sweep`, "

@@ -21,7 +21,7 @@ def test_models_of_the_error(tmp_path):
     assert math.isnan(first.ms)
     assert second == SCORES[1]
     made = annex(file, 1)
-    assert made.text.startswith("## Models of the error\n")
+    assert made.text.startswith("## Models of the error: scores\n")
     assert "| ours | 1.500 | 0.500 | 0.80 | 0.100 | 90 % | 1.20 |" in made.text
     assert made.pictures == {}
 
