@@ -17,7 +17,7 @@ demo: install
 test: install
 	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile --ignore tests/run
 	$(BIN)/pytest tests/run  # real processes in real time: with the cores to themselves
-SLOW_ALONE := tests/run tests/frozen tests/tutorial  # in real time, or with their own processes
+SLOW_ALONE := tests/run tests/frozen tests/booted tests/tutorial  # in real time, or with their own processes
 slow: install
 	$(BIN)/pytest -m slow -n auto --maxprocesses 4 --dist loadfile $(SLOW_ALONE:%=--ignore %)
 	$(BIN)/pytest -m slow $(SLOW_ALONE)

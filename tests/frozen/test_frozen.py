@@ -14,16 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_device import make_device
+from frozen_program import ROOT, frozen_program
 from recordings import make_euroc, make_tum
 from ssh_server import HOST, ssh_server
 
 from share import __version__
 from share.cli.main import COMMANDS
 
-ROOT = Path(__file__).resolve().parents[2]
-PROGRAM = ROOT / "dist" / "share" / "share"
-SOURCES = ["Makefile", "setup.cfg", "share/**/*.py", "tools/share.spec", "tools/frozen_entry.py"]
-SOURCES += ["tools/slim.py", "tools/stub_library.py", "tools/no_highs.py"]
 MB = 1_000_000
 
 pytestmark = pytest.mark.slow
@@ -31,12 +28,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def program() -> Path:
-    """dist/share/share, built anew unless it is younger than what it is made of."""
-    newest = max(path.stat().st_mtime for pattern in SOURCES for path in ROOT.glob(pattern))
-    if not PROGRAM.exists() or PROGRAM.stat().st_mtime < newest:
-        made = subprocess.run(["make", "freeze"], cwd=ROOT, capture_output=True, text=True, check=False)
-        assert made.returncode == 0, made.stdout + made.stderr
-    return PROGRAM
+    return frozen_program()
 
 
 @pytest.fixture

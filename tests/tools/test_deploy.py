@@ -343,6 +343,12 @@ def test_an_agent_may_write_what_starts_the_camera_s_imu():
     assert "SupplementaryGroups=plugdev video" in lines
 
 
+@pytest.mark.parametrize("unit", ["share-edge.service", "share-agent@.service"])
+def test_libzmq_may_ask_for_the_interfaces_of_the_machine(unit):
+    """By netlink, and it aborts the program where it may not: tests/booted saw it."""
+    assert re.search("^RestrictAddressFamilies=.*AF_NETLINK", (TOOLS / "device" / unit).read_text(), re.M)
+
+
 def test_over_a_real_ssh(device, tmp_path):
     program = device.program("1.0")
     agent = ("agent", "--name", "ann", "--edge", "tcp://10.0.0.1:5555")

@@ -10,6 +10,8 @@ KEEP=${SHARE_KEEP:-3}      # releases
 OPT=$ROOT/opt/share ETC=$ROOT/etc/share VAR=$ROOT/var/lib/share
 UNITS=$ROOT/etc/systemd/system RULES=$ROOT/etc/udev/rules.d BOOT=$ROOT/etc/tmpfiles.d
 
+ROUTINE='^(Starting|Started|Stopping|Stopped) |: (Scheduled restart job|Failed with result)' # what systemd says at each try
+
 say() { echo "share: $*" || :; } # perhaps to nobody
 die() { echo "$*" >&2 || :; exit 1; }
 release() { readlink "$OPT/$1" 2>/dev/null | sed 's|^releases/||'; } # current or previous: which it is
@@ -161,24 +163,25 @@ healthy() { # all services stay up, and what is made of machine code loads here
     [ -z "$(services)" ] || sleep "$SETTLE"
     fine=yes
     for unit in $(services); do
-        systemctl is-active --quiet "$unit" || complain "$unit"
+        { systemctl is-active --quiet "$unit" && echo "$before" | grep -qxF "$(started "$unit")"; } || complain "$unit"
     done
-    [ "$before" = "$(restarts)" ] || complain "$(services | tr '\n' ' ')"
     [ "$fine" = yes ] && checkup
 }
 
-restarts() { for unit in $(services); do systemctl show -p NRestarts "$unit"; done; }
+restarts() { for unit in $(services); do started "$unit"; done; }
 
-complain() { # UNITS: that they do not stay up, and the last that they said
+started() { echo "$1 $(systemctl show -p NRestarts "$1")"; } # how often anew, by itself
+
+complain() { # UNIT: that it does not stay up, and the last that it said
     fine=no
     say "$1 did not stay up for $SETTLE s:"
-    for unit in $1; do journalctl -u "$unit" -n 5 -o cat --no-pager 2>/dev/null | sed 's/^/    /'; done
+    journalctl -u "$1" -n 50 -o cat --no-pager 2>/dev/null | grep -vE "$ROUTINE" | tail -n 5 | sed 's/^/    /'
 }
 
 checkup() { # shows what the doctor finds; only the libraries are the program's own
     found=$("$OPT/current/share" doctor --json --profile "$(cat "$ETC/profile")" --keys "$ETC/keys" --out "$VAR" \
         2>&1 | tr '{' '\n' | sed -n 's/.*"name": "\([^"]*\)", "state": "\([A-Z]*\)", "what": "\([^"]*\)".*/\2 \1: \3/p')
-    echo "$found" | grep -E '^(FAIL|WARN)' | sed 's/^/    doctor: /' || true
+    echo "$found" | grep -E '^(FAIL|WARN)' | grep -v ' port:' | sed 's/^/    doctor: /' || true # the edge has its port
     echo "$found" | grep -q '^OK libraries' || { say "its libraries do not load here"; return 1; }
 }
 
