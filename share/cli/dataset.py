@@ -133,7 +133,8 @@ def _recovered(out: Path, result: Any) -> str:
 
 
 def _text(d: dict[str, Any]) -> str:
-    lines = [f"{d['name']}: {d['kind']}, {d['duration_s']:.1f} s"]
+    device = f", device {d['serial']}" if d["serial"] else ""
+    lines = [f"{d['name']}: {d['kind']}, {d['duration_s']:.1f} s{device}"]
     for name, s in d["streams"].items():
         line = f"  {name:<6} {s['count']:>7} at {s['rate_hz']:.5g} Hz"
         if s["gaps"]:

@@ -44,12 +44,13 @@ def doctor(
     """
     from share.core.checkup import failures
     from share.io.profile import host_profile
-    from share.run.doctor import of_calibration, of_camera, of_edge, of_host, of_port
+    from share.run.doctor import ask, of_calibration, of_camera, of_edge, of_host, of_port
 
     wanted = host_profile(profile)
+    sdk = ask(wanted)
     found = [
-        *of_camera(wanted),
-        of_calibration(wanted, None if calib is None else Path(calib)),
+        *of_camera(wanted, sdk),
+        *of_calibration(wanted, None if calib is None else Path(calib), sdk),
         *of_host(wanted, Path(out)),
         *of_port(wanted),
         *of_edge(address, None if keys is None else Path(keys), server_key),

@@ -8,7 +8,8 @@ import time
 from pathlib import Path
 
 from share.core.checkup import Finding, boot, camera, fail, host, ok, skipped
-from share.core.checkup.calibration import calibration
+from share.core.checkup.calibration import calibration, device
+from share.core.checkup.camera import Sdk
 from share.errors import ShareError
 from share.io import host as facts
 from share.io.calibration import read_calibration
@@ -36,16 +37,23 @@ def of_host(profile: HostProfile, out: Path) -> list[Finding]:
     ]
 
 
-def of_camera(profile: HostProfile) -> list[Finding]:
-    """Only of a device that is a RealSense."""
+def ask(profile: HostProfile) -> Sdk | None:
+    """What librealsense sees; None where the profile's device is no RealSense."""
     if profile.sensor is None or _REALSENSE not in profile.sensor.device.model:
+        return None
+    return asked.ask()
+
+
+def of_camera(profile: HostProfile, sdk: Sdk | None) -> list[Finding]:
+    """sdk: as `ask` found it."""
+    if profile.sensor is None or sdk is None:
         return [skipped("camera", f"profile '{profile.name}' has none that can be asked")]
-    device, wanted = profile.sensor.device, profile.host
-    found, sdk = facts.cameras(), asked.ask()
+    wanted, found = profile.host, facts.cameras()
+    good, oldest = profile.sensor.device.firmware, profile.sensor.device.firmware_oldest
     return [
         camera.link(found),
         camera.sdk(sdk, found or (), _frozen()),
-        camera.firmware(sdk, device.firmware, device.firmware_oldest),
+        camera.firmware(sdk, good, oldest),
         camera.udev(facts.camera_rules(), os.geteuid() == 0),
         camera.imu(found or ()),
         camera.autosuspend(found or (), wanted.usb_autosuspend),
@@ -53,17 +61,19 @@ def of_camera(profile: HostProfile) -> list[Finding]:
     ]
 
 
-def of_calibration(profile: HostProfile, folder: Path | None) -> Finding:
+def of_calibration(profile: HostProfile, folder: Path | None, sdk: Sdk | None) -> list[Finding]:
+    """sdk: as `ask` found it."""
     if profile.sensor is None:
-        return skipped("calibration", f"profile '{profile.name}' has no device")
+        return [skipped("calibration", f"profile '{profile.name}' has no device")]
     if folder is None:
-        return skipped("calibration", "none given: --calib DIR")
+        return [skipped("calibration", "none given: --calib DIR")]
     try:
         found = read_calibration(folder)
         age_days = (time.time() - Path(found.where).stat().st_mtime) / 86400
     except (ShareError, OSError) as error:
-        return fail("calibration", str(error))
-    return calibration(found.rig, age_days, profile.sensor.device.T_imu_cam0, profile.sensor.baseline_m)
+        return [fail("calibration", str(error))]
+    whole = calibration(found.rig, age_days, profile.sensor.device.T_imu_cam0, profile.sensor.baseline_m)
+    return [whole, device(found.serials, () if sdk is None else sdk.serials)]
 
 
 def of_port(profile: HostProfile) -> list[Finding]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from share.core.checkup import State, boot, camera, host
-from share.core.checkup.calibration import calibration
+from share.core.checkup.calibration import calibration, device
 from share.core.checkup.camera import Sdk, UsbCamera
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.geometry.se3 import inverse
@@ -113,6 +113,28 @@ def test_an_inverted_extrinsic_is_told_from_one_that_is_elsewhere() -> None:
     assert of(inverse(T), T_10) == (State.FAIL, "the extrinsics to the IMU are inverted")
     assert of(np.eye(4), T_10)[0] is State.WARN
     assert "cam1 lies left" in of(T, inverse(T_10))[1]
+
+
+@pytest.mark.parametrize(
+    ("said", "there", "state", "mended"),
+    [
+        (("0123",), ("0123",), State.OK, []),
+        (("0123",), ("0456", "0123"), State.OK, []),
+        (("0123",), ("0456",), State.WARN, ["0456"]),
+        (("0123", "0789"), ("0123",), State.WARN, ["0123"]),
+        (("0123",), (), State.SKIPPED, []),
+        ((), ("0123",), State.SKIPPED, []),
+    ],
+)
+def test_a_calibration_of_another_camera_is_a_warning(
+    said: tuple[str, ...], there: tuple[str, ...], state: State, mended: list[str]
+) -> None:
+    found = device(said, there)
+    assert found.state is state
+    assert [line.partition("  #")[0] for line in found.mend] == [
+        f"share calibrate realsense {one} --out calib/{one}" for one in mended
+    ]
+    assert all(one in found.what for one in said)
 
 
 def test_facts_are_read_from_a_tree(tmp_path: Path) -> None:

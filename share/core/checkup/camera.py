@@ -37,10 +37,12 @@ class UsbCamera:
 
 @dataclass(frozen=True)
 class Sdk:
-    """What librealsense says. trouble: why it could not be asked, None where it was. firmware: of each."""
+    """What librealsense says. trouble: why it could not be asked, None where it was. firmware, serials: of
+    each camera."""
 
     trouble: str | None = None
     firmware: tuple[str, ...] = ()
+    serials: tuple[str, ...] = ()
 
 
 def link(cameras: Sequence[UsbCamera] | None) -> Finding:
