@@ -34,7 +34,8 @@ class Section:
     def text(self, key: str, default: str | None = None) -> str:
         value = self.get(key) if default is None else self.data.get(key, default)
         if not isinstance(value, str):
-            raise ConfigError(f"{self.where}: {key}: expected a word, found {_kind(value)}")
+            quoted = "" if value is None or isinstance(value, dict | list) else "; put it in quotes"
+            raise ConfigError(f"{self.where}: {key}: expected a word, found {_kind(value)}{quoted}")
         return value
 
     def number(self, key: str, default: float | None = None, positive: bool = False) -> float:
@@ -94,12 +95,33 @@ def read_yaml(path: Path) -> Section:
     if lines[0].startswith("%YAML"):  # not valid YAML: the directive needs a space, and a `---` after it
         lines[0] = ""
     try:
-        return Section(yaml.safe_load("\n".join(lines)), str(path))
+        return Section(_unambiguous("\n".join(lines)), str(path))
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark else ""
         reason = getattr(error, "problem", None) or str(error).splitlines()[0]
         raise ConfigError(f"{path}{line}: not valid YAML: {reason}") from None
+
+
+def _unambiguous(text: str) -> Any:
+    """As yaml.safe_load, which of a key that stands there twice takes the last. Raises yaml.YAMLError."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+            seen = set()
+            for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+                if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE:
+                    if (key.tag, key.value) in seen:
+                        twice = f"key '{key.value}' for the second time"
+                        raise yaml.MarkedYAMLError(problem=twice, problem_mark=key.start_mark)
+                    seen.add((key.tag, key.value))
+            return super().construct_mapping(node, deep)
+
+    return yaml.load(text, Loader)  # no less safe
+
+
+_MERGE = "tag:yaml.org,2002:merge"
 
 
 def _kind(value: Any) -> str:
