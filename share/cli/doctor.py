@@ -53,7 +53,7 @@ def doctor(
         *of_calibration(wanted, None if calib is None else Path(calib), sdk),
         *of_host(wanted, Path(out)),
         *of_port(wanted),
-        *of_edge(address, None if keys is None else Path(keys), server_key),
+        *of_edge(wanted, address, None if keys is None else Path(keys), server_key),
     ]
     failed = failures(found)
     click.echo(_plain(wanted.name, found, not failed) if as_json else _table(found))

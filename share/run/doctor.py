@@ -13,7 +13,7 @@ from share.core.checkup.camera import Sdk
 from share.errors import ShareError
 from share.io import host as facts
 from share.io.calibration import read_calibration
-from share.io.keys import AgentKeys, agent_keys, default_folder, has_pair, load
+from share.io.keys import AgentKeys, agent_keys, default_folder, edge_keys, has_pair, load
 from share.io.profile import HostProfile
 from share.io.profile_types import HostFacts, Profile
 from share.io.realsense import asked
@@ -23,6 +23,7 @@ from share.run.edge_probe import probe
 
 _REALSENSE = "RealSense"
 _PORT = 5555  # of `share edge`
+_PPD = "sudo systemctl mask --now power-profiles-daemon  # or it sets powersave again at the next start"
 
 
 def of_host(profile: HostProfile, out: Path) -> list[Finding]:
@@ -30,8 +31,8 @@ def of_host(profile: HostProfile, out: Path) -> list[Finding]:
     where, free = facts.free_bytes(out)
     return [
         host.libraries(facts.native_libraries(), _frozen()),
-        host.governor(facts.governors(), wanted.cpu_governor, _boot(wanted)),
-        host.throttling(facts.throttles()),
+        host.governor(facts.governors(), wanted.cpu_governor, _governor_mend(wanted)),
+        host.throttling(facts.throttles(), facts.pi_throttled()),
         host.disk(str(where), free, 0.0 if profile.sensor is None else _bytes_s(profile.sensor)),
         host.clock_of_edge() if profile.role == "edge" else _clock(),
     ]
@@ -81,11 +82,13 @@ def of_port(profile: HostProfile) -> list[Finding]:
     return [host.port(_PORT, facts.port_free(_PORT))] if profile.role == "edge" else []
 
 
-def of_edge(address: str | None, keys: Path | None, server_key: str | None) -> list[Finding]:
+def of_edge(
+    profile: HostProfile, address: str | None, keys: Path | None, server_key: str | None
+) -> list[Finding]:
     """This machine's keys, and the edge by them. Raises UsageError for an address that is none."""
     if address is not None:
         parse_address(address)
-    pair, with_keys = _keys(keys or default_folder(), server_key)
+    pair, with_keys = _keys(keys or default_folder(), server_key, profile.role == "edge")
     if address is None:
         return [pair, skipped("edge", "none given: --edge tcp://HOST:PORT")]
     if server_key is not None and with_keys is None:
@@ -96,8 +99,10 @@ def of_edge(address: str | None, keys: Path | None, server_key: str | None) -> l
         return [pair, fail("edge", str(error))]
 
 
-def _keys(folder: Path, server_key: str | None) -> tuple[Finding, AgentKeys | None]:
+def _keys(folder: Path, server_key: str | None, is_edge: bool) -> tuple[Finding, AgentKeys | None]:
     try:
+        if server_key is None and is_edge:
+            return _keys_of_edge(folder), None
         if server_key is not None:
             both = agent_keys(folder, server_key)
             return ok("keys", f"{both.own.name}, and that of the edge"), both
@@ -106,6 +111,14 @@ def _keys(folder: Path, server_key: str | None) -> tuple[Finding, AgentKeys | No
         return ok("keys", f"{load(folder).name}"), None
     except ShareError as error:
         return fail("keys", str(error)), None
+
+
+def _keys_of_edge(folder: Path) -> Finding:
+    """Raises UsageError."""
+    if not has_pair(folder):
+        return host.no_edge_keys(str(folder))
+    keys = edge_keys(folder)
+    return host.edge_keys(keys.own.name, sorted(set(keys.allowed.names().values())))
 
 
 def _clock() -> Finding:
@@ -126,6 +139,12 @@ def _frozen() -> bool:
 
 def _boot(wanted: HostFacts) -> tuple[str, ...]:
     return boot.mend(wanted.cpu_governor, wanted.usbfs_mb)
+
+
+def _governor_mend(wanted: HostFacts) -> tuple[str, ...]:
+    if wanted.cpu_governor != "powersave" and facts.resets_governor():
+        return _PPD, *_boot(wanted)
+    return _boot(wanted)
 
 
 def _bytes_s(sensor: Profile) -> float:

@@ -75,6 +75,32 @@ def test_the_host_is_held_against_the_profile() -> None:
     assert camera.udev([], is_root=False).state is State.FAIL
 
 
+@pytest.mark.parametrize(
+    ("bits", "what", "mend"),
+    [
+        (0x0, "none since the start", ""),
+        (0x50005, "its supply gives too little voltage and it is slowed (get_throttled 0x50005)", "5.1 V"),
+        (0x50000, "its supply gave too little voltage and it was slowed since the start (", "5.1 V"),
+        (0x80000, "it was slowed since the start (get_throttled 0x80000)", "cool it"),
+        (0x8, "it is slowed (get_throttled 0x8)", "cool it"),
+    ],
+)
+def test_a_raspberry_pi_tells_of_its_supply_and_of_heat(bits: int, what: str, mend: str) -> None:
+    found = host.throttling([], bits)
+    assert found.state is (State.WARN if bits else State.OK)
+    assert found.what.startswith(what)
+    assert all(mend in line for line in found.mend) and bool(found.mend) == bool(bits)
+
+
+def test_an_edge_without_keys_or_agents_serves_its_own_machine_only() -> None:
+    assert (host.no_edge_keys("k").state, host.no_edge_keys("k").mend) == (
+        State.WARN,
+        ("share keys generate",),
+    )
+    assert host.edge_keys("edge", []).state is State.WARN
+    assert host.edge_keys("edge", ["ann", "bob"]).what == "edge; lets in: ann, bob"
+
+
 def test_what_mends_the_host_outlives_a_start() -> None:
     lines, mend = boot.lines("performance", 128), boot.mend("performance", 128)
     assert [line.split()[-1] for line in lines] == ["performance", "128"]
