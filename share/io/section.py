@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from share.errors import ConfigError
+from share.strict import load_yaml
 from share.types import F64, checked_pose
 
 
@@ -81,8 +82,6 @@ class Section:
 
 def read_yaml(path: Path) -> Section:
     """The top mapping of a YAML file, also of one that OpenCV wrote (`%YAML:1.0`, `!!opencv-matrix`)."""
-    import yaml
-
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -94,34 +93,7 @@ def read_yaml(path: Path) -> Section:
     lines = text.replace("!!opencv-matrix", "").split("\n")
     if lines[0].startswith("%YAML"):  # not valid YAML: the directive needs a space, and a `---` after it
         lines[0] = ""
-    try:
-        return Section(_unambiguous("\n".join(lines)), str(path))
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f", line {mark.line + 1}" if mark else ""
-        reason = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise ConfigError(f"{path}{line}: not valid YAML: {reason}") from None
-
-
-def _unambiguous(text: str) -> Any:
-    """As yaml.safe_load, which of a key that stands there twice takes the last. Raises yaml.YAMLError."""
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-            seen = set()
-            for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
-                if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE:
-                    if (key.tag, key.value) in seen:
-                        twice = f"key '{key.value}' for the second time"
-                        raise yaml.MarkedYAMLError(problem=twice, problem_mark=key.start_mark)
-                    seen.add((key.tag, key.value))
-            return super().construct_mapping(node, deep)
-
-    return yaml.load(text, Loader)  # no less safe
-
-
-_MERGE = "tag:yaml.org,2002:merge"
+    return Section(load_yaml("\n".join(lines), str(path)), str(path))
 
 
 def _kind(value: Any) -> str:
