@@ -18,7 +18,11 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.option(
-    "--profile", default="d435i", show_default=True, metavar="NAME|FILE", help="What is wanted here."
+    "--profile",
+    default="d435i",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="What is wanted here: d435i-n100-headset, d435i-turtlebot4, laptop-edge, your own file.",
 )
 @click.option("--calib", metavar="DIR", help="The calibration of this device.")
 @click.option("--edge", "address", metavar="tcp://H:P", help="An edge to try.")

@@ -73,7 +73,9 @@ def of_calibration(profile: HostProfile, folder: Path | None, sdk: Sdk | None) -
         age_days = (time.time() - Path(found.where).stat().st_mtime) / 86400
     except (ShareError, OSError) as error:
         return [fail("calibration", str(error))]
-    whole = calibration(found.rig, age_days, profile.sensor.device.T_imu_cam0, profile.sensor.baseline_m)
+    sensor = profile.sensor
+    size = (sensor.mode.width, sensor.mode.height)
+    whole = calibration(found.rig, age_days, sensor.device.T_imu_cam0, sensor.baseline_m, size)
     return [whole, device(found.serials, () if sdk is None else sdk.serials)]
 
 

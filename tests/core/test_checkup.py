@@ -129,13 +129,14 @@ def test_an_inverted_extrinsic_is_told_from_one_that_is_elsewhere() -> None:
     T_10[0, 3] = -0.05
     lens = Camera(640, 480, 385.0, 385.0, 320.0, 240.0)
 
-    def of(T_imu_cam0: np.ndarray, cam1: np.ndarray) -> tuple[State, str]:
+    def of(T_imu_cam0: np.ndarray, cam1: np.ndarray, size: tuple[int, int] = (640, 480)) -> tuple[State, str]:
         noise = ImuNoise(1e-4, 2e-3, 2e-5, 3e-3, 200.0)
         rig = Rig(lens, T_imu_cam0, cam1=lens, T_cam1_cam0=cam1, imu=noise)
-        found = calibration(rig, 1.0, T, 0.05)
+        found = calibration(rig, 1.0, T, 0.05, size)
         return found.state, found.what
 
-    assert of(T, T_10)[0] is State.OK
+    assert of(T, T_10) == (State.OK, "cameras (640x480) and IMU, 1 days old")
+    assert of(T, T_10, (848, 480))[1].endswith("; goes with --mode 640x480 only")
     assert of(inverse(T), T_10) == (State.FAIL, "the extrinsics to the IMU are inverted")
     assert of(np.eye(4), T_10)[0] is State.WARN
     assert "cam1 lies left" in of(T, inverse(T_10))[1]

@@ -18,15 +18,21 @@ _DEVICE = "serial number"
 _CALIBRATE = "calibrate again: docs/data.md says which files; give the folder with --calib"
 
 
-def calibration(rig: Rig, age_days: float, T_imu_cam0: F64, baseline_m: float) -> Finding:
-    """Against what the profile says of such devices: T_imu_cam0 (4, 4), baseline_m."""
+def calibration(
+    rig: Rig, age_days: float, T_imu_cam0: F64, baseline_m: float, size: tuple[int, int]
+) -> Finding:
+    """Against what the profile says of such devices: T_imu_cam0 (4, 4), baseline_m, size of images where no
+    --mode is given."""
     if rig.imu is None:
         return fail("calibration", "has no IMU chain, kalibr_imu_chain.yaml", _CALIBRATE)
     if rig.T_cam1_cam0 is not None and (wrong := _baseline(rig.T_cam1_cam0, baseline_m)):
         return fail("calibration", wrong, _CALIBRATE)
     if not _near(rig.T_body_cam0, T_imu_cam0):
         return _elsewhere(rig.T_body_cam0, T_imu_cam0)
-    what = f"cameras and IMU, {age_days:.0f} days old"
+    found = (rig.cam0.width, rig.cam0.height)
+    words = f"{found[0]}x{found[1]}"
+    mode = "" if found == size else f"; goes with --mode {words} only"
+    what = f"cameras ({words}) and IMU, {age_days:.0f} days old{mode}"
     return ok("calibration", what) if age_days <= _OLD_DAYS else warn("calibration", what, _CALIBRATE)
 
 
