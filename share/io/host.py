@@ -108,7 +108,7 @@ def _is_d435i(path: Path) -> bool:
 
 
 def _camera(path: Path, nodes: Path) -> UsbCamera:
-    speed_mbit_s, control = float(_text(path / "speed") or 0), _text(path / "power/control")
+    speed_mbit_s, control = _number(path / "speed") or 0.0, _text(path / "power/control")
     node = nodes / f"{_whole(path / 'busnum') or 0:03}" / f"{_whole(path / 'devnum') or 0:03}"
     may_open = os.access(node, os.R_OK | os.W_OK)
     return UsbCamera(path.name, speed_mbit_s, control, may_open, _may_start_imu(path))
@@ -131,6 +131,12 @@ def _text(path: Path) -> str | None:
         return path.read_text(errors="replace").strip()
     except OSError:
         return None
+
+
+def _number(path: Path) -> float | None:
+    """Also None of `unknown`, as the kernel calls the speed of a device that is coming or going."""
+    text = _text(path) or ""
+    return float(text) if re.fullmatch(r"\d+(\.\d+)?", text) else None
 
 
 def _whole(path: Path) -> int | None:

@@ -33,7 +33,7 @@ def of_host(profile: HostProfile, out: Path) -> list[Finding]:
         host.libraries(facts.native_libraries(), _frozen()),
         host.governor(facts.governors(), wanted.cpu_governor, _governor_mend(wanted)),
         host.throttling(facts.throttles(), facts.pi_throttled()),
-        host.disk(str(where), free, 0.0 if profile.sensor is None else _bytes_s(profile.sensor)),
+        host.disk(str(where), free, _bytes_s(profile.sensor), os.access(where, os.W_OK)),
         host.clock_of_edge() if profile.role == "edge" else _clock(),
     ]
 
@@ -149,6 +149,8 @@ def _governor_mend(wanted: HostFacts) -> tuple[str, ...]:
     return _boot(wanted)
 
 
-def _bytes_s(sensor: Profile) -> float:
-    """Two gray images, uncompressed."""
+def _bytes_s(sensor: Profile | None) -> float:
+    """Two gray images, uncompressed; nothing where there is no camera."""
+    if sensor is None:
+        return 0.0
     return 2.0 * sensor.mode.width * sensor.mode.height * sensor.rate_hz

@@ -116,6 +116,11 @@ def test_a_disk_is_told_in_minutes(minutes: int, state: str) -> None:
     assert host.disk("/", minutes * 60 * 10_000_000, 1e7).state.value == state
 
 
+def test_a_disk_that_may_not_be_written_to_is_of_no_use() -> None:
+    found = host.disk("/data", 10**12, 1e7, may_write=False)
+    assert (found.state, found.what) == (State.FAIL, "/data: this user may not write there")
+
+
 @pytest.mark.parametrize(("offset", "state"), [(0.5, State.OK), (-0.5, State.OK), (0.8, State.WARN)])
 def test_the_clock_counts_with_its_uncertainty(offset: float, state: State) -> None:
     assert host.clock((offset, 0.3), None).state is state
@@ -179,6 +184,9 @@ def test_facts_are_read_from_a_tree(tmp_path: Path) -> None:
     }.items():
         (usb / name).write_text(text + "\n")
     assert facts.cameras(tmp_path) == [UsbCamera("2-1", 480.0, "auto", may_open=False, may_start_imu=None)]
+    (usb / "speed").write_text("unknown\n")  # on its way out
+    assert camera.link(facts.cameras(tmp_path)).state is State.FAIL
+    (usb / "speed").write_text("480\n")
     node = tmp_path / "dev/bus/usb/002/013"
     node.parent.mkdir(parents=True)
     node.touch()

@@ -58,9 +58,11 @@ def _pi_throttling(bits: int) -> Finding:
     return warn("throttling", f"{' and '.join(what)} (get_throttled 0x{bits:x})", *mends)
 
 
-def disk(where: str, free_bytes: int, bytes_s: float) -> Finding:
-    """bytes_s: what is written at most, 0 where nothing is recorded."""
+def disk(where: str, free_bytes: int, bytes_s: float, may_write: bool = True) -> Finding:
+    """bytes_s: what is written at most, 0 where nothing is recorded. may_write: whether this user may."""
     what = f"{where}: {free_bytes / 1e9:.1f} GB free"
+    if not may_write:
+        return fail("disk", f"{where}: this user may not write there", "give another --out")
     if not bytes_s:
         return ok("disk", what) if free_bytes > 1e9 else fail("disk", what, f"df -h {where}; make room")
     minutes = free_bytes / bytes_s / 60
