@@ -86,6 +86,7 @@ def convert(
     if kind == "mcap":
         _check_mcap(check_writable(target), source)
     opened = open_source(source, calib, frames)
+    options.say_notes(opened)
     with progress(opened.images_count, "converting") as bar:
         if kind == "mcap":
             to_mcap(opened, target, jpeg, bar)
