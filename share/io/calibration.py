@@ -7,6 +7,7 @@ in docs/data.md.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -95,13 +96,16 @@ def kalibr(chain: Section, imu: Section | None) -> Calibration:
 
 def serials(sections: Iterable[Section]) -> tuple[str, ...]:
     """Of which devices they say to be, each once (ours alone: Kalibr reads past it). Raises ConfigError."""
-    return tuple(dict.fromkeys(_serial(section) for section in sections if SERIAL in section))
+    said = (_serial(section) for section in sections if section.data.get(SERIAL) not in (None, ""))
+    return tuple(dict.fromkeys(said))
 
 
 def _serial(section: Section) -> str:
     found = section.get(SERIAL)
     if not isinstance(found, str):
         raise ConfigError(f"{section.where}: {SERIAL}: put it in quotes, else YAML takes it for a number")
+    if not re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", found):
+        raise ConfigError(f"{section.where}: {SERIAL}: {found!r:.40} is no serial number; leave it out")
     return found
 
 

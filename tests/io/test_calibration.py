@@ -171,6 +171,11 @@ def test_the_device_is_told_in_every_section_and_never_at_the_top(tmp_path):
     (tmp_path / IMU_CHAIN).write_text(chain_of_another.replace("'0456'", "0456"))
     with pytest.raises(ConfigError, match=f"{IMU_CHAIN}: imu0: serial: put it in quotes"):
         read_calibration(tmp_path)
+    (tmp_path / IMU_CHAIN).write_text(chain_of_another.replace("'0456'", "'a b'"))
+    with pytest.raises(ConfigError, match=f"{IMU_CHAIN}: imu0: serial: 'a b' is no serial number"):
+        read_calibration(tmp_path)
+    (tmp_path / IMU_CHAIN).write_text(chain_of_another.replace("'0456'", ""))
+    assert read_calibration(tmp_path).serials == ("0123",)
 
 
 DEPTH = """depth:
