@@ -36,8 +36,8 @@ def as_read(given: Rig, own: Rig) -> Rig:
 
 
 def unused(given: Rig, own: Rig) -> tuple[str, ...]:
-    """A line for each camera that is read and not in the calibration."""
-    names = [name for name in ("cam1", "depth") if getattr(own, name) and not getattr(given, name)]
+    """A line for each camera, and the IMU, that is read and not in the calibration."""
+    names = [name for name in ("cam1", "depth", "imu") if getattr(own, name) and not getattr(given, name)]
     return tuple(f"{name} is not used: the calibration has no {name}" for name in names)
 
 

@@ -90,6 +90,7 @@ def test_a_raspberry_pi_tells_of_its_supply_and_of_heat(bits: int, what: str, me
     assert found.state is (State.WARN if bits else State.OK)
     assert found.what.startswith(what)
     assert all(mend in line for line in found.mend) and bool(found.mend) == bool(bits)
+    assert len(host.throttling([], bits | 0x90000).mend) == 2  # each has a remedy of its own
 
 
 def test_an_edge_without_keys_or_agents_serves_its_own_machine_only() -> None:

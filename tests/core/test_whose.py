@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from share.core.whose import as_read, of_another, unused
-from share.geometry.camera import Camera, Rig
+from share.geometry.camera import Camera, ImuNoise, Rig
 
 LENS = Camera(640, 480, 385.0, 385.0, 320.0, 240.0)
 STEREO = Rig(LENS, np.eye(4), cam1=LENS, T_cam1_cam0=np.eye(4))
@@ -37,6 +37,8 @@ def test_cameras_that_are_not_read_are_left_out():
     assert as_read(STEREO, ALL).depth is None
     assert unused(STEREO, ALL) == ("depth is not used: the calibration has no depth",)
     assert unused(ALL, STEREO) == unused(ALL, ALL) == ()
+    moved = replace(STEREO, imu=ImuNoise(1e-4, 2e-3, 2e-5, 3e-3, 200.0))
+    assert unused(STEREO, moved) == ("imu is not used: the calibration has no imu",)
 
 
 def test_images_of_another_size_cannot_be_meant():

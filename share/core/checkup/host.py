@@ -40,7 +40,8 @@ def throttling(counts: Sequence[int], pi: int | None = None) -> Finding:
 
 _COOL = "cool it better (fan, dust, air), or ask less of it: a lower image rate"
 _SUPPLY = "give it 5.1 V and 3 A by a short, thick cable, or the camera a USB 3 hub with a supply of its own"
-_VOLTAGE, _SLOWED, _EVER = 0x1, 0xE, 16  # bits now, and by how many they are shifted for "since the start"
+_VOLTAGE, _SLOWED, _HOT = 0x1, 0xE, 0x8  # bits of now
+_EVER = 16  # by so many they are shifted for "since the start"
 
 
 def _pi_throttling(bits: int) -> Finding:
@@ -54,7 +55,8 @@ def _pi_throttling(bits: int) -> Finding:
         what.append(f"its supply {'gives' if now & _VOLTAGE else 'gave'} too little voltage")
     if ever & _SLOWED:
         what.append("it is slowed" if now & _SLOWED else "it was slowed since the start")
-    mends = [_SUPPLY] if ever & _VOLTAGE else [_COOL]
+    needed = ((_SUPPLY, ever & _VOLTAGE), (_COOL, ever & _HOT or not ever & _VOLTAGE))
+    mends = [mend for mend, there in needed if there]
     return warn("throttling", f"{' and '.join(what)} (get_throttled 0x{bits:x})", *mends)
 
 
