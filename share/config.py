@@ -7,8 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from share.errors import ConfigError
-from share.strict import from_mapping
+from share.strict import from_mapping, load_yaml
 
 
 @dataclass(frozen=True)
@@ -360,10 +359,5 @@ def _require_positive(config: Any, *names: str) -> None:
 
 def load(text: str, where: str = "configuration") -> Config:
     """A `Config` from YAML text. Raises ConfigError naming the key and what would be right."""
-    import yaml
-
-    try:
-        data = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{where}: not valid YAML: {str(error).splitlines()[0]}") from None
+    data = load_yaml(text, where)
     return from_mapping(Config, {} if data is None else data, where)

@@ -59,3 +59,30 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
             return value
     names = " or ".join(getattr(kind, "__name__", str(kind)) for kind in accepted)
     raise ConfigError(f"{where}: expected {names}, found {value!r}")
+
+
+def load_yaml(text: str, where: str) -> Any:
+    """As yaml.safe_load, which of a key that stands there twice takes the last. Raises ConfigError."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+            seen = set()
+            for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+                if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE:
+                    if (key.tag, key.value) in seen:
+                        twice = f"key '{key.value}' for the second time"
+                        raise yaml.MarkedYAMLError(problem=twice, problem_mark=key.start_mark)
+                    seen.add((key.tag, key.value))
+            return super().construct_mapping(node, deep)
+
+    try:
+        return yaml.load(text, Loader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark else ""
+        reason = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise ConfigError(f"{where}{line}: not valid YAML: {reason}") from None
+
+
+_MERGE = "tag:yaml.org,2002:merge"  # of `<<`

@@ -14,6 +14,7 @@ from software_camera import SoftwareCamera
 from share.config import SequencerConfig
 from share.core.watchdog import Watchdog
 from share.errors import UsageError
+from share.io.calibration import Calibration
 from share.io.feed import Feed, MakeWatchdog
 from share.io.handover import Handover
 from share.io.profile import profile
@@ -53,13 +54,14 @@ class Bench:
         watchdog: MakeWatchdog = Watchdog,
         wanted: Wanted = WANTED,
         most_images: int = 60,
+        calibration: Calibration | None = None,
     ) -> None:
         self.camera, self.said, self.there = SoftwareCamera(load_sdk()), list[str](), True
         self.wanted, self.connected = wanted, 0
         rates_hz, max_jump_s = wanted.rates_hz(), SequencerConfig().max_jump_s
         queue = Handover(most_images)
         feed = Feed(self.connect, None, rates_hz, max_jump_s, self.said.append, queue, watchdog)
-        self.run = Capture(feed, out, 0.0, self.said.append)
+        self.run = Capture(feed, out, 0.0, self.said.append, calibration=calibration)
         self.report: dict[str, Any] = {}
         self.thread = threading.Thread(target=self._go, daemon=True)
 

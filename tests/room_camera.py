@@ -30,8 +30,8 @@ BEGIN_US = 5_000_000  # of the camera's clock
 class RoomCamera:
     """The devices of `source`, with its lenses. It plays when somebody listens."""
 
-    def __init__(self, rs: Any, source: Source) -> None:
-        self.source, self.camera = source, SoftwareCamera(rs, rate_hz=HZ, lens=LENS, depth=True)
+    def __init__(self, rs: Any, source: Source, serial: str = "0123") -> None:
+        self.source, self.camera = source, SoftwareCamera(rs, serial, rate_hz=HZ, lens=LENS, depth=True)
         self.there = True  # it can be connected
         self.first_ns = next(iter(source.measurements())).stamp_ns
 

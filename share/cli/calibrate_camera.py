@@ -69,6 +69,7 @@ def camera(
     pictures = open_pictures(source, ("cam0", "cam1") if camera == "both" else ("cam0",), calib)
     if pictures.said is not None:
         to_kalibr(pictures.said.rig, pictures.said)  # what is kept of it must be sound: said before the work
+    options.say_another(source, pictures.said, pictures.serial)
     writable_dir(out)
     outcome = _calibrated(source, pictures, target, every, most, workers)
     text = json.dumps(known(camera_report.to_json(outcome)), indent=1)
@@ -121,8 +122,9 @@ def _calibrated(
         for eye, T in enumerate((state.T_cam0_target, state.T_cam1_cam0 @ state.T_cam0_target)[: len(sizes)])
     )
     return Outcome(
-        used, solution, covers, judge(solution, covers, seen), rig, len(seen), before, pictures.said
-    )
+        used, solution, covers, judge(solution, covers, seen), rig, len(seen), before, pictures.said,
+        pictures.serial,
+    )  # fmt: skip
 
 
 def _summary(outcome: Outcome, chain: Path) -> str:

@@ -78,6 +78,7 @@ def camera_imu(
 
     pictures = open_rig_pictures(source, camera)
     noise = stated_noise(source, imu, "--imu")
+    options.say_another(source, pictures.pictures.said, pictures.pictures.serial)
     writable_dir(out)
     outcome = _calibrated(source, pictures, noise, target_name, every, within, workers)
     text = json.dumps(known(report.to_json(outcome)), indent=1)
@@ -128,7 +129,8 @@ def _calibrated(
             partial(stages, "fitting"),
         )  # fmt: skip
     before = None if pictures.before is None else compare(found.T_imu_cam0, pictures.before)
-    return Outcome(found, judge(found), pictures.rig, noise, before, seen, pictures.pictures.said)
+    of = pictures.pictures
+    return Outcome(found, judge(found), pictures.rig, noise, before, seen, of.said, of.serial)
 
 
 def _summary(outcome: Outcome, chain: Path) -> str:

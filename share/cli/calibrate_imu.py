@@ -56,7 +56,7 @@ def imu(source: str, profile_name: str | None, inflate: float, out: Path, as_jso
         stages("Allan deviation", 1, 1)
     report = imu_report.to_json(nature, source, stated, inflate) | {"dropped": table.dropped}
     text = json.dumps(known(report), indent=1)
-    atomic_write(out / "kalibr_imu_chain.yaml", imu_report.kalibr_text(nature, source, inflate))
+    atomic_write(out / "kalibr_imu_chain.yaml", imu_report.kalibr_text(nature, source, inflate, table.serial))
     atomic_write(out / "imu-report.json", text + "\n")
     atomic_write(
         out / "imu-report.png", allan_png(nature, stated, f"{source}, {nature.rest_s:.0f} s at rest")

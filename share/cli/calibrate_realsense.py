@@ -36,9 +36,10 @@ def realsense(serial: str | None, profile_name: str | None, mode: str | None, de
             raise UsageError(f"{path}: exists and is not overwritten; give another --out")
     wanted = Wanted(profile(profile_name or live.PROFILE, mode), depth=depth)
     with RealSense(wanted, serial) as camera:
-        rig, who = camera.rig, f"factory calibration of {camera.serial}"
+        rig, found = camera.rig, camera.serial
+    who = f"factory calibration of {found}"
     writable_dir(out)
-    for name, text in kalibr_texts(rig, f"{who}; IMU noise of profile {wanted.profile.name}").items():
+    for name, text in kalibr_texts(rig, f"{who}; IMU noise of profile {wanted.profile.name}", found).items():
         atomic_write(out / name, text)
     size = f"{rig.cam0.width}x{rig.cam0.height}, f {rig.cam0.fx:.1f} {rig.cam0.fy:.1f} px"
     click.echo(f"{out}: {who}: {size}, baseline {100 * rig.baseline:.2f} cm")

@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 @click.option("--out", required=True, metavar="REC.mcap", type=click.Path(path_type=Path), help="Recording.")
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="End after so long.")
 @live.mode
+@click.option(
+    "--calib",
+    metavar="DIR",
+    help="Your calibration of this camera, to be recorded in place of the factory's.",
+)
 @click.option("--depth", is_flag=True, help="Record depth too.")
 @click.option("--imu-only", is_flag=True, help="No images: for `share calibrate imu`.")
 @click.option(
@@ -38,12 +43,13 @@ def capture(
     out: Path,
     seconds: float | None,
     mode: str | None,
+    calib: str | None,
     depth: bool,
     imu_only: bool,
     min_free_gb: float,
     as_json: bool,
 ) -> None:
-    """Record a camera with its IMU and factory calibration until Ctrl-C, as MCAP.
+    """Record a camera with its IMU, calibration and serial number until Ctrl-C, as MCAP.
 
     SOURCE is realsense or realsense:SERIAL. After a power cut, `share dataset recover` mends the .part.
 
@@ -55,19 +61,22 @@ def capture(
     from share.io.profile import profile
     from share.io.realsense.live import feed_of
     from share.io.realsense.streams import Wanted
+    from share.io.source import calibration_of
     from share.run.capture import Capture
     from share.run.stop import on_stop
 
     if depth and imu_only:
         raise UsageError("--depth, --imu-only: give one of them")
+    if calib is not None and imu_only:
+        raise UsageError("--calib, --imu-only: give one of them; there are no images to be calibrated")
     wanted = Wanted(profile(profile_name or live.PROFILE, mode), images=not imu_only, depth=depth)
-    line = LiveLine()
+    given, line = calibration_of(calib), LiveLine()
 
     def say(text: str) -> None:
         line.say(f"share: {text}")
 
     feed = feed_of(source, wanted, SequencerConfig(), say, Handover())
-    run = Capture(feed, out, min_free_gb, say, lambda status: line.write(_live(status)))
+    run = Capture(feed, out, min_free_gb, say, lambda status: line.write(_live(status)), given)
     with on_stop(run.stop):
         report = run.go(seconds)
     line.end()

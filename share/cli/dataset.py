@@ -86,6 +86,7 @@ def convert(
     if kind == "mcap":
         _check_mcap(check_writable(target), source)
     opened = open_source(source, calib, frames)
+    options.say_notes(opened)
     with progress(opened.images_count, "converting") as bar:
         if kind == "mcap":
             to_mcap(opened, target, jpeg, bar)
@@ -133,7 +134,8 @@ def _recovered(out: Path, result: Any) -> str:
 
 
 def _text(d: dict[str, Any]) -> str:
-    lines = [f"{d['name']}: {d['kind']}, {d['duration_s']:.1f} s"]
+    device = f", device {d['serial']}" if d["serial"] else ""
+    lines = [f"{d['name']}: {d['kind']}, {d['duration_s']:.1f} s{device}"]
     for name, s in d["streams"].items():
         line = f"  {name:<6} {s['count']:>7} at {s['rate_hz']:.5g} Hz"
         if s["gaps"]:

@@ -198,13 +198,14 @@ def _device(
 
     kind, calib = _kind(of("--kind") or "ar"), of("--calib")
     source = open_source(recording, calib)
+    options.say_notes(source)
     if source.rig.imu is None:
         raise UsageError(f"{recording}: has no IMU, or its calibration has none; align goes by the gyro")
-    options = _mounted(chosen, of("--mounting"))
+    mounted = _mounted(chosen, of("--mounting"))
     imu = read_imu(recording, lambda done, total: stages(f"reading {name}", done, total)).imu
     stages(f"fitting {name}", 0, 1)
     try:
-        found = run(imu, source.rig.imu, seen[1], options)
+        found = run(imu, source.rig.imu, seen[1], mounted)
     except DataError as error:
         raise type(error)(f"{name}: {error}") from None
     stages(f"fitting {name}", 1, 1)

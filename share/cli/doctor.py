@@ -18,7 +18,11 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.option(
-    "--profile", default="d435i", show_default=True, metavar="NAME|FILE", help="What is wanted here."
+    "--profile",
+    default="d435i",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="What is wanted here: d435i-n100-headset, d435i-turtlebot4, laptop-edge, your own file.",
 )
 @click.option("--calib", metavar="DIR", help="The calibration of this device.")
 @click.option("--edge", "address", metavar="tcp://H:P", help="An edge to try.")
@@ -44,15 +48,16 @@ def doctor(
     """
     from share.core.checkup import failures
     from share.io.profile import host_profile
-    from share.run.doctor import of_calibration, of_camera, of_edge, of_host, of_port
+    from share.run.doctor import ask, of_calibration, of_camera, of_edge, of_host, of_port
 
     wanted = host_profile(profile)
+    sdk = ask(wanted)
     found = [
-        *of_camera(wanted),
-        of_calibration(wanted, None if calib is None else Path(calib)),
+        *of_camera(wanted, sdk),
+        *of_calibration(wanted, None if calib is None else Path(calib), sdk),
         *of_host(wanted, Path(out)),
         *of_port(wanted),
-        *of_edge(address, None if keys is None else Path(keys), server_key),
+        *of_edge(wanted, address, None if keys is None else Path(keys), server_key),
     ]
     failed = failures(found)
     click.echo(_plain(wanted.name, found, not failed) if as_json else _table(found))

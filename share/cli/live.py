@@ -95,9 +95,7 @@ def open_source(
     from share.io.realsense.live import open_live
     from share.io.source import calibration_of
 
-    given = calibration_of(calib)
-    rig = None if given is None else given.rig
-    live = open_live(source, camera.wanted(), settings.sequencer, say, rig)
+    live = open_live(source, camera.wanted(), settings.sequencer, say, calibration_of(calib))
     click.get_current_context().with_resource(closing(live))
     return live
 

@@ -12,6 +12,7 @@ from share.errors import UsageError
 
 if TYPE_CHECKING:
     from share.config import Config
+    from share.io.calibration import Calibration
     from share.io.source import Source
 
 calib = click.option(
@@ -114,6 +115,14 @@ def say_notes(source: Source) -> None:
     """What a person should know of a recording, such as streams that are not used: a line each on stderr."""
     for note in source.notes:
         click.echo(f"share: {source.name}: {note}", err=True)
+
+
+def say_another(name: str, said: Calibration | None, serial: str | None) -> None:
+    """That a calibration which was given is of another device, on stderr, if it is."""
+    from share.core.whose import of_another
+
+    if said is not None and (wrong := of_another(said.serials, serial)):
+        click.echo(f"share: {name}: {wrong}", err=True)
 
 
 def say_counters(counters: dict[str, int]) -> None:

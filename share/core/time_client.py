@@ -79,6 +79,8 @@ def read(data: bytes, nonce: int, sent_ns: int, back_ns: int) -> Answer:
         raise KissError(code.decode("ascii"))
     if packet.leap == LEAP_UNKNOWN or packet.stratum in (KISS, UNSYNCHRONISED):  # 0: chronyd says it so
         raise ValueError("that server does not know the time itself (unsynchronised)")
+    if packet.precision > 0:
+        raise ValueError(f"that server reads its clock to no better than 2^{packet.precision} s")
     received_ns, replied_ns = from_stamp(packet.receive, sent_ns), from_stamp(packet.transmit, sent_ns)
     exchange = Exchange(sent_ns, received_ns, replied_ns, back_ns)
     if not exchange.is_possible:

@@ -25,12 +25,14 @@ _TOGETHER_NS = 2_000_000  # stamps of two pictures taken at once
 @dataclass(frozen=True, eq=False)
 class Pictures:
     """count: of cam0's; rig: the calibration so far, if the source has one; read: name and images of each,
-    which of a recording is the stamp of the first camera's, ns; said: the calibration that was given."""
+    which of a recording is the stamp of the first camera's, ns; said: the calibration that was given; serial:
+    of the device that took them, else of the one that the calibration is of."""
 
     count: int
     rig: Rig | None
     read: Callable[[], Iterator[tuple[str, tuple[U8, ...]]]]
     said: Calibration | None = None
+    serial: str | None = None
 
 
 def open_pictures(
@@ -62,7 +64,7 @@ def open_pictures(
                 pair = tuple(waiting.pop(eye)[1].load() for eye in eyes)  # type: ignore[attr-defined]
                 yield str(first), pair
 
-    return Pictures(opened.images_count, opened.rig, read, said)
+    return Pictures(opened.images_count, opened.rig, read, said, opened.serial or _only(said))
 
 
 def _folder(folder: Path, eyes: Sequence[str], said: Calibration | None, alone: str) -> Pictures:
@@ -76,7 +78,12 @@ def _folder(folder: Path, eyes: Sequence[str], said: Calibration | None, alone: 
         for name in names:
             yield name, tuple(decode_gray(one[name].read_bytes(), str(one[name])) for one in found)
 
-    return Pictures(len(names), None if said is None else said.rig, read, said)
+    return Pictures(len(names), None if said is None else said.rig, read, said, _only(said))
+
+
+def _only(said: Calibration | None) -> str | None:
+    """The device that a calibration is of, where it names just one."""
+    return said.serials[0] if said is not None and len(said.serials) == 1 else None
 
 
 def _pictures(folder: Path) -> dict[str, Path]:

@@ -7,7 +7,8 @@ in docs/data.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -23,6 +24,7 @@ CAMCHAIN = "kalibr_imucam_chain.yaml"
 IMU_CHAIN = "kalibr_imu_chain.yaml"
 _RADTAN = ("radtan", "radial-tangential", "plumb_bob")
 TIMESHIFT = "timeshift_cam_imu"
+SERIAL = "serial"
 _AGREE_S = 1e-3  # timeshifts of two cameras that look together
 _DEPTH_SCALE = 1000.0  # 16-bit depth in millimetres, as ROS and RealSense have it
 
@@ -30,13 +32,14 @@ _DEPTH_SCALE = 1000.0  # 16-bit depth in millimetres, as ROS and RealSense have 
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """A rig and what else its file says. topics: stream -> ROS topic; depth_scale: units per metre; eyes: of
-    cam0 and cam1, as they were read."""
+    cam0 and cam1, as they were read; serials: of the devices that it says it is of, each once."""
 
     rig: Rig
     where: str
     depth_scale: float = _DEPTH_SCALE
     topics: dict[str, str] = field(default_factory=dict)
     eyes: tuple[Section, ...] = ()
+    serials: tuple[str, ...] = ()
 
     @property
     def T_imu_cam0(self) -> F64 | None:
@@ -87,7 +90,23 @@ def kalibr(chain: Section, imu: Section | None) -> Calibration:
         scale = depth.number("depth_scale", _DEPTH_SCALE, positive=True)
     named = cams | ({"imu": imu} if imu else {})
     topics = {name: section.text("rostopic", "") for name, section in named.items()}
-    return Calibration(rig, chain.where, scale, {k: v for k, v in topics.items() if v}, eyes)
+    told = {k: v for k, v in topics.items() if v}
+    return Calibration(rig, chain.where, scale, told, eyes, serials(named.values()))
+
+
+def serials(sections: Iterable[Section]) -> tuple[str, ...]:
+    """Of which devices they say to be, each once (ours alone: Kalibr reads past it). Raises ConfigError."""
+    said = (_serial(section) for section in sections if section.data.get(SERIAL) not in (None, ""))
+    return tuple(dict.fromkeys(said))
+
+
+def _serial(section: Section) -> str:
+    found = section.get(SERIAL)
+    if not isinstance(found, str):
+        raise ConfigError(f"{section.where}: {SERIAL}: put it in quotes, else YAML takes it for a number")
+    if not re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", found):
+        raise ConfigError(f"{section.where}: {SERIAL}: {found!r:.40} is no serial number; leave it out")
+    return found
 
 
 def read_camera_yaml(path: Path) -> Calibration:

@@ -21,7 +21,8 @@ from share.types import F64
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """All that is told of one calibration. rig: the cameras as they were known; before: how T_imu_cam0 that
-    was given compares; pictures: what was looked at; said: the cameras' calibration that was given."""
+    was given compares; pictures: what was looked at; said: the cameras' calibration that was given;
+    serial: of the device."""
 
     fit: Fit
     verdict: Verdict
@@ -30,6 +31,7 @@ class Outcome:
     before: Comparison | None
     pictures: Stamped
     said: Calibration | None = None
+    serial: str | None = None
 
     @property
     def calibrated(self) -> Rig:
@@ -46,7 +48,7 @@ class Outcome:
 
 def camchain_text(outcome: Outcome, source: str) -> str:
     """Kalibr's camchain-imucam: intrinsics as they were, T_cam_imu and timeshift_cam_imu of each camera."""
-    chain = to_kalibr(outcome.calibrated, outcome.said)
+    chain = to_kalibr(outcome.calibrated, outcome.said, outcome.serial)
     del chain["imu0"]
     for eye, T in enumerate(outcome.T_cam_imu):
         chain[f"cam{eye}"] |= {"T_cam_imu": T.tolist(), "timeshift_cam_imu": outcome.fit.shift_s}
@@ -57,7 +59,7 @@ def camchain_text(outcome: Outcome, source: str) -> str:
 
 def imu_chain_text(outcome: Outcome, source: str) -> str:
     """The IMU's noise as the recording has it, so that the folder is whole."""
-    chain = {"imu0": to_kalibr(outcome.calibrated)["imu0"]}
+    chain = {"imu0": to_kalibr(outcome.calibrated, serial=outcome.serial)["imu0"]}
     return f"# as it came with share calibrate camera-imu {source}\n" + yaml.safe_dump(chain, sort_keys=False)
 
 

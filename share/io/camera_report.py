@@ -27,7 +27,7 @@ NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 class Outcome:
     """All that is told of one calibration. before: the cameras that the source came with; seen: views with
     the target among all pictures looked at; pair_before_px: as the verdict's, by `before`; said: the
-    calibration that was given."""
+    calibration that was given; serial: of the device."""
 
     views: Sequence[View]
     solution: Solution
@@ -37,6 +37,7 @@ class Outcome:
     seen: int
     pair_before_px: float | None = None
     said: Calibration | None = None
+    serial: str | None = None
 
     @property
     def rig(self) -> Rig:
@@ -55,7 +56,8 @@ class Outcome:
 def kalibr_text(outcome: Outcome, source: str) -> str:
     """The camchain, with what was given of how the cameras sit on an IMU. The IMU's own noise is of another
     file, `share calibrate imu` writes it."""
-    chain = {key: value for key, value in to_kalibr(outcome.rig, outcome.said).items() if key != "imu0"}
+    told = to_kalibr(outcome.rig, outcome.said, outcome.serial)
+    chain = {key: value for key, value in told.items() if key != "imu0"}
     if "T_cam_imu" in chain["cam0"] and "cam1" in chain:  # by the new pair
         T_cam1_cam0 = np.array(chain["cam1"]["T_cn_cnm1"])
         chain["cam1"]["T_cam_imu"] = (T_cam1_cam0 @ chain["cam0"]["T_cam_imu"]).tolist()

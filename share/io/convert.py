@@ -50,7 +50,7 @@ def write_recording(source: Source, out: Path, jpeg: int | None, progress: Progr
     """`to_mcap` without the truth."""
     check_writable(out)
     try:
-        with Recorder(out, source.rig, jpeg) as recorder:
+        with Recorder(out, source.rig, jpeg, serial=source.serial) as recorder:
             for measurement in _counted(source, progress):
                 recorder.write(measurement)
     except BaseException:  # also Ctrl-C

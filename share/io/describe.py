@@ -21,6 +21,7 @@ def describe(source: Source) -> dict[str, Any]:
     return {
         "name": source.name,
         "kind": source.rig.kind,
+        "serial": source.serial,
         "duration_s": (last - first) / 1e9,
         "start_ns": first,
         "streams": {name: describe_stream(s) for name, s in stamps.items()},

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import shutil
 import socket
 from pathlib import Path
@@ -28,6 +29,28 @@ def throttles(root: Path = Path("/")) -> list[int]:
     """How often each core was slowed by heat since the start (Intel's; core_throttle_count)."""
     files = root.glob(f"{_CPUS}/thermal_throttle/core_throttle_count")
     return [count for path in files if (count := _whole(path)) is not None]
+
+
+def pi_throttled(root: Path = Path("/")) -> int | None:
+    """What a Raspberry Pi's firmware says of supply and heat, as `vcgencmd get_throttled` has it; None of
+    another computer. A kernel that is not the Pi's own tells of the supply alone (rpi_volt)."""
+    for path in root.glob("sys/devices/platform/soc*/*firmware*/get_throttled"):
+        if re.fullmatch(r"(0x)?[0-9a-fA-F]{1,8}", text := _text(path) or ""):
+            return int(text, 16)
+    for path in root.glob("sys/class/hwmon/hwmon*/in0_lcrit_alarm"):
+        if _text(path.parent / "name") == "rpi_volt":
+            return _whole(path)
+    return None
+
+
+def resets_governor(root: Path = Path("/")) -> bool:
+    """Whether a power-profiles-daemon is installed and may run, which sets the governor of processors that
+    have an energy preference (Intel's, AMD's) to powersave whenever it starts."""
+    unit = "systemd/system/power-profiles-daemon.service"
+    masked = os.path.realpath(root / "etc" / unit) == "/dev/null"
+    there = any((root / folder / unit).exists() for folder in ("lib", "usr/lib"))
+    preference = "sys/devices/system/cpu/cpufreq/policy*/energy_performance_preference"
+    return there and not masked and any(root.glob(preference))
 
 
 def usb_memory_mb(root: Path = Path("/")) -> int | None:
@@ -85,7 +108,7 @@ def _is_d435i(path: Path) -> bool:
 
 
 def _camera(path: Path, nodes: Path) -> UsbCamera:
-    speed_mbit_s, control = float(_text(path / "speed") or 0), _text(path / "power/control")
+    speed_mbit_s, control = _number(path / "speed") or 0.0, _text(path / "power/control")
     node = nodes / f"{_whole(path / 'busnum') or 0:03}" / f"{_whole(path / 'devnum') or 0:03}"
     may_open = os.access(node, os.R_OK | os.W_OK)
     return UsbCamera(path.name, speed_mbit_s, control, may_open, _may_start_imu(path))
@@ -108,6 +131,12 @@ def _text(path: Path) -> str | None:
         return path.read_text(errors="replace").strip()
     except OSError:
         return None
+
+
+def _number(path: Path) -> float | None:
+    """Also None of `unknown`, as the kernel calls the speed of a device that is coming or going."""
+    text = _text(path) or ""
+    return float(text) if re.fullmatch(r"\d+(\.\d+)?", text) else None
 
 
 def _whole(path: Path) -> int | None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from share.calibration.imu import ImuNature, SensorNoise
 from share.calibration.noise import AxisNoise, Figure
+from share.io.calibration import SERIAL
 from share.io.profile_types import Inertial, Profile
 
 GYRO, ACCEL = "gyroscope", "accelerometer"
@@ -56,8 +58,9 @@ def stated(profile: Profile | None, sensor: str) -> dict[str, float]:
     return {"density": float(np.sqrt(facts.density**2 + digits)), "walk": facts.kalibr_walk}
 
 
-def kalibr_text(nature: ImuNature, name: str, inflate: float) -> str:
-    """kalibr_imu_chain.yaml, as `share.io.calibration` and Kalibr read it. inflate: times the measured."""
+def kalibr_text(nature: ImuNature, name: str, inflate: float, serial: str | None = None) -> str:
+    """kalibr_imu_chain.yaml, as `share.io.calibration` and Kalibr read it. inflate: times the measured;
+    serial: of the device."""
     lines = [
         f"# share calibrate imu: {name}, {nature.rest_s:.0f} s at rest",
         "# " + ("as measured" if inflate == 1 else f"{inflate:g} times what was measured (--inflate)"),
@@ -67,7 +70,8 @@ def kalibr_text(nature: ImuNature, name: str, inflate: float) -> str:
         for figure, key in (("density", "noise_density"), ("walk", "random_walk")):
             found, unit = noise.typical(figure), UNITS[sensor][figure]
             lines.append(f"  {sensor}_{key}: {found.cautious * inflate:.4e}  # {unit}, {_how(found)}")
-    return "\n".join([*lines, f"  update_rate: {nature.rate_hz:.3f}", ""])
+    of = [f"  {SERIAL}: {json.dumps(serial)}"] if serial else []  # quoted, or YAML makes it a number
+    return "\n".join([*lines, f"  update_rate: {nature.rate_hz:.3f}", *of, ""])
 
 
 def _how(figure: Figure) -> str:

@@ -21,11 +21,13 @@ _KINDS = (
 
 @dataclass(frozen=True, eq=False)
 class ImuTable:
-    """imu: samples in order of time; dropped: such as were not later than the one before."""
+    """imu: samples in order of time; dropped: such as were not later than the one before; serial: of the
+    device, where it is known."""
 
     name: str
     imu: ImuBatch
     dropped: int
+    serial: str | None = None
 
 
 def read_imu(spec: str, told: Callable[[int, int], None] = lambda done, total: None) -> ImuTable:
@@ -35,9 +37,10 @@ def read_imu(spec: str, told: Callable[[int, int], None] = lambda done, total: N
     """
     path = Path(spec)
     if path.suffix == ".mcap" and path.is_file():
-        return _table(path.stem, *_of_mcap(path, told))
+        return _table(path.stem, *_of_mcap(path, told), serial=_serial(path))
     if is_session(path.parent) and not path.exists():
-        return _table(path.name, *_of_mcap(read_session(path.parent).recording(path.name), told))
+        recording = read_session(path.parent).recording(path.name)
+        return _table(path.name, *_of_mcap(recording, told), serial=_serial(recording))
     for csv in imu_tables(path):
         if csv.is_file():
             return _table(path.stem, *tables.read_table(csv, 7))
@@ -60,10 +63,17 @@ def _of_mcap(path: Path, told: Callable[[int, int], None]) -> tuple[I64, F64]:
     return read(McapFile(path), told)
 
 
-def _table(name: str, stamps_ns: I64, values: F64) -> ImuTable:
+def _serial(path: Path) -> str | None:
+    from share.io.mcap.file import McapFile
+    from share.io.mcap.reader import own_serial
+
+    return own_serial(McapFile(path))
+
+
+def _table(name: str, stamps_ns: I64, values: F64, serial: str | None = None) -> ImuTable:
     finite = np.isfinite(values).all(axis=1)
     if not finite.all():
         raise DataError(f"{name}: IMU sample {int((~finite).argmax()) + 1} is not finite; leave it out")
     later = stamps_ns > np.maximum.accumulate(np.concatenate([[-(2**62)], stamps_ns[:-1]]))
     imu = ImuBatch(stamps_ns[later], values[later, :3], values[later, 3:])
-    return ImuTable(name, imu, int(np.count_nonzero(~later)))
+    return ImuTable(name, imu, int(np.count_nonzero(~later)), serial)

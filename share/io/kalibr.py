@@ -6,14 +6,15 @@ from typing import Any
 
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.io.calibration import CAMCHAIN, IMU_CHAIN, TIMESHIFT, Calibration
+from share.io.calibration import CAMCHAIN, IMU_CHAIN, SERIAL, TIMESHIFT, Calibration
 
 
-def to_kalibr(rig: Rig, said: Calibration | None = None) -> dict[str, Any]:
+def to_kalibr(rig: Rig, said: Calibration | None = None, serial: str | None = None) -> dict[str, Any]:
     """cam0, cam1, depth (ours) and imu0 of the rig, as plain data for a YAML file.
 
     said: what the rig was known by before. Of that is kept what no Rig holds: topics, depth_scale and, for a
-    rig without IMU, how cam0 sits on one and how late their clock is. Raises ConfigError.
+    rig without IMU, how cam0 sits on one and how late their clock is. serial: of the device, in each section:
+    Kalibr takes every key at the top for a camera. Raises ConfigError.
     """
     said = said or Calibration(rig, "")
     T_imu_cam0, shift_s = (
@@ -34,14 +35,15 @@ def to_kalibr(rig: Rig, said: Calibration | None = None) -> dict[str, Any]:
         name = "imu0" if stream == "imu" else stream
         if name in out:
             out[name]["rostopic"] = topic
-    return out
+    return {name: section | ({SERIAL: serial} if serial else {}) for name, section in out.items()}
 
 
-def kalibr_texts(rig: Rig, remark: str) -> dict[str, str]:
-    """Both of Kalibr's chains, by the names of their files; one where the rig has no IMU. remark: a line."""
+def kalibr_texts(rig: Rig, remark: str, serial: str | None = None) -> dict[str, str]:
+    """Both of Kalibr's chains, by the names of their files; one where the rig has no IMU. remark: a line;
+    serial: of the device."""
     import yaml
 
-    data = to_kalibr(rig)
+    data = to_kalibr(rig, serial=serial)
     parts = {CAMCHAIN: {k: v for k, v in data.items() if k != "imu0"}}
     if "imu0" in data:
         parts[IMU_CHAIN] = {"imu0": data["imu0"]}

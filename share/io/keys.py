@@ -11,16 +11,19 @@ import contextlib
 import os
 import re
 import socket
+import stat
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from share.errors import UsageError
 from share.io.files import atomic_write, writing
 
-_NAME = r"[A-Za-z0-9_][\w.-]{0,63}"
+_NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
 _Z85 = r"[0-9a-zA-Z.:+=^!/*?&<>()\[\]{}@%$#-]{40}"
+_LIST = "authorized"
 _LINE = re.compile(rf"share-(public|secret)-key ({_NAME}) ({_Z85})")
 
 
@@ -67,6 +70,7 @@ class AllowList:
             return {}
         except OSError as error:
             raise UsageError(f"{self.path}: cannot be read: {error.strerror}") from None
+        _check_guarded(self.path, status)
         state = (status.st_mtime_ns, status.st_ino, status.st_size)
         if state != self._read[0]:
             self._read = state, self._parsed()
@@ -79,13 +83,24 @@ class AllowList:
         except UsageError:
             return False
 
+    def trouble(self) -> str | None:
+        """Why nobody may connect; None where the file can be read."""
+        try:
+            self.names()
+        except UsageError as error:
+            return str(error)
+        return None
+
     def _parsed(self) -> dict[str, str]:
-        names: dict[str, str] = {}
-        for number, line in enumerate(_text(self.path).splitlines(), 1):
-            if line.strip() and not line.startswith("#"):
-                name, key = _public(line, f"{self.path}, line {number}")
-                names[key] = name
-        return names
+        return {line.key: line.name for line in _lines(self.path) if line.key}
+
+
+class _Line(NamedTuple):
+    """Of the list, with its end. name and key are empty for a comment."""
+
+    text: str
+    name: str = ""
+    key: str = ""
 
 
 def default_folder() -> Path:
@@ -129,11 +144,14 @@ def load(folder: Path) -> KeyPair:
     if len(found) > 1:
         raise UsageError(f"{folder}: has {len(found)} key pairs; keep one in each folder")
     path = found[0]
+    _check_guarded(folder, folder.stat())
     if path.stat().st_mode & 0o077:
         raise UsageError(f"{path}: others can read this secret; `chmod 600 {path}`, or make a new pair")
     match = _LINE.fullmatch(_text(path).strip())
     if not match or match[1] != "secret" or not _is_key(match[3]):
-        raise UsageError(f"{path}: is not a secret key of SHARE; make a new pair with `share keys generate`")
+        raise UsageError(
+            f"{path}: is not a secret key of SHARE; move it away, then `share keys generate` makes a new pair"
+        )
     return KeyPair(match[2], zmq.curve_public(match[3].encode()).decode(), match[3])
 
 
@@ -144,17 +162,18 @@ def public_key(given: str) -> str:
     if given.startswith("share-"):
         return _public(given, "what was given")[1]
     path = Path(given)
-    if not path.is_file():
-        raise UsageError(f"'{given}': neither a file nor a public key (40 characters, in single quotes)")
+    if not _is_file(path):
+        raise UsageError(f"'{given:.60}': neither a file nor a public key (40 characters, in single quotes)")
     return _public(_text(path).strip(), given)[1]
 
 
 def allow_list(folder: Path) -> AllowList:
-    return AllowList(folder / "authorized")
+    return AllowList(folder / _LIST)
 
 
 def authorize(folder: Path, name: str, public: str) -> None:
-    """Let the agent machine `name` in. Raises UsageError if the name or the key is taken."""
+    """Let the agent machine `name` in. Raises UsageError if the name or the key is taken, or the list is
+    damaged."""
     name = _checked(name)
     _make(folder)
     with _locked(folder):
@@ -163,17 +182,22 @@ def authorize(folder: Path, name: str, public: str) -> None:
             raise UsageError(f"'{name}': this key is authorized already, as '{names[public]}'")
         if name in names.values() and public not in names:
             raise UsageError(f"'{name}' has another key; `share keys revoke {name}` takes that away first")
-        _save(folder, names | {public: name})
+        if public not in names:
+            _save(folder, [*_lines(folder / _LIST), _Line(_line(name, public))])
 
 
 def revoke(folder: Path, name: str) -> None:
-    """Let it in no more. Raises UsageError if there is none of that name."""
-    names = allow_list(folder).names()
-    if name not in names.values():
-        raise UsageError(f"'{name}' is not authorized; there is {', '.join(names.values()) or 'nobody'}")
+    """Let it in no more, by any of its keys. Raises UsageError if there is none of that name, or the list is
+    damaged."""
+    if not (folder / _LIST).exists():
+        raise UsageError(f"'{name}' is not authorized; there is nobody")
     with _locked(folder):
-        names = allow_list(folder).names()
-        _save(folder, {key: other for key, other in names.items() if other != name})
+        lines = _lines(folder / _LIST)
+        keys = {line.key for line in lines if line.key and line.name == name}
+        if not keys:
+            others = ", ".join(dict.fromkeys(line.name for line in lines if line.key))
+            raise UsageError(f"'{name}' is not authorized; there is {others or 'nobody'}")
+        _save(folder, [line for line in lines if line.key not in keys])  # also under another name
 
 
 def agent_keys(folder: Path | None, edge: str) -> AgentKeys:
@@ -248,9 +272,34 @@ def _make(folder: Path) -> None:
         raise UsageError(f"{folder}: cannot be made: {error.strerror}; give another --keys") from None
 
 
-def _save(folder: Path, names: dict[str, str]) -> None:
-    lines = (_line(name, public) for public, name in sorted(names.items(), key=lambda item: item[1]))
-    atomic_write(folder / "authorized", "".join(lines))
+def _lines(path: Path) -> list[_Line]:
+    """Of a list; none where there is no file. Raises UsageError."""
+    if not path.exists():
+        return []
+    found = []
+    for number, text in enumerate(_text(path).splitlines(), 1):
+        comment = not text.strip() or text.startswith("#")
+        name_and_key = ("", "") if comment else _public(text, f"{path}, line {number}")
+        found.append(_Line(text + "\n", *name_and_key))
+    return found
+
+
+def _save(folder: Path, lines: Iterable[_Line]) -> None:
+    """Comments stay where they are."""
+    atomic_write(folder / _LIST, "".join(line.text for line in lines))
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long for any
+        return False
+
+
+def _check_guarded(path: Path, status: os.stat_result) -> None:
+    """Raises UsageError where anybody could let himself in."""
+    if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
+        raise UsageError(f"{path}: anybody may write to it; `chmod o-w {path}`")
 
 
 def _write_secret(path: Path, text: str) -> None:

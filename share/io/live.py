@@ -7,8 +7,10 @@ from functools import cached_property
 from typing import Any
 
 from share.core.measurement import CAM0, Measurement
+from share.core.whose import as_read, of_another, unused
 from share.errors import UsageError
 from share.geometry.camera import Rig
+from share.io.calibration import Calibration
 from share.io.feed import Feed
 from share.io.recording import Source
 from share.io.trajectory import Trajectory
@@ -17,17 +19,35 @@ from share.types import I64
 WAITING = 2  # frames that may wait for the tracker
 
 
+def given_rig(given: Calibration | None, factory: Rig, serial: str | None) -> tuple[Rig, tuple[str, ...]]:
+    """What is to be believed of a camera, and what a person should know of that. Raises UsageError where the
+    calibration that was given cannot be of it as it is read."""
+    if given is None:
+        return factory, ()
+    try:
+        rig = as_read(given.rig, factory)
+    except ValueError as error:
+        raise UsageError(f"{given.where}: {error}") from None
+    doubt = of_another(given.serials, serial)
+    return rig, (*unused(rig, factory), *([] if doubt is None else [doubt]))
+
+
 class LiveSource(Source):
     """The camera is opened here, and let go at the end of `measurements`.
 
-    Raises UsageError, ShareError or DataError where it cannot be opened.
+    Raises UsageError, ShareError or DataError where it cannot be opened, or not with that calibration.
     """
 
-    def __init__(self, feed: Feed, rate_hz: float, rig: Rig | None = None) -> None:
-        """rate_hz: of cam0; rig: in place of the factory's."""
+    def __init__(self, feed: Feed, rate_hz: float, calibration: Calibration | None = None) -> None:
+        """rate_hz: of cam0; calibration: in place of the factory's."""
         factory = feed.open()
         self.feed, self._rate_hz = feed, rate_hz
-        self.name, self.rig, self.notes = f"realsense:{feed.serial}", rig or factory, ()
+        self.name, self.serial = f"realsense:{feed.serial}", feed.serial
+        try:
+            self.rig, self.notes = given_rig(calibration, factory, feed.serial)
+        except BaseException:
+            feed.close()
+            raise
 
     def stamps(self) -> dict[str, I64]:
         raise UsageError(f"{self.name}: nobody knows yet what a live camera will see; record it first")

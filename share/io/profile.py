@@ -80,11 +80,13 @@ def _read(path: Path) -> _File:
     """A `device` that is a name stands for the device and the emulation of that shipped profile."""
     top = read_yaml(path)
     if isinstance(name := top.data.get("device"), str):
-        if "emulation" in top or name not in shipped():
+        if "emulation" in top:
+            raise ConfigError(f"{path}: emulation: comes with device '{name}'; leave one of them out")
+        of = read_yaml(shipped()[name]) if name in shipped() else Section({}, "")
+        if not isinstance(of.data.get("device"), dict):
             raise ConfigError(
-                f"{path}: device: '{name}' is no shipped profile, or emulation is given beside it"
+                f"{path}: device: '{name}' is no shipped profile that describes one, such as d435i"
             )
-        of = read_yaml(shipped()[name])
         top = Section(top.data | {key: of.section(key).data for key in ("device", "emulation")}, top.where)
     return read(_File, top)
 

@@ -37,6 +37,7 @@ class Inertial:
     instability_s: float = 100.0
 
     def __post_init__(self) -> None:
+        _rates(self.rates_hz)
         _positive(self, "rate_hz", "range", "instability_s")
         _not_negative(self, "step", "density", "walk", "start_bias", "instability")
         if self.rate_hz not in self.rates_hz:
@@ -81,6 +82,7 @@ class Mode:
     cam1: Lens
 
     def __post_init__(self) -> None:
+        _rates(self.rates_hz)
         self.cameras()
 
     def cameras(self) -> tuple[Camera, Camera]:
@@ -273,6 +275,14 @@ class Profile:
 _EMITTER = ("off", "on", "interleaved", "none")
 _GOVERNORS = ("performance", "powersave", "ondemand", "conservative", "schedutil", "userspace")
 _USBFS_MOST = 2047  # of the kernel
+
+
+_RATE_MOST = 10_000.0  # Hz; above it somebody has mistaken the unit
+
+
+def _rates(rates_hz: tuple[float, ...]) -> None:
+    if not rates_hz or not all(0 < hz <= _RATE_MOST for hz in rates_hz):
+        raise ValueError(f"rates_hz: [{_listed(rates_hz)}] must be rates above 0, up to {_RATE_MOST:g} Hz")
 
 
 def _listed(values: tuple[float, ...]) -> str:

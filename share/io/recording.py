@@ -19,11 +19,13 @@ from share.types import F64, I64
 
 
 class Source(ABC):
-    """One agent's recording, or its camera. `rig` decides which streams there are; `notes` are for people."""
+    """One agent's recording, or its camera. `rig` decides which streams there are; `notes` are for people;
+    `serial` is the number of the device, None where nobody knows."""
 
     name: str
     rig: Rig
     notes: tuple[str, ...]
+    serial: str | None = None
 
     @abstractmethod
     def stamps(self) -> dict[str, I64]:

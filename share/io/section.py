@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from share.errors import ConfigError
+from share.strict import load_yaml
 from share.types import F64, checked_pose
 
 
@@ -34,7 +35,8 @@ class Section:
     def text(self, key: str, default: str | None = None) -> str:
         value = self.get(key) if default is None else self.data.get(key, default)
         if not isinstance(value, str):
-            raise ConfigError(f"{self.where}: {key}: expected a word, found {_kind(value)}")
+            quoted = "" if value is None or isinstance(value, dict | list) else "; put it in quotes"
+            raise ConfigError(f"{self.where}: {key}: expected a word, found {_kind(value)}{quoted}")
         return value
 
     def number(self, key: str, default: float | None = None, positive: bool = False) -> float:
@@ -80,8 +82,6 @@ class Section:
 
 def read_yaml(path: Path) -> Section:
     """The top mapping of a YAML file, also of one that OpenCV wrote (`%YAML:1.0`, `!!opencv-matrix`)."""
-    import yaml
-
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -93,13 +93,7 @@ def read_yaml(path: Path) -> Section:
     lines = text.replace("!!opencv-matrix", "").split("\n")
     if lines[0].startswith("%YAML"):  # not valid YAML: the directive needs a space, and a `---` after it
         lines[0] = ""
-    try:
-        return Section(yaml.safe_load("\n".join(lines)), str(path))
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f", line {mark.line + 1}" if mark else ""
-        reason = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise ConfigError(f"{path}{line}: not valid YAML: {reason}") from None
+    return Section(load_yaml("\n".join(lines), str(path)), str(path))
 
 
 def _kind(value: Any) -> str:

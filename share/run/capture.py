@@ -16,8 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from share.errors import ShareError, UsageError
+from share.io.calibration import Calibration
 from share.io.feed import Feed
 from share.io.feed_status import FeedStatus
+from share.io.live import given_rig
 from share.io.mcap.recorder import Recorder, left_over, part_of
 
 _TICK_S = 0.1
@@ -48,8 +50,11 @@ class Capture:
         min_free_gb: float,
         say: Callable[[str], None],
         show: Callable[[Status], None] = lambda status: None,
+        calibration: Calibration | None = None,
     ) -> None:
+        """calibration: what the recording says of the camera, in place of the factory's."""
         self._feed, self._out, self._free_least = feed, out, min_free_gb * 1e9
+        self._calibration = calibration
         self._say, self._show = say, show
         self._stop = threading.Event()
         self._error: BaseException | None = None
@@ -64,9 +69,12 @@ class Capture:
     def go(self, seconds: float | None = None) -> dict[str, Any]:
         """Record, and tell what came of it."""
         _check_disk(self._out, self._free_least)
-        rig = self._feed.open()  # before there is a file: the queue holds what comes meanwhile
+        factory = self._feed.open()  # before there is a file: the queue holds what comes meanwhile
         try:
-            recorder = Recorder(self._out, rig, durable=True)
+            rig, doubts = given_rig(self._calibration, factory, self._feed.serial)
+            for doubt in doubts:
+                self._say(f"camera {self._feed.serial}: {doubt}")
+            recorder = Recorder(self._out, rig, durable=True, serial=self._feed.serial)
         except BaseException:
             self._feed.close()
             raise

@@ -283,7 +283,8 @@ def test_images_of_another_size(stereo, share, tmp_path):
 
 CONFIGS = {
     "missing": (None, "config.yaml: cannot read the configuration: No such file"),
-    "no YAML": ("tracker: {", "config.yaml: not valid YAML"),
+    "no YAML": ("tracker: {", "config.yaml, line 1: not valid YAML"),
+    "twice": ("agent: {}\nagent: {}", "config.yaml, line 2: not valid YAML: key 'agent' for the second time"),
     "a list": ("- tracker", "config.yaml: expected a mapping of settings, found list"),
     "unknown section": ("traker: {}", "config.yaml: unknown key 'traker'; did you mean 'tracker'?"),
     "unknown key": ("tracker: {cornrs: 9}", "tracker: unknown key 'cornrs'; did you mean 'corners'?"),

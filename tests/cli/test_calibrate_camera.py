@@ -72,7 +72,12 @@ def test_a_known_camera_is_found_from_a_folder_of_pictures(
     _pictures(tmp_path / "pictures" / "cam0", rng)
     out, given = tmp_path / "out", tmp_path / "given.yaml"
     T_cam_imu = se3.exp(np.array([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]))
-    kept = {"T_cam_imu": T_cam_imu.tolist(), "timeshift_cam_imu": 0.004, "rostopic": "/left"}
+    kept = {
+        "T_cam_imu": T_cam_imu.tolist(),
+        "timeshift_cam_imu": 0.004,
+        "rostopic": "/left",
+        "serial": "0123",
+    }
     camera = to_kalibr(Rig(Camera(640, 480, 400.0, 400.0, 320.0, 240.0), np.eye(4)))["cam0"]
     given.write_text(yaml.safe_dump({"cam0": camera | kept}))
     done = share(

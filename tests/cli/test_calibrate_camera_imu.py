@@ -40,7 +40,7 @@ def dance(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "imu0" / "data.csv").write_text("".join(lines))
     chain = to_kalibr(Rig(CAMERA, se3.inverse(T_IMU_CAM0), imu=NOISE))  # the other way round
     (folder / "imu.yaml").write_text("# measured\n" + yaml.safe_dump({"imu0": chain.pop("imu0")}))
-    chain["cam0"]["rostopic"] = "/left"
+    chain["cam0"] |= {"rostopic": "/left", "serial": "0123"}
     (folder / "camera.yaml").write_text(yaml.safe_dump(chain))
     del chain["cam0"]["T_cam_imu"]
     (folder / "bare.yaml").write_text(yaml.safe_dump(chain))
@@ -64,6 +64,7 @@ def test_mounting_and_offset_are_found_and_an_inverted_one_is_said(
     assert rig.timeshift_s == pytest.approx(SHIFT_S, abs=2e-4)
     assert rig.cam0 == CAMERA and rig.imu == NOISE
     assert read_calibration(tmp_path).topics == {"cam0": "/left"}
+    assert read_calibration(tmp_path).serials == ("0123",)
     assert (tmp_path / "kalibr_imu_chain.yaml").read_text() == (dance / "imu.yaml").read_text()
     report = json.loads(done.out)
     assert report == json.loads((tmp_path / "camera-imu-report.json").read_text())

@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from share.core.measurement import Measurement
 from share.emulate.sensor.imu import measured
 from share.io.calibration import imu_noise
+from share.io.mcap.recorder import Recorder
 from share.io.profile import profile
 from share.io.section import read_yaml
 
@@ -73,6 +75,14 @@ def test_inflated_noise_is_written_and_said(share, table, tmp_path):
     assert two.gyro_density == pytest.approx(2 * one.gyro_density, rel=1e-3)
     assert two.accel_walk == pytest.approx(2 * one.accel_walk, rel=1e-3) and two.rate_hz == one.rate_hz
     assert "2 times what was measured" in (tmp_path / "two" / "kalibr_imu_chain.yaml").read_text()
+
+
+def test_the_device_is_named_where_the_recording_knows_it(share, tmp_path):
+    with Recorder(tmp_path / "rest.mcap", profile("euroc").rig(), serial="0123") as recorder:
+        for stamp, *values in np.loadtxt(written(tmp_path / "a.csv", 70), delimiter=",", skiprows=1):
+            recorder.write(Measurement("imu", int(stamp), tuple(values)))
+    assert share("calibrate", "imu", tmp_path / "rest.mcap", "--out", tmp_path / "mine").code == 0
+    assert read_yaml(tmp_path / "mine" / "kalibr_imu_chain.yaml").section("imu0").get("serial") == "0123"
 
 
 def test_noise_far_from_the_profile_is_told(share, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,12 +27,27 @@ def test_the_file_has_what_the_factory_measured(share: Callable[..., Done], tmp_
     done = share("calibrate", "realsense", "0123", "--depth", "--out", tmp_path / "mine")
     assert done.code == 0, done.err
     assert "0123" in done.out
-    rig = read_calibration(tmp_path / "mine").rig
+    found = read_calibration(tmp_path / "mine")
+    rig = found.rig
+    assert found.serials == ("0123",)
     assert rig.kind == "stereo+imu"
     assert rig.depth == rig.cam0
     assert (rig.cam0.fx, rig.cam0.fy, rig.cam0.cx, rig.cam0.cy) == (385.0, 386.0, 320.5, 239.5)
     assert rig.baseline == pytest.approx(BASELINE)
     np.testing.assert_allclose(rig.T_body_cam0[:3, 3], T_GYRO_IR, atol=1e-8)
+
+
+def test_the_doctor_knows_whose_it_is(share: Callable[..., Done], tmp_path: Path) -> None:
+    def line(*words: object) -> tuple[str, str]:
+        told = json.loads(share("doctor", "--json", *words).out)["findings"]
+        return next((one["state"], one["what"]) for one in told if one["name"] == "serial number")
+
+    mine = tmp_path / "mine"
+    share("calibrate", "realsense", "--out", mine)
+    assert line("--calib", mine) == ("OK", "0123, as the calibration says")
+    for chain in mine.iterdir():
+        chain.write_text(chain.read_text().replace("'0123'", "'0456'"))
+    assert line("--calib", mine) == ("WARN", "the calibration is of 0456, plugged in is 0123")
 
 
 def test_a_calibration_that_is_there_is_not_overwritten(share: Callable[..., Done], tmp_path: Path) -> None:

@@ -7,7 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from live import RIG, live
 from recordings import make_euroc, make_tum
+
+from share.io.kalibr import kalibr_texts
+from share.io.mcap.recorder import Recorder
 
 
 def share(*arguments: object) -> subprocess.CompletedProcess:
@@ -121,3 +125,15 @@ def test_real_recording(shared_data: Path):
         "backward": 0,
     }
     assert data["truth"]["poses"] == 500
+
+
+def test_a_calibration_of_another_device_is_said(tmp_path):
+    with Recorder(tmp_path / "a.mcap", RIG, serial="0123") as recorder:
+        for measurement in live(3):
+            recorder.write(measurement)
+    for file, text in kalibr_texts(RIG, "another's", "0456").items():
+        (tmp_path / file).write_text(text)
+    done = share("convert", tmp_path / "a.mcap", "--calib", tmp_path, "--out", tmp_path / "b.mcap")
+    assert done.returncode == 0
+    assert done.stderr.startswith("share: a: the calibration is of device 0456, this is 0123: ")
+    assert "device 0123\n" in good("info", tmp_path / "b.mcap")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from share.core.checkup import State, boot, camera, host
-from share.core.checkup.calibration import calibration
+from share.core.checkup.calibration import calibration, device
 from share.core.checkup.camera import Sdk, UsbCamera
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.geometry.se3 import inverse
@@ -75,6 +75,33 @@ def test_the_host_is_held_against_the_profile() -> None:
     assert camera.udev([], is_root=False).state is State.FAIL
 
 
+@pytest.mark.parametrize(
+    ("bits", "what", "mend"),
+    [
+        (0x0, "none since the start", ""),
+        (0x50005, "its supply gives too little voltage and it is slowed (get_throttled 0x50005)", "5.1 V"),
+        (0x50000, "its supply gave too little voltage and it was slowed since the start (", "5.1 V"),
+        (0x80000, "it was slowed since the start (get_throttled 0x80000)", "cool it"),
+        (0x8, "it is slowed (get_throttled 0x8)", "cool it"),
+    ],
+)
+def test_a_raspberry_pi_tells_of_its_supply_and_of_heat(bits: int, what: str, mend: str) -> None:
+    found = host.throttling([], bits)
+    assert found.state is (State.WARN if bits else State.OK)
+    assert found.what.startswith(what)
+    assert all(mend in line for line in found.mend) and bool(found.mend) == bool(bits)
+    assert len(host.throttling([], bits | 0x90000).mend) == 2  # each has a remedy of its own
+
+
+def test_an_edge_without_keys_or_agents_serves_its_own_machine_only() -> None:
+    assert (host.no_edge_keys("k").state, host.no_edge_keys("k").mend) == (
+        State.WARN,
+        ("share keys generate",),
+    )
+    assert host.edge_keys("edge", []).state is State.WARN
+    assert host.edge_keys("edge", ["ann", "bob"]).what == "edge; lets in: ann, bob"
+
+
 def test_what_mends_the_host_outlives_a_start() -> None:
     lines, mend = boot.lines("performance", 128), boot.mend("performance", 128)
     assert [line.split()[-1] for line in lines] == ["performance", "128"]
@@ -90,6 +117,11 @@ def test_a_disk_is_told_in_minutes(minutes: int, state: str) -> None:
     assert host.disk("/", minutes * 60 * 10_000_000, 1e7).state.value == state
 
 
+def test_a_disk_that_may_not_be_written_to_is_of_no_use() -> None:
+    found = host.disk("/data", 10**12, 1e7, may_write=False)
+    assert (found.state, found.what) == (State.FAIL, "/data: this user may not write there")
+
+
 @pytest.mark.parametrize(("offset", "state"), [(0.5, State.OK), (-0.5, State.OK), (0.8, State.WARN)])
 def test_the_clock_counts_with_its_uncertainty(offset: float, state: State) -> None:
     assert host.clock((offset, 0.3), None).state is state
@@ -103,16 +135,39 @@ def test_an_inverted_extrinsic_is_told_from_one_that_is_elsewhere() -> None:
     T_10[0, 3] = -0.05
     lens = Camera(640, 480, 385.0, 385.0, 320.0, 240.0)
 
-    def of(T_imu_cam0: np.ndarray, cam1: np.ndarray) -> tuple[State, str]:
+    def of(T_imu_cam0: np.ndarray, cam1: np.ndarray, size: tuple[int, int] = (640, 480)) -> tuple[State, str]:
         noise = ImuNoise(1e-4, 2e-3, 2e-5, 3e-3, 200.0)
         rig = Rig(lens, T_imu_cam0, cam1=lens, T_cam1_cam0=cam1, imu=noise)
-        found = calibration(rig, 1.0, T, 0.05)
+        found = calibration(rig, 1.0, T, 0.05, size)
         return found.state, found.what
 
-    assert of(T, T_10)[0] is State.OK
+    assert of(T, T_10) == (State.OK, "cameras (640x480) and IMU, 1 days old")
+    assert of(T, T_10, (848, 480))[1].endswith("; goes with --mode 640x480 only")
     assert of(inverse(T), T_10) == (State.FAIL, "the extrinsics to the IMU are inverted")
     assert of(np.eye(4), T_10)[0] is State.WARN
     assert "cam1 lies left" in of(T, inverse(T_10))[1]
+
+
+@pytest.mark.parametrize(
+    ("said", "there", "state", "mended"),
+    [
+        (("0123",), ("0123",), State.OK, []),
+        (("0123",), ("0456", "0123"), State.OK, []),
+        (("0123",), ("0456",), State.WARN, ["0456"]),
+        (("0123", "0789"), ("0123",), State.WARN, ["0123"]),
+        (("0123",), (), State.SKIPPED, []),
+        ((), ("0123",), State.SKIPPED, []),
+    ],
+)
+def test_a_calibration_of_another_camera_is_a_warning(
+    said: tuple[str, ...], there: tuple[str, ...], state: State, mended: list[str]
+) -> None:
+    found = device(said, there)
+    assert found.state is state
+    assert [line.partition("  #")[0] for line in found.mend] == [
+        f"share calibrate realsense {one} --out calib/{one}" for one in mended
+    ]
+    assert all(one in found.what for one in said)
 
 
 def test_facts_are_read_from_a_tree(tmp_path: Path) -> None:
@@ -130,6 +185,9 @@ def test_facts_are_read_from_a_tree(tmp_path: Path) -> None:
     }.items():
         (usb / name).write_text(text + "\n")
     assert facts.cameras(tmp_path) == [UsbCamera("2-1", 480.0, "auto", may_open=False, may_start_imu=None)]
+    (usb / "speed").write_text("unknown\n")  # on its way out
+    assert camera.link(facts.cameras(tmp_path)).state is State.FAIL
+    (usb / "speed").write_text("480\n")
     node = tmp_path / "dev/bus/usb/002/013"
     node.parent.mkdir(parents=True)
     node.touch()

@@ -55,6 +55,7 @@ def test_an_answer_and_its_bound_by_hand() -> None:
         ({"origin": NONCE + 1}, "answers another question"),
         ({"leap": 3}, "does not know the time itself"),
         ({"stratum": 16}, "does not know the time itself"),
+        ({"precision": 127}, r"reads its clock to no better than 2\^127 s"),
         ({"stratum": 0}, "does not know the time itself"),  # chronyd's; a kiss has letters
         ({"receive": 0}, "unknown"),
         ({"transmit": 0}, "unknown"),

@@ -8,8 +8,8 @@ import pytest
 from share.errors import ConfigError
 from share.geometry import se3
 from share.io.calibration import CAMCHAIN, IMU_CHAIN, kalibr, read_calibration, read_camera_yaml
-from share.io.kalibr import to_kalibr
-from share.io.section import Section
+from share.io.kalibr import kalibr_texts, to_kalibr
+from share.io.section import Section, read_yaml
 
 CAM = """
   camera_model: pinhole
@@ -155,6 +155,27 @@ def test_a_rig_written_under_kalibrs_names_is_read_as_it_was(tmp_path, seconds):
     back = kalibr(written, written.section("imu0")).rig
     assert (back.cam0, back.cam1, back.imu, back.timeshift_s) == (rig.cam0, rig.cam1, rig.imu, seconds)
     np.testing.assert_allclose(back.T_body_cam0, rig.T_body_cam0, atol=1e-12)
+
+
+def test_the_device_is_told_in_every_section_and_never_at_the_top(tmp_path):
+    """Where Kalibr would take it for a camera. Quoted: YAML reads 0123 as 83."""
+    rig = read_calibration(write(tmp_path, chain(SHIFT0.format(0), SHIFT1.format(0)))).rig
+    assert read_calibration(tmp_path).serials == ()
+    for name, text in kalibr_texts(rig, "ours", "0123").items():
+        (tmp_path / name).write_text(text)
+    assert read_calibration(tmp_path).serials == ("0123",)
+    assert set(read_yaml(tmp_path / CAMCHAIN).data) == {"cam0", "cam1"}
+    chain_of_another = (tmp_path / IMU_CHAIN).read_text().replace("'0123'", "'0456'")
+    (tmp_path / IMU_CHAIN).write_text(chain_of_another)
+    assert read_calibration(tmp_path).serials == ("0123", "0456")
+    (tmp_path / IMU_CHAIN).write_text(chain_of_another.replace("'0456'", "0456"))
+    with pytest.raises(ConfigError, match=f"{IMU_CHAIN}: imu0: serial: put it in quotes"):
+        read_calibration(tmp_path)
+    (tmp_path / IMU_CHAIN).write_text(chain_of_another.replace("'0456'", "'a b'"))
+    with pytest.raises(ConfigError, match=f"{IMU_CHAIN}: imu0: serial: 'a b' is no serial number"):
+        read_calibration(tmp_path)
+    (tmp_path / IMU_CHAIN).write_text(chain_of_another.replace("'0456'", ""))
+    assert read_calibration(tmp_path).serials == ("0123",)
 
 
 DEPTH = """depth:

@@ -76,10 +76,14 @@ def test_named_after_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert keys.generate(tmp_path).name == "lab-pc-local"
 
 
-@pytest.mark.parametrize("name", ["", "a b", "../x", ".x", "-x", "x" * 65])
+@pytest.mark.parametrize("name", ["", "a b", "../x", ".x", "-x", "x" * 65, "zoë", "a\n"])
 def test_names(name: str, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="a name has 1 to 64 letters"):
-        keys.authorize(tmp_path, name, "0" * 40)
+    for use in (
+        lambda: keys.authorize(tmp_path, name, "0" * 40),
+        lambda: keys.generate(tmp_path, name or " "),
+    ):
+        with pytest.raises(UsageError, match="a name has 1 to 64 letters"):
+            use()
     assert os.listdir(tmp_path) == []
 
 
@@ -162,7 +166,7 @@ def test_authorize_and_revoke(tmp_path: Path) -> None:
     keys.authorize(tmp_path, "ann", key(1))
     keys.authorize(tmp_path, "ann", key(1))  # again: nothing new
     assert allowed.names() == {key(1): "ann", key(2): "bob"}
-    assert text(allowed.path) == f"share-public-key ann {key(1)}\nshare-public-key bob {key(2)}\n"
+    assert text(allowed.path) == f"share-public-key bob {key(2)}\nshare-public-key ann {key(1)}\n"
     keys.revoke(tmp_path, "ann")
     assert [allowed.admits(key(n)) for n in (1, 2)] == [False, True]
     with pytest.raises(UsageError, match="'ann' is not authorized; there is bob"):
@@ -183,6 +187,38 @@ def test_a_list_made_of_public_key_files(tmp_path: Path) -> None:
     path = tmp_path / "authorized"
     path.write_text("# ours\n\n" + text(*(tmp_path / p.name / f"{p.name}.public" for p in pairs)))
     assert AllowList(path).names() == {pair.public: pair.name for pair in pairs}
+
+
+def test_what_was_written_by_hand_stays(tmp_path: Path) -> None:
+    path = tmp_path / "authorized"
+    path.write_text(f"# room 1\n\nshare-public-key ann {key(1)}\n# spare")  # without an end
+    keys.authorize(tmp_path, "bob", key(2))
+    keys.revoke(tmp_path, "ann")
+    assert text(path) == f"# room 1\n\n# spare\nshare-public-key bob {key(2)}\n"
+
+
+def test_a_key_that_stands_there_twice_is_revoked_by_either_name(tmp_path: Path) -> None:
+    path = tmp_path / "authorized"
+    for name in ("ann", "old-ann"):
+        path.write_text("".join(f"share-public-key {n} {key(1)}\n" for n in ("ann", "old-ann")))
+        keys.revoke(tmp_path, name)
+        assert not AllowList(path).admits(key(1))
+
+
+def test_what_anybody_may_write_to_lets_nobody_in(tmp_path: Path) -> None:
+    keys.generate(tmp_path, "edge")
+    keys.authorize(tmp_path, "ann", key(1))
+    allowed = keys.allow_list(tmp_path)
+    assert (allowed.admits(key(1)), allowed.trouble()) == (True, None)
+    allowed.path.chmod(0o666)
+    assert not allowed.admits(key(1))
+    assert allowed.trouble() == f"{allowed.path}: anybody may write to it; `chmod o-w {allowed.path}`"
+    allowed.path.chmod(0o664)
+    assert allowed.admits(key(1))
+    tmp_path.chmod(0o777)
+    with pytest.raises(UsageError, match=f"^{tmp_path}: anybody may write to it; `chmod o-w"):
+        keys.load(tmp_path)
+    tmp_path.chmod(0o700)
 
 
 def test_a_damaged_list_lets_nobody_in_and_says_where(tmp_path: Path) -> None:
@@ -280,6 +316,13 @@ def test_who_is_not_listed_does_not_until_listed(house: House) -> None:
     keys.authorize(house.folder, "bob", bob.public)
     house.greets(agent, 2)
     assert agent.trouble() is None
+
+
+def test_a_list_that_was_damaged_meanwhile_is_said(house: House) -> None:
+    path = house.folder / "authorized"
+    path.write_text(text(path) + "bob\n")
+    said = house.refusals(house.agent(1, house.ann))
+    assert set(said) == {f"nobody is let in: {path}, line 2: is not `share-public-key NAME KEY`"}
 
 
 def test_the_key_of_another_edge(house: House) -> None:

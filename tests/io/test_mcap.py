@@ -19,6 +19,8 @@ from share.geometry.camera import Camera, Rig
 from share.io.convert import to_euroc, to_mcap
 from share.io.describe import describe
 from share.io.images import ArrayImage
+from share.io.imu_table import read_imu
+from share.io.kalibr import kalibr_texts
 from share.io.mcap import rig as ros_rig
 from share.io.mcap import types as ros
 from share.io.mcap.recorder import Recorder
@@ -318,3 +320,21 @@ def test_memory_does_not_grow_with_the_file(tmp_path):
     tracemalloc.stop()
     assert peak < 8e6
     assert time.process_time() - began < 5
+
+
+def test_the_device_goes_with_its_recording_and_a_calibration_of_another_is_said(tmp_path):
+    path, again = tmp_path / "a.mcap", tmp_path / "again.mcap"
+    with Recorder(path, RIG, serial="0123") as recorder:
+        for measurement in live(3):
+            recorder.write(measurement)
+    to_mcap(open_source(str(path)), again, None, nothing)
+    for name, said in (("own", "0123"), ("other", "0456")):
+        (tmp_path / name).mkdir()
+        for file, text in kalibr_texts(RIG, name, said).items():
+            (tmp_path / name / file).write_text(text)
+    for recording in (path, again):
+        assert describe(open_source(str(recording)))["serial"] == "0123"
+        assert open_source(str(recording), str(tmp_path / "own")).notes == ()
+        (note,) = open_source(str(recording), str(tmp_path / "other")).notes
+        assert note.startswith("the calibration is of device 0456, this is 0123")
+        assert read_imu(str(recording)).serial == "0123"

@@ -119,6 +119,22 @@ def test_what_is_not_known_is_refused_with_what_is(arguments: tuple, says: str):
             "firmware_oldest: v5",
             "device: firmware: 'v5' is not dotted numbers",
         ),
+        (
+            "rate_hz: 400\n",
+            "rate_hz: 400\n      rate_hz: 200\n",
+            "line 47: not valid YAML: key 'rate_hz' for the second",
+        ),
+        (
+            "rates_hz: [30, 15, 60, 90]",
+            "rates_hz: [0, 30]",
+            "modes[0]: rates_hz: [0, 30] must be rates above 0",
+        ),
+        (
+            "rates_hz: [30, 15, 60, 90]",
+            "rates_hz: []",
+            "device: modes[0]: rates_hz: [] must be rates above 0",
+        ),
+        ("rates_hz: [200, 400]", "rates_hz: [-1, 400]", "device: imu: gyro: rates_hz: [-1, 400] must be"),
         ("[[1, 0, 0, -0.00552]", "[[2, 0, 0, -0.00552]", "device: T_imu_cam0: is not a rigid transform"),
     ],
 )
@@ -148,6 +164,17 @@ def test_a_device_by_its_name_is_that_of_the_shipped_profile():
     assert headset.role == "ar" and host_profile("d435i-turtlebot4").role == "robot"
     assert headset.sensor is not None and headset.sensor.device.firmware == bare.device.firmware
     assert headset.sensor.emulation == bare.emulation
+
+
+@pytest.mark.parametrize("name", ["laptop-edge", "d435i-n100-headset", "../d435i"])
+def test_a_device_by_a_name_that_describes_none(name: str, tmp_path: Path):
+    mine = tmp_path / "mine.yaml"
+    host = "{cpu_governor: performance, usb_autosuspend: false, usbfs_mb: 0}"
+    mine.write_text(f"name: mine\ndevice: {name}\nhost: {host}\n")
+    with pytest.raises(
+        ConfigError, match=f"^{mine}: device: '{name}' is no shipped profile that describes one"
+    ):
+        host_profile(mine)
 
 
 def test_an_edge_has_no_device_and_is_refused_where_one_is_needed():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,12 @@ from capture_bench import PICTURE, WANTED, WRAP_US, Bench, Fake, quick
 from share.core.intake import Sample
 from share.core.measurement import Measurement
 from share.errors import ShareError, UsageError
+from share.io.calibration import Calibration
 from share.io.feed import Feed
 from share.io.handover import Handover
 from share.io.imu_table import read_imu
 from share.io.mcap.recorder import Recorder
+from share.io.profile import profile
 from share.io.source import open_source
 from share.run.capture import Capture
 
@@ -38,6 +41,25 @@ def test_what_the_camera_sees_is_in_the_recording(tmp_path: Path) -> None:
     assert bench.report["streams"]["cam0"]["missing"] == 0
     assert len(stamps["imu"]) == bench.report["imu"] > 0.95 * 20 * 13
     assert bench.said == []
+
+
+def test_a_calibration_of_another_camera_is_recorded_and_said(tmp_path: Path) -> None:
+    own = profile("d435i").rig()
+    given = Calibration(replace(own, timeshift_s=0.004), "mine", serials=("0456",))
+    with Bench(tmp_path / "a.mcap", calibration=given) as bench:
+        bench.feed(1_000_000, 5)
+    source = open_source(str(tmp_path / "a.mcap"))
+    assert (source.serial, source.rig.timeshift_s, source.rig.cam0) == ("0123", 0.004, own.cam0)
+    (said,) = bench.said
+    assert said.startswith("camera 0123: the calibration is of device 0456, this is 0123: ")
+
+
+def test_a_calibration_of_other_images_ends_it_before_there_is_a_file(tmp_path: Path) -> None:
+    given = Calibration(profile("d435i", "848x480").rig(), "mine")
+    bench = Bench(tmp_path / "a.mcap", calibration=given)
+    with pytest.raises(UsageError, match="mine: its cam0 is 848x480, the camera sends 640x480; add --mode"):
+        bench.run.go(1)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_wrap_of_the_cameras_clock_is_not_seen(tmp_path: Path) -> None:

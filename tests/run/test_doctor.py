@@ -14,7 +14,7 @@ import pytest
 from children import Child, start_edge
 from shell import Done
 
-from share.io.host import governors, throttles, usb_memory_mb
+from share.io.host import governors, pi_throttled, resets_governor, throttles, usb_memory_mb
 from share.io.realsense import asked
 from share.run import doctor, edge_probe
 
@@ -137,3 +137,54 @@ def test_what_the_computer_says_of_itself_is_read(tmp_path: Path) -> None:
     assert sorted(throttles(tmp_path)) == [0, 3]
     assert usb_memory_mb(tmp_path) == 16
     assert usb_memory_mb(tmp_path / "nowhere") is None
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "bits"),
+    [
+        ("sys/devices/platform/soc/soc:firmware/get_throttled", "50005", 0x50005),
+        ("sys/devices/platform/soc@107c000000/soc@107c000000:firmware/get_throttled", "0", 0),
+        ("sys/devices/platform/soc/soc:firmware/get_throttled", "oops", None),
+        ("sys/class/hwmon/hwmon1/in0_lcrit_alarm", "1", 1),
+    ],
+)
+def test_a_raspberry_pi_is_read(path: str, text: str, bits: int | None, tmp_path: Path) -> None:
+    assert pi_throttled(tmp_path) is None
+    (tmp_path / path).parent.mkdir(parents=True)
+    (tmp_path / path).write_text(text + "\n")
+    if "hwmon" in path:
+        assert pi_throttled(tmp_path) is None  # of something else
+        (tmp_path / path).with_name("name").write_text("rpi_volt\n")
+    assert pi_throttled(tmp_path) == bits
+
+
+def test_what_sets_the_governor_back_is_found_unless_it_is_masked(tmp_path: Path) -> None:
+    unit = tmp_path / "usr/lib/systemd/system/power-profiles-daemon.service"
+    unit.parent.mkdir(parents=True)
+    unit.touch()
+    assert not resets_governor(tmp_path)  # it leaves processors alone that have no energy preference
+    policy = tmp_path / "sys/devices/system/cpu/cpufreq/policy0"
+    policy.mkdir(parents=True)
+    (policy / "energy_performance_preference").touch()
+    assert resets_governor(tmp_path)
+    masked = tmp_path / "etc/systemd/system/power-profiles-daemon.service"
+    masked.parent.mkdir(parents=True)
+    masked.symlink_to("/dev/null")
+    assert not resets_governor(tmp_path)
+
+
+def test_an_edge_is_told_of_its_keys(share: Share, tmp_path: Path) -> None:
+    def keys_of(folder: Path) -> tuple[str, str, list[str]]:
+        told = json.loads(share("doctor", *LAPTOP, "--keys", folder, "--json").out)
+        return next((f["state"], f["what"], f["mend"]) for f in told["findings"] if f["name"] == "keys")
+
+    state, what, mend = keys_of(tmp_path / "none")
+    assert (state, mend) == ("WARN", ["share keys generate"]) and "this machine alone" in what
+    share("keys", "generate", "--name", "edge", "--keys", tmp_path / "its")
+    assert keys_of(tmp_path / "its")[:2] == ("WARN", "edge; lets in nobody from another machine")
+    public = share("keys", "generate", "--name", "ann", "--keys", tmp_path / "ann").out.strip()
+    share("keys", "authorize", "ann", public, "--keys", tmp_path / "its")
+    assert keys_of(tmp_path / "its")[:2] == ("OK", "edge; lets in: ann")
+    (tmp_path / "its" / "authorized").write_text("half a li")
+    state, what, _ = keys_of(tmp_path / "its")
+    assert state == "FAIL" and "authorized, line 1" in what

@@ -6,6 +6,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from room_camera import BEGIN_US, HZ, RGBD, STEREO, RoomCamera
 
 from share.config import Config
 from share.estimator.result import TrackResult
+from share.io.calibration import Calibration
 from share.io.handover import Handover, KeepNewest
 from share.io.live import WAITING, LiveSource
 from share.io.source import Source, open_source
@@ -81,6 +83,16 @@ def test_a_live_camera_is_tracked_as_the_original(room: RoomCamera, original: Tr
         "dropped": 0,
     }
     assert said == []
+
+
+def test_a_calibration_of_another_camera_is_noted_and_used(room: RoomCamera) -> None:
+    rig = replace(room.source.rig, depth=room.source.rig.cam0, T_depth_cam0=np.eye(4), timeshift_s=0.004)
+    given = Calibration(rig, "mine", serials=("0456",))
+    source = LiveSource(room.feed(STEREO, KeepNewest(2 * WAITING), []), HZ, given)
+    source.close()
+    assert (source.rig.timeshift_s, source.rig.depth) == (0.004, None)  # depth is not read
+    (note,) = source.notes
+    assert note.startswith("the calibration is of device 0456, this is 0123: ")
 
 
 def test_a_tracker_slower_than_its_camera_takes_the_newest_and_all_of_the_imu(room: RoomCamera) -> None:

@@ -111,8 +111,11 @@ def test_it_is_converted_and_told_of(
     _, path = stereo
     told = share("dataset", "info", path)
     assert (told.code, "stereo+imu" in told.out, "profile d435i" in told.out) == (0, True, True)
+    assert "device 0123" in told.out
     assert share("dataset", "convert", path, "--frames", "5:15", "--out", tmp_path / "a.mcap").code == 0
-    stamps = open_source(str(tmp_path / "a.mcap")).stamps()
+    converted = open_source(str(tmp_path / "a.mcap"))
+    stamps = converted.stamps()
+    assert converted.serial == "0123"
     np.testing.assert_array_equal(stamps["cam0"], open_source(str(path)).stamps()["cam0"][5:15])
 
 

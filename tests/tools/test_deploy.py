@@ -222,6 +222,19 @@ def test_the_doctor_looks_for_what_that_kind_of_computer_needs(device, kind, pro
     assert f"systemd-tmpfiles --create {device.root}/etc/tmpfiles.d/share.conf" in device.asked()
 
 
+def test_what_sets_the_governor_back_at_a_start_is_said_unless_it_is_masked(device):
+    unit = "systemd/system/power-profiles-daemon.service"
+    for path in (f"usr/lib/{unit}", "sys/devices/system/cpu/cpufreq/policy0/energy_performance_preference"):
+        (device.root / path).parent.mkdir(parents=True)
+        (device.root / path).touch()
+    command = "sudo systemctl mask --now power-profiles-daemon.service"
+    first = device.agent(device.program("1.0"))
+    assert first.code == 0 and command in first.out
+    (device.root / "etc" / unit).symlink_to("/dev/null")
+    second = device.agent(device.program("1.1"))
+    assert second.code == 0 and command not in second.out
+
+
 def test_back_without_a_release_before_is_one_line(device):
     device.agent(device.program("1.0"))
     done = device.deploy("agent", "--name", "ann", "--rollback")

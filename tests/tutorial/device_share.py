@@ -88,7 +88,7 @@ def main(machine: str, words: list[str]) -> None:
         lying = SoftwareCamera(rs, serial=f"{machine}-1")
         share(words, lying, lambda ended: play_rest(lying, ended))
     else:
-        moving = RoomCamera(rs, InMemory(field_trip.world(machine, name)))
+        moving = RoomCamera(rs, InMemory(field_trip.world(machine, name)), f"{machine}-1")
         share(words, moving.camera, lambda ended: play_room(moving, ended))
 
 

@@ -146,6 +146,12 @@ set_kernel() { # FILE: what the profile asks of processor and USB, now and at ev
     mkdir -p "$BOOT"
     cp "$1" "$BOOT/share.conf"
     systemd-tmpfiles --create "$BOOT/share.conf" || say "the kernel did not take all of /etc/tmpfiles.d/share.conf"
+    ppd=power-profiles-daemon.service # of desktops
+    if grep -q scaling_governor "$1" && [ -e "$ROOT/usr/lib/systemd/system/$ppd" ] &&
+        [ "$(readlink "$UNITS/$ppd")" != /dev/null ] &&
+        ls "$ROOT"/sys/devices/system/cpu/cpufreq/policy*/energy_performance_preference >/dev/null 2>&1; then
+        say "$ppd sets the CPU governor back whenever it starts; to keep it: sudo systemctl mask --now $ppd"
+    fi
 }
 
 point() { # LINK RELEASE: at once, so that nobody ever finds none

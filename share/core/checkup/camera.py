@@ -37,10 +37,12 @@ class UsbCamera:
 
 @dataclass(frozen=True)
 class Sdk:
-    """What librealsense says. trouble: why it could not be asked, None where it was. firmware: of each."""
+    """What librealsense says. trouble: why it could not be asked, None where it was. firmware, serials: of
+    each camera."""
 
     trouble: str | None = None
     firmware: tuple[str, ...] = ()
+    serials: tuple[str, ...] = ()
 
 
 def link(cameras: Sequence[UsbCamera] | None) -> Finding:
@@ -78,7 +80,7 @@ def firmware(sdk: Sdk, good: Sequence[str], oldest: str | None) -> Finding:
 
 def _update(good: Sequence[str]) -> tuple[str, ...]:
     return (
-        f"rs-fw-update -l; then rs-fw-update -f FILE, with a file of one of {', '.join(good)}",
+        f"rs-fw-update -l  # then: rs-fw-update -f FILE, with a file of one of {', '.join(good)}",
         "FILE: https://dev.realsenseai.com/docs/firmware-releases-d400",
         "rs-fw-update: in the maker's package librealsense2-utils, for any computer with the camera at it, "
         "https://github.com/realsenseai/librealsense/blob/master/doc/distribution_linux.md",
@@ -134,13 +136,20 @@ def imu(cameras: Sequence[UsbCamera]) -> Finding:
     unseen = [camera.path for camera in cameras if camera.may_start_imu is None]
     if unseen:
         what = f"{', '.join(unseen)}: the kernel shows no IMU (iio) of the camera"
-        return warn("IMU", what, "sudo modprobe -a hid_sensor_accel_3d hid_sensor_gyro_3d; replug the camera")
+        return warn("IMU", what, *_TO_SHOW_IMU)
     closed = [camera.path for camera in cameras if not camera.may_start_imu]
     if closed:
         what = f"{', '.join(closed)}: its files in /sys (iio:device*) cannot be written"
         mend = "sudo usermod -aG plugdev $USER  # then log in again, and replug the camera"
         return fail("IMU", what, *_write_rules(), mend)
     return ok("IMU", "may be started")
+
+
+_TO_SHOW_IMU = (
+    "sudo modprobe -a hid_sensor_accel_3d hid_sensor_gyro_3d  # then replug the camera",
+    "grep HID_SENSOR /boot/config-$(uname -r)  # nothing with =m or =y: this kernel, often a Raspberry Pi's, "
+    "has no driver for it; take one that has",
+)
 
 
 def _write_rules() -> tuple[str, ...]:

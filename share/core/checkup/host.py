@@ -24,19 +24,47 @@ def governor(found: Sequence[str], wanted: str, mend: Sequence[str] = ()) -> Fin
     return warn("CPU governor", what, *mend)
 
 
-def throttling(counts: Sequence[int]) -> Finding:
-    """counts: how often each core was slowed by heat since it was started."""
+def throttling(counts: Sequence[int], pi: int | None = None) -> Finding:
+    """counts: how often each core was slowed by heat since it was started. pi: a Raspberry Pi's own bits."""
+    if pi is not None:
+        return _pi_throttling(pi)
     if not counts:
-        return skipped("throttling", "the cores count none (not Intel's, or a virtual machine)")
+        return skipped(
+            "throttling", "nobody counts it (neither Intel nor a Raspberry Pi, or a virtual machine)"
+        )
     if not any(counts):
         return ok("throttling", "none since the start")
     what = f"slowed by heat, {max(counts)} times on one core since the start"
-    return warn("throttling", what, "cool it better (fan, dust, air), or ask less of it: a lower image rate")
+    return warn("throttling", what, _COOL)
 
 
-def disk(where: str, free_bytes: int, bytes_s: float) -> Finding:
-    """bytes_s: what is written at most, 0 where nothing is recorded."""
+_COOL = "cool it better (fan, dust, air), or ask less of it: a lower image rate"
+_SUPPLY = "give it 5.1 V and 3 A by a short, thick cable, or the camera a USB 3 hub with a supply of its own"
+_VOLTAGE, _SLOWED, _HOT = 0x1, 0xE, 0x8  # bits of now
+_EVER = 16  # by so many they are shifted for "since the start"
+
+
+def _pi_throttling(bits: int) -> Finding:
+    """Bits of the firmware: 0 too little voltage, 1 frequency capped, 2 throttled, 3 soft limit of
+    temperature (Raspberry Pi documentation, vcgencmd get_throttled)."""
+    now, ever = bits, bits | bits >> _EVER
+    if not ever & (_VOLTAGE | _SLOWED):
+        return ok("throttling", "none since the start")
+    what = []
+    if ever & _VOLTAGE:
+        what.append(f"its supply {'gives' if now & _VOLTAGE else 'gave'} too little voltage")
+    if ever & _SLOWED:
+        what.append("it is slowed" if now & _SLOWED else "it was slowed since the start")
+    needed = ((_SUPPLY, ever & _VOLTAGE), (_COOL, ever & _HOT or not ever & _VOLTAGE))
+    mends = [mend for mend, there in needed if there]
+    return warn("throttling", f"{' and '.join(what)} (get_throttled 0x{bits:x})", *mends)
+
+
+def disk(where: str, free_bytes: int, bytes_s: float, may_write: bool = True) -> Finding:
+    """bytes_s: what is written at most, 0 where nothing is recorded. may_write: whether this user may."""
     what = f"{where}: {free_bytes / 1e9:.1f} GB free"
+    if not may_write:
+        return fail("disk", f"{where}: this user may not write there", "give another --out")
     if not bytes_s:
         return ok("disk", what) if free_bytes > 1e9 else fail("disk", what, f"df -h {where}; make room")
     minutes = free_bytes / bytes_s / 60
@@ -83,6 +111,22 @@ def libraries(found: Mapping[str, str | None], frozen: bool = False) -> Finding:
     if frozen:
         mend = "put a program here that was frozen on a machine of this kind: make freeze, then tools/deploy"
     return fail("libraries", what, mend)
+
+
+def edge_keys(own: str, let_in: Sequence[str]) -> Finding:
+    """own: name of its pair. let_in: names on its list."""
+    if let_in:
+        return ok("keys", f"{own}; lets in: {', '.join(let_in)}")
+    return warn(
+        "keys",
+        f"{own}; lets in nobody from another machine",
+        "share keys authorize NAME 'PUBLIC KEY OF THE AGENT'",
+    )
+
+
+def no_edge_keys(folder: str) -> Finding:
+    what = f"{folder}: none; without them it serves this machine alone"
+    return warn("keys", what, "share keys generate")
 
 
 def port(number: int, free: bool) -> Finding:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from share.core.measurement import CAM0, CAM1, DEPTH, IMU, STREAMS, Measurement
+from share.core.whose import of_another
 from share.errors import ConfigError, DataError
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
@@ -58,13 +59,15 @@ class McapSource(Source):
         if rig is None:
             raise ConfigError(f"{file.path}: carries no calibration; give one with --calib")
         self.name, self.rig = file.path.stem, _fit(rig, topics, file.path)
-        self._file, self._own = file, own
+        self._file, self._own, self.serial = file, own, own_serial(file)
         cameras = ros_rig.cameras(self.rig)
         used = {s for s in topics if s in cameras or (s == IMU and self.rig.imu)}
         self._topics = {s: topics[s] for s in used}
         self.notes = tuple(
             f"{topics[s]} is not used: the calibration has no {s}" for s in topics if s not in used
         )
+        if calibration and (wrong := of_another(calibration.serials, self.serial)):
+            self.notes += (wrong,)
         self._span = self._find_span(frames)
 
     def stamps(self) -> dict[str, I64]:
@@ -193,13 +196,23 @@ def guess_topic(stream: str, candidates: list[str]) -> str | None:
 
 def own_rig(file: McapFile, topics: dict[str, str], needed: bool) -> Rig | None:
     """The rig that the recording carries in our record, else (if `needed`) in CameraInfo, else None."""
-    try:
-        record = file.metadata(ros.RIG_RECORD)
-    except damage():
-        record = {}
+    record = _record(file)
     if "rig" in record:
         return ros_rig.from_json(record["rig"], str(file.path))
     return _rig_of_messages(file, topics) if needed else None
+
+
+def own_serial(file: McapFile) -> str | None:
+    """Of the device, where the recording knows it."""
+    return _record(file).get("serial")
+
+
+def _record(file: McapFile) -> dict[str, str]:
+    """What we wrote of the device; empty where it is another's recording, or damaged."""
+    try:
+        return file.metadata(ros.RIG_RECORD)
+    except damage():
+        return {}
 
 
 def _rig_of_messages(file: McapFile, topics: dict[str, str]) -> Rig | None:

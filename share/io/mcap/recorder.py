@@ -53,10 +53,17 @@ class Recorder:
 
     jpeg: quality to which gray images are compressed; None keeps encoded images byte for byte and
     raw ones raw. durable: of what cannot be made again: survives a power cut, at the price of one fdatasync
-    a second, and overwrites no `.part`. Raises UsageError if the file cannot be made.
+    a second, and overwrites no `.part`. serial: of the device. Raises UsageError if the file cannot be made.
     """
 
-    def __init__(self, path: Path, rig: Rig, jpeg: int | None = None, durable: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        rig: Rig,
+        jpeg: int | None = None,
+        durable: bool = False,
+        serial: str | None = None,
+    ) -> None:
         from mcap.writer import Writer
 
         self.path, self.part = check_writable(path), part_of(path)
@@ -70,7 +77,8 @@ class Recorder:
             raise UsageError(f"{self.part}: cannot be written: {error.strerror}") from None
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
         self._writer.start(profile="ros2", library="share")
-        self._writer.add_metadata(ros.RIG_RECORD, {"rig": ros_rig.to_json(rig), "schema": "1"})
+        about = {"rig": ros_rig.to_json(rig), "schema": "1"} | ({"serial": serial} if serial else {})
+        self._writer.add_metadata(ros.RIG_RECORD, about)
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._counts: dict[str, int] = {}

@@ -42,6 +42,7 @@ def _tell(to: Connection) -> None:
 def _query() -> Sdk:
     try:
         rs = load_sdk()
-        return Sdk(firmware=tuple(device.firmware for device in attached(rs, rs.context())))
+        found = attached(rs, rs.context())
+        return Sdk(firmware=tuple(d.firmware for d in found), serials=tuple(d.serial for d in found))
     except (ShareError, RuntimeError) as error:
         return Sdk(str(error).splitlines()[0])

@@ -35,6 +35,11 @@ class Db3:
         self._data = {STREAMS[p[3]]: name for p, name in parts if len(p) > 3 and p[3] in STREAMS}
         self.streams = {stream: "/".join(name.split("/")[:4]) for stream, name in self._data.items()}
 
+    @property
+    def serial(self) -> str | None:
+        """Of the device."""
+        return self.told("/device_0/info").get("Serial Number")
+
     def told(self, topic: str) -> dict[str, str]:
         """What a text such as `key=value;key=value` says, empty if it is not there."""
         for (data,) in self._rows(

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from share.config import SequencerConfig
 from share.core.measurement import CAM0
-from share.geometry.camera import Rig
+from share.io.calibration import Calibration
 from share.io.feed import Feed
 from share.io.handover import Handover, KeepNewest
 from share.io.live import WAITING, LiveSource
@@ -34,12 +34,12 @@ def open_live(
     wanted: Wanted,
     config: SequencerConfig,
     say: Callable[[str], None],
-    rig: Rig | None = None,
+    calibration: Calibration | None = None,
 ) -> LiveSource:
-    """The camera as a source, with the factory's calibration or `rig`.
+    """The camera as a source, with the factory's calibration or another.
 
     Raises UsageError, ShareError, DataError.
     """
     rates = wanted.rates_hz()
     queue = KeepNewest(WAITING * len(wanted.cameras))
-    return LiveSource(feed_of(spec, wanted, config, say, queue), rates[CAM0], rig)
+    return LiveSource(feed_of(spec, wanted, config, say, queue), rates[CAM0], calibration)

@@ -12,6 +12,7 @@ import numpy as np
 from share.config import SequencerConfig
 from share.core.intake import ACCEL, GYRO, Intake
 from share.core.measurement import CAM0, CAM1, DEPTH, IMU, Measurement
+from share.core.whose import of_another
 from share.errors import DataError, UsageError
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
@@ -36,7 +37,8 @@ def open_db3(path: Path, calibration: Calibration | None, frames: slice | None) 
             f"{path}: has no left infrared images (Infrared 1), compressed as the SDK does it; record them"
         )
     if calibration is not None:
-        return RecordedSource(file, calibration.rig, (), frames)
+        doubt = of_another(calibration.serials, file.serial)
+        return RecordedSource(file, calibration.rig, () if doubt is None else (doubt,), frames)
     rig = recorded_rig(file)
     return RecordedSource(file, rig, (_NOTE,) if rig.imu else (), frames)
 
@@ -45,7 +47,7 @@ class RecordedSource(Source):
     """The streams of the file that the rig has."""
 
     def __init__(self, file: Db3, rig: Rig, notes: tuple[str, ...], frames: slice | None) -> None:
-        self.name, self.rig, self.notes = file.path.stem, rig, notes
+        self.name, self.rig, self.notes, self.serial = file.path.stem, rig, notes, file.serial
         self._file, self._cameras = file, cameras(rig)
         if missing := sorted(self._cameras.keys() - file.streams.keys()):
             raise UsageError(f"{file.path}: has no {missing[0]}, which the calibration has")

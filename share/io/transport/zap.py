@@ -59,8 +59,11 @@ class Doorkeeper:
         if self._allowed.admits(key):
             self._inside.add(key)  # a revocation since then is seen by the next `revoked`
             return [version, number, b"200", b"", key.encode(), b""]
+        wrong = self._allowed.trouble()
         self._refusals.append(
-            f"the key '{key}' ({address.decode()}) is not authorized; "
+            f"nobody is let in: {wrong}"
+            if wrong
+            else f"the key '{key}' ({address.decode()}) is not authorized; "
             f"to let it in: share keys authorize NAME '{key}'"
         )
         return [version, number, b"400", b"not authorized", b"", b""]
