@@ -5,11 +5,12 @@ What is not there is None or empty: containers and virtual machines show little.
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import os
 import re
 import shutil
 import socket
+from collections.abc import Sequence
 from pathlib import Path
 
 from share.core.checkup.camera import UsbCamera
@@ -17,7 +18,8 @@ from share.core.checkup.camera import UsbCamera
 _VENDOR, _D435I = "8086", "0b3a"
 _RULES = ("etc/udev/rules.d", "lib/udev/rules.d", "usr/lib/udev/rules.d")
 _CPUS = "sys/devices/system/cpu/cpu[0-9]*"
-_NATIVE = ("numpy", "cv2", "scipy.linalg", "zmq", "onnxruntime", "poselib")
+_NATIVE = ("numpy", "cv2", "scipy.linalg", "zmq", "onnxruntime")
+_WHERE_THERE_IS_ONE = ("poselib",)  # for this processor; share.geometry.absolute_pose does without
 
 
 def governors(root: Path = Path("/")) -> list[str]:
@@ -90,9 +92,12 @@ def port_free(port: int) -> bool:
     return True
 
 
-def native_libraries(names: tuple[str, ...] = _NATIVE) -> dict[str, str | None]:
-    """Why each does not load; None where it does."""
-    return {name: _trouble(name) for name in names}
+def native_libraries(
+    names: Sequence[str] = _NATIVE, optional: Sequence[str] = _WHERE_THERE_IS_ONE
+) -> dict[str, str | None]:
+    """Why each does not load; None where it does. optional: those that may not be installed at all."""
+    there = [name for name in optional if importlib.util.find_spec(name) is not None]
+    return {name: _trouble(name) for name in (*names, *there)}
 
 
 def _trouble(name: str) -> str | None:

@@ -39,6 +39,13 @@ def test_nobody_is_told_to_go_back_to_an_older_firmware() -> None:
     assert found.what.startswith("5.17.0.10, newer than those tried")
 
 
+def test_a_processor_for_which_there_is_no_poselib_is_told() -> None:
+    assert host.libraries({"numpy": None, "poselib": None}).what == "numpy, poselib load"
+    found = host.libraries({"numpy": None})
+    assert (found.state, found.mend) == (State.OK, ())
+    assert found.what.startswith("numpy load; no poselib for this processor")
+
+
 def test_into_a_frozen_program_nothing_can_be_installed() -> None:
     for frozen in (False, True):
         mends = [

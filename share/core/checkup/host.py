@@ -105,7 +105,8 @@ def libraries(found: Mapping[str, str | None], frozen: bool = False) -> Finding:
     brings its own Python, into which nothing can be installed."""
     broken = {name: why for name, why in found.items() if why is not None}
     if not broken:
-        return ok("libraries", f"{', '.join(found)} load")
+        slower = "" if "poselib" in found else "; no poselib for this processor: OpenCV finds places, slower"
+        return ok("libraries", f"{', '.join(found)} load{slower}")
     what = "; ".join(f"{name}: {why}" for name, why in broken.items())
     mend = "pip install --force-reinstall share-slam, for this Python and processor"
     if frozen:
