@@ -14,8 +14,8 @@ from share.io.session import is_session, read_session
 from share.types import F64, I64, ImuBatch
 
 _KINDS = (
-    "an .mcap recording, SESSION/NAME, a folder with imu0/data.csv (EuRoC/ASL), or such a data.csv: "
-    "t[ns],wx,wy,wz,ax,ay,az"
+    "an .mcap recording, one of the RealSense SDK (.db3), SESSION/NAME, a folder with imu0/data.csv "
+    "(EuRoC/ASL), or such a data.csv: t[ns],wx,wy,wz,ax,ay,az"
 )
 
 
@@ -36,6 +36,8 @@ def read_imu(spec: str, told: Callable[[int, int], None] = lambda done, total: N
     path = Path(spec)
     if path.suffix == ".mcap" and path.is_file():
         return _table(path.stem, *_of_mcap(path, told))
+    if path.suffix == ".db3" and path.is_file():
+        return _table(path.stem, *_of_db3(path, told))
     if is_session(path.parent) and not path.exists():
         return _table(path.name, *_of_mcap(read_session(path.parent).recording(path.name), told))
     for csv in imu_tables(path):
@@ -58,6 +60,15 @@ def _of_mcap(path: Path, told: Callable[[int, int], None]) -> tuple[I64, F64]:
     from share.io.mcap.imu import read_imu as read
 
     return read(McapFile(path), told)
+
+
+def _of_db3(path: Path, told: Callable[[int, int], None]) -> tuple[I64, F64]:
+    from share.io.realsense.recorded import recorded_imu  # rosbags only where it is needed
+
+    told(0, 1)
+    table = recorded_imu(path)
+    told(1, 1)
+    return table
 
 
 def _table(name: str, stamps_ns: I64, values: F64) -> ImuTable:
