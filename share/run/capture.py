@@ -85,12 +85,13 @@ class Capture:
             self._error = self._error or error
         self._feed.stop()
         writer.join()
-        if self._error is not None:
+        if self._error is not None and not self._feed.in_vain:
             recorder.abort()
-        elif not self._written:
+        elif self._feed.in_vain or not self._written:
             recorder.abort()
             recorder.part.unlink()
-            self._error = ShareError(f"camera {self._feed.serial}: {self._came()}; nothing was recorded")
+            nothing = f"camera {self._feed.serial}: {self._came()}"
+            self._error = ShareError(f"{self._error or nothing}; nothing was recorded")
         else:
             recorder.close()
 
