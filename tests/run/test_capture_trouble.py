@@ -145,7 +145,11 @@ def test_a_disk_that_fills_ends_the_recording_in_a_line_and_what_was_written_is_
     )
     reason = os.strerror(errno.EFBIG)
     assert child.returncode == 1
-    assert child.stderr == f"share: {tmp_path / 'a.mcap'}: cannot be written: {reason}\n"
+    out = tmp_path / "a.mcap"
+    assert child.stderr.splitlines() == [
+        f"share: {out}.part: is not closed; `share dataset recover {out}.part --out {out}` saves what it has",
+        f"share: {out}: cannot be written: {reason}",
+    ]
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap.part"]
     recover(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
     assert len(open_source(str(tmp_path / "b.mcap")).stamps()["cam0"]) > 15
