@@ -180,6 +180,22 @@ def test_dots_of_an_emitter_that_should_be_off_are_said_once(camera: SoftwareCam
     assert [text.partition(":")[0] for text in said] == ["the emitter is on though it was switched off"]
 
 
+def test_an_interleaved_emitter_that_does_not_alternate_is_said(camera: SoftwareCamera) -> None:
+    said, got = list[str](), list[Sample]()
+    interleaved = replace(D435I, device=replace(FACTS, emitter="interleaved"))
+    with RealSense(Wanted(interleaved), context=camera.context, say=said.append) as device:
+        device.start(got.append)
+        camera.stereo.set_metadata(rs.frame_metadata_value.frame_laser_power_mode, 1)
+        for k in range(40):
+            camera.image(0, 1_000_000 + 33_333 * k, np.zeros((480, 640), np.uint8))
+            time.sleep(0.01)
+        time.sleep(0.1)
+    assert got == []
+    assert said == [
+        "emitter interleaved: all images have dots, so none is kept; use a profile with emitter off"
+    ]
+
+
 def test_a_frame_that_cannot_be_read_is_said_once_and_those_after_it_are_read(
     camera: SoftwareCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:

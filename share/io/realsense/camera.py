@@ -28,6 +28,8 @@ _UNKNOWN_DOTS = (
     "see docs/capture.md"
 )
 _DOTS = "the emitter is on though it was switched off: its dots spoil tracking; plug the camera in anew"
+_MANY = 30  # images with dots and none without: it does not alternate
+_NEVER_DARK = "emitter interleaved: all images have dots, so none is kept; use a profile with emitter off"
 
 Sink = Callable[[Sample], None]
 
@@ -58,6 +60,7 @@ class RealSense:
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self.lit = 0
+        self._dark = False  # whether an image without dots came
         self._told = set[str]()
 
     @property
@@ -145,8 +148,13 @@ class RealSense:
             "none": {},
         }[emitter]
         for name, value in ({option.global_time_enabled: 0} | dots).items():
-            if sensor.supports(name):
+            if not sensor.supports(name):
+                continue
+            try:
                 sensor.set_option(name, value)
+            except RuntimeError:
+                if name != option.emitter_on_off or value:  # not to alternate is usual, and dots are said
+                    raise
 
     def _pump(self, queue: Any, sink: Sink, depth_unit_m: float) -> None:
         while not self._stop.is_set():
@@ -174,7 +182,9 @@ class RealSense:
             return sample
         if dots is None:
             self._once(_UNKNOWN_DOTS)
-        self.lit += bool(dots)
+        self.lit, self._dark = self.lit + bool(dots), self._dark or not dots
+        if self.lit >= _MANY and not self._dark:
+            self._once(_NEVER_DARK)
         # the number counts those with dots too, which are not missing
         return None if dots else replace(sample, number=None)
 
