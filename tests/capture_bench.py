@@ -13,7 +13,7 @@ from software_camera import SoftwareCamera
 
 from share.config import SequencerConfig
 from share.core.watchdog import Watchdog
-from share.errors import UsageError
+from share.errors import ShareError, UsageError
 from share.io.calibration import Calibration
 from share.io.feed import Feed, MakeWatchdog
 from share.io.handover import Handover
@@ -56,12 +56,13 @@ class Bench:
         most_images: int = 60,
         calibration: Calibration | None = None,
     ) -> None:
-        self.camera, self.said, self.there = SoftwareCamera(load_sdk()), list[str](), True
+        self.camera = SoftwareCamera(load_sdk(), depth=wanted.depth)
+        self.said, self.there, self.error = list[str](), True, ""
         self.wanted, self.connected = wanted, 0
         rates_hz, max_jump_s = wanted.rates_hz(), SequencerConfig().max_jump_s
         queue = Handover(most_images)
-        feed = Feed(self.connect, None, rates_hz, max_jump_s, self.said.append, queue, watchdog)
-        self.run = Capture(feed, out, 0.0, self.said.append, calibration=calibration)
+        self.source = Feed(self.connect, None, rates_hz, max_jump_s, self.said.append, queue, watchdog)
+        self.run = Capture(self.source, out, 0.0, self.said.append, calibration=calibration)
         self.report: dict[str, Any] = {}
         self.thread = threading.Thread(target=self._go, daemon=True)
 
@@ -92,7 +93,13 @@ class Bench:
             time.sleep(0.02)
 
     def feed(
-        self, begin_us: int, frames: int, imu: bool = True, wrap: bool = False, host_us: int | None = None
+        self,
+        begin_us: int,
+        frames: int,
+        imu: bool = True,
+        wrap: bool = False,
+        host_us: int | None = None,
+        eyes: tuple[int, ...] = (0, 1),
     ) -> int:
         """Frames at 30 Hz with IMU at 400 and 250 Hz; gives the stamp after them. host_us: where the host's
         clock begins, by which images are stamped then."""
@@ -102,7 +109,7 @@ class Bench:
             for stamp, turns in sorted(at) if imu else []:
                 device_us = stamp % WRAP_US if wrap else stamp
                 (self.camera.turn if turns else self.camera.force)(device_us, 0.1, 0.2, 9.8)
-            for eye in (0, 1):
+            for eye in eyes:
                 if host_us is not None:
                     host = self.camera.rs.timestamp_domain.system_time
                     self.camera.image(eye, host_us + now - begin_us, PICTURE, host)
@@ -112,8 +119,11 @@ class Bench:
         return begin_us + frames * 33_333
 
     def _go(self) -> None:
-        self.report = self.run.go()
+        try:
+            self.report = self.run.go()
+        except ShareError as error:
+            self.error = str(error)
 
 
 def quick(now_ns: int, streams: Collection[str]) -> Watchdog:
-    return Watchdog(now_ns, streams, silent_ms=600, warm_up_ms=800, retry_ms=100)
+    return Watchdog(now_ns, streams, silent_ms=600, warm_up_ms=800, retry_ms=100, reset_ms=100)

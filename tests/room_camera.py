@@ -68,13 +68,12 @@ class RoomCamera:
                 self.camera.image(m.stream == "cam1", now, m.payload.load())
         return now
 
-    def begin(self, feed: Feed, pause_s: float = 0.0) -> threading.Thread:
-        """Play to who reads `feed`, then stop it. A frame is shown when those before it are taken; where a
-        pause is given, after that."""
+    def taken(self, feed: Feed, pause_s: float = 0.0) -> Callable[[], None]:
+        """Waits until all frames that were shown before have been taken; where a pause is given, so long."""
         images = [name for name in feed.intake.streams if name not in ("accel", "gyro")]
         shown = itertools.count()
 
-        def taken() -> None:
+        def wait() -> None:
             before, until = next(shown), time.monotonic() + 20
             time.sleep(pause_s)
             while not pause_s and time.monotonic() < until:
@@ -82,9 +81,14 @@ class RoomCamera:
                     return
                 time.sleep(0.001)
 
+        return wait
+
+    def begin(self, feed: Feed, pause_s: float = 0.0) -> threading.Thread:
+        """Play to who reads `feed`, then stop it. See `taken`."""
+
         def play() -> None:
             time.sleep(0.2)  # until the sensors deliver
-            self.play(taken)
+            self.play(self.taken(feed, pause_s))
             time.sleep(0.5)
             feed.stop()
 

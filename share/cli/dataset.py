@@ -115,7 +115,7 @@ def recover(broken: str, out: str, as_json: bool) -> None:
     _check_mcap(target, broken)
     with progress(path.stat().st_size, "recovering") as bar:
         result = run(path, target, bar)
-    click.echo(json.dumps(result._asdict()) if as_json else _recovered(target, result))
+    click.echo(json.dumps(result._asdict()) if as_json else _recovered(path, target, result))
 
 
 def _check_mcap(out: Path, source: str) -> None:
@@ -125,11 +125,13 @@ def _check_mcap(out: Path, source: str) -> None:
         raise UsageError(f"--out {out}: is the source itself; give another name")
 
 
-def _recovered(out: Path, result: Any) -> str:
+def _recovered(broken: Path, out: Path, result: Any) -> str:
     lines = [f"{out}: {sum(result.messages.values())} messages saved"]
     lines += [f"  {topic:<34} {count:>8}" for topic, count in sorted(result.messages.items())]
     if result.reason:
         lines.append(f"lost: {result.lost_bytes} bytes ({result.reason})")
+    if not result.lost_bytes:
+        lines.append(f"all that {broken} has is saved: it can be deleted")
     return "\n".join(lines)
 
 

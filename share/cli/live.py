@@ -128,7 +128,8 @@ _MET = ("imu_alone", "foreign", "wraps", "jumps", "strays", "past", "restarts", 
 
 def met(report: dict[str, Any]) -> str:
     """What happened to the camera, without what never did; of its report."""
-    return ", ".join(f"{name.replace('_', ' ')} {report[name]}" for name in _MET if report[name])
+    told = [f"{name.replace('_', ' ')} {report[name]}" for name in _MET if report[name]]
+    return ", ".join([*told, *([] if report["health"] == "OK" else [f"{report['health']} at the end"])])
 
 
 def summary(report: dict[str, Any]) -> list[str]:

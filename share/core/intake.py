@@ -74,8 +74,8 @@ class Intake:
 
     def feed(self, sample: Sample) -> Iterator[Measurement]:
         """What may now be used: mostly this sample, perhaps none or several."""
-        if sample.stream not in self.streams:
-            return
+        if sample.stream not in self.streams or (self._source and sample.epoch < self._source[0]):
+            return  # not asked for, or left over from before a reconnection
         self.foreign += not sample.hardware
         if sample.hardware or (self._source is not None and not self._source[1]):
             yield from self._timed(sample)

@@ -20,7 +20,7 @@ from share.core.stamps import StampRepair
 from share.geometry.camera import Rig
 from share.types import ImuBatch
 
-_DEAD = 10  # an IMU silent for this many imu_silent_ms is not waited for any more
+_DEAD = 10  # a stream silent for so many times what a frame waits is not waited for any more
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +70,10 @@ def sequence(
     """Merge by time. `streams` as `streams_of` gives them; rate_hz: the frame rate, 0 if unknown;
     imu_shift_ns: IMU time less camera time, by which a frame's IMU samples are later stamped than it.
 
+    Every frame has its partner image: cam1, or depth where there is no cam1; depth beside cam1 may be
+    missing. A partner that is dead (silent for _DEAD times what a frame waits) is done without where the
+    IMU or depth is alive.
+
     Streams may be out of step with each other by up to imu_silent_ms, and within themselves by
     reorder_ms: such disorder does not change the bundles. Memory is bounded by these times.
     """
@@ -100,6 +104,7 @@ class _Buffer:
         self.items: list[tuple[int, Any]] = []
         self.newest = -(2**62)
         self.taken = -(2**62)  # nothing up to here is accepted any more
+        self.died = False  # was dead when all ended
         self._reorder_ns = reorder_ns
 
     @property
@@ -167,6 +172,8 @@ class _Merger:
     def end(self) -> None:
         """No more will come: whatever waits is as whole as it gets."""
         for buffer in self.buffers.values():
+            buffer.died = self._dead(buffer)
+        for buffer in self.buffers.values():
             buffer.newest = self._now = 2**62
 
     def ready(self) -> Iterator[Bundle]:
@@ -175,11 +182,19 @@ class _Merger:
             stamp, image0 = self._images.items[0]
             self._images.pop_until(stamp)
             partners = [self._partner(buffer, stamp) for buffer in self._partners]
-            if None in partners:
+            if self._incomplete(partners):
                 self._counters.unpaired += 1 + sum(p is not None for p in partners)
             else:
                 yield self._bundle(stamp, image0, partners)
         self._forget()
+
+    def _incomplete(self, partners: list[Any]) -> bool:
+        """Whether the frame lacks an image that it needs: the first partner, unless that one is dead and
+        something else tells how far things are."""
+        if not partners or partners[0] is not None:
+            return False
+        other = partners[-1] is not None or (self._imu is not None and not self._dead(self._imu))
+        return not (other and self._dead(self._partners[0]))
 
     def _settled(self, stamp: int) -> bool:
         """Whether waiting longer can change nothing in the frame at `stamp`, or has lasted too long."""
@@ -195,6 +210,8 @@ class _Merger:
         """The partner is there, or it will not come any more."""
         if buffer.reached > stamp + self._tolerance:
             return True
+        if self._dead(buffer):
+            return True
         at = bisect_left(buffer.items, stamp - self._tolerance, key=itemgetter(0))
         return at < len(buffer.items) and buffer.items[at][0] <= min(stamp + self._tolerance, buffer.reached)
 
@@ -202,7 +219,11 @@ class _Merger:
         imu = self._imu
         if imu is None or imu.reached >= stamp:
             return True
-        return self._now - max(imu.newest, self._first) > _DEAD * self._wait
+        return self._dead(imu)
+
+    def _dead(self, buffer: _Buffer) -> bool:
+        """It is silent for so long that nobody waits for it any more."""
+        return buffer.died or self._now - max(buffer.newest, self._first) > _DEAD * self._wait
 
     def _partner(self, buffer: _Buffer, stamp: int) -> Any | None:
         """The first image within the tolerance. Those before it have missed their frame."""

@@ -24,10 +24,14 @@ _TICK_S = 0.1
 _REMEMBERED = 1000  # images whose arrival can be asked for
 _MANY = 30  # stamps of the host's clock in one stream; fewer are exceptions
 _SAID = {
-    Action.RESET: "the IMU is silent; the camera is reset once",
-    Action.VISION_ONLY: "the IMU stays silent; VISION_ONLY: goes on with images alone",
-    Action.HEARD_AGAIN: "the IMU is heard again",
+    Action.RESET: "{silent}: silent; the camera is reset once",
+    Action.GO_WITHOUT: "{silent}: still silent; {health}: goes on without",
+    Action.HEARD_AGAIN: "{silent}: heard again",
 }
+_IN_VAIN = (
+    "camera {serial}: {silent}: no sample came, nor after a hardware reset; unplug it and plug it in again, "
+    "with another cable or port if need be"
+)
 
 
 class Device(Protocol):
@@ -74,6 +78,7 @@ class Feed:
         self.serial, self.intake = serial, Intake(rates_hz, max_jump_s)
         self._max_jump_s = max_jump_s
         self._watchdog = watchdog(time.monotonic_ns(), rates_hz)
+        self.in_vain = False  # what is needed has never come
         self._tick = Every(_TICK_S)
         self._stop = threading.Event()
         self._device: Device | None = None
@@ -95,7 +100,8 @@ class Feed:
         return rig
 
     def measurements(self) -> Iterator[Measurement]:
-        """Until it is stopped; what has come by then is still given."""
+        """Until it is stopped; what has come by then is still given. Raises ShareError where a stream that is
+        needed never comes (`in_vain`)."""
         try:
             while not self.queue.done:
                 self._guard()
@@ -170,17 +176,26 @@ class Feed:
         self._do(self._watchdog.tick(time.monotonic_ns()))
 
     def _do(self, action: Action) -> None:
+        told = {
+            "silent": ", ".join(self._watchdog.silent),
+            "health": self.health.value,
+            "serial": self.serial,
+        }
         if action in _SAID:
-            self._say(_SAID[action])
+            self._say(_SAID[action].format(**told))
         if action is Action.RESET and self._device is not None:
             self._device.reset()
             self._device = None
         if action is Action.RECONNECT:
             self._reconnect()
+        if action is Action.GIVE_UP:
+            self.in_vain = True
+            raise ShareError(_IN_VAIN.format(**told))
 
     def _reconnect(self) -> None:
         if self._device is not None:
-            self._say(f"no more samples come; looks for camera {self.serial} until it is back")
+            silent = ", ".join(self._watchdog.silent)
+            self._say(f"{silent}: no more samples come; looks for camera {self.serial} until it is back")
             self._device.stop()
             self._device = None
         self._attempts += 1

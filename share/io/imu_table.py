@@ -14,8 +14,8 @@ from share.io.session import is_session, read_session
 from share.types import F64, I64, ImuBatch
 
 _KINDS = (
-    "an .mcap recording, SESSION/NAME, a folder with imu0/data.csv (EuRoC/ASL), or such a data.csv: "
-    "t[ns],wx,wy,wz,ax,ay,az"
+    "an .mcap recording, one of the RealSense SDK (.db3), SESSION/NAME, a folder with imu0/data.csv "
+    "(EuRoC/ASL), or such a data.csv: t[ns],wx,wy,wz,ax,ay,az"
 )
 
 
@@ -38,6 +38,8 @@ def read_imu(spec: str, told: Callable[[int, int], None] = lambda done, total: N
     path = Path(spec)
     if path.suffix == ".mcap" and path.is_file():
         return _table(path.stem, *_of_mcap(path, told), serial=_serial(path))
+    if path.suffix == ".db3" and path.is_file():
+        return _of_db3(path, told)
     if is_session(path.parent) and not path.exists():
         recording = read_session(path.parent).recording(path.name)
         return _table(path.name, *_of_mcap(recording, told), serial=_serial(recording))
@@ -68,6 +70,16 @@ def _serial(path: Path) -> str | None:
     from share.io.mcap.reader import own_serial
 
     return own_serial(McapFile(path))
+
+
+def _of_db3(path: Path, told: Callable[[int, int], None]) -> ImuTable:
+    from share.io.realsense.db3 import Db3
+    from share.io.realsense.recorded import recorded_imu  # rosbags only where it is needed
+
+    told(0, 1)
+    stamps_ns, values = recorded_imu(path)
+    told(1, 1)
+    return _table(path.stem, stamps_ns, values, serial=Db3(path).serial)
 
 
 def _table(name: str, stamps_ns: I64, values: F64, serial: str | None = None) -> ImuTable:

@@ -79,8 +79,7 @@ def open_source(spec: str, calib: str | None = None, frames: slice | None = None
             return reader.open(path, calibration, frames)
     _existing(path, "SOURCE")
     if path.name.endswith(".mcap.part"):
-        saves = f"`share dataset recover {path} --out {path.with_suffix('')}` saves it"
-        raise UsageError(f"{path}: was not closed; {saves}")
+        raise _unclosed(path)
     if is_session(path):
         agents = ", ".join(str(path / name) for name in read_session(path).agents)
         raise UsageError(f"{spec}: is a session; name one of its agents: {agents}")
@@ -95,5 +94,13 @@ def calibration_of(calib: str | None) -> Calibration | None:
 
 def _existing(path: Path, what: str) -> Path:
     if not path.exists():
+        part = path.with_name(path.name + ".part")
+        if part.exists():
+            raise _unclosed(part)
         raise UsageError(f"{what} {path}: no such file or folder")
     return path
+
+
+def _unclosed(part: Path) -> UsageError:
+    saves = f"`share dataset recover {part} --out {part.with_suffix('')}` saves it"
+    return UsageError(f"{part}: was not closed, or is being recorded; {saves}")

@@ -19,6 +19,7 @@ from share.errors import ShareError, UsageError
 from share.io.calibration import Calibration
 from share.io.feed import Feed
 from share.io.feed_status import FeedStatus
+from share.io.files import writing
 from share.io.live import given_rig
 from share.io.mcap.recorder import Recorder, left_over, part_of
 
@@ -92,15 +93,29 @@ class Capture:
         except BaseException as error:
             self._error = self._error or error
         self._feed.stop()
-        writer.join()
-        if self._error is not None:
+        self._wait(writer, recorder)
+        if self._error is not None and not self._feed.in_vain:
             recorder.abort()
-        elif not self._written:
+            self._unclosed(recorder)
+        elif self._feed.in_vain or not self._written:
             recorder.abort()
             recorder.part.unlink()
-            self._error = ShareError(f"camera {self._feed.serial}: {self._came()}; nothing was recorded")
+            nothing = f"camera {self._feed.serial}: {self._came()}"
+            self._error = ShareError(f"{self._error or nothing}; nothing was recorded")
         else:
             recorder.close()
+
+    def _wait(self, writer: threading.Thread, recorder: Recorder) -> None:
+        """Until all that came is written, or a person does not want to wait for that."""
+        try:
+            writer.join()
+        except BaseException:
+            self._unclosed(recorder)
+            raise
+
+    def _unclosed(self, recorder: Recorder) -> None:
+        out, part = self._out, recorder.part
+        self._say(f"{part}: is not closed; `share dataset recover {part} --out {out}` saves what it has")
 
     def _came(self) -> str:
         """What came where nothing could be written: not all of an IMU, or nothing."""
@@ -123,7 +138,9 @@ class Capture:
     def _loop(self, seconds: float | None) -> None:
         began = time.monotonic()
         while not self._stop.wait(_TICK_S):
-            if shutil.disk_usage(self._out.parent).free < self._free_least:
+            with writing(self._out):  # a disk that was pulled out
+                free = shutil.disk_usage(self._out.parent).free
+            if free < self._free_least:
                 self.ended = "disk almost full"
                 self._say(f"{self._out.parent}: less than {self._free_least / 1e9:g} GB left; ends here")
                 return
@@ -131,13 +148,12 @@ class Capture:
                 self.ended = "time is over"
                 return
             if time.monotonic() - self._shown[0] >= _SHOW_S:
-                self._show(self._status())
+                self._show(self._status(free))
 
-    def _status(self) -> Status:
+    def _status(self, free: int) -> Status:
         (then, size), now = self._shown, time.monotonic()
         self._shown = (now, _size(self._out))
         mb_s = (self._shown[1] - size) / (now - then) / 1e6
-        free = shutil.disk_usage(self._out.parent).free
         left = max(0.0, free - self._free_least)
         minutes = left / (mb_s * 1e6) / 60 if mb_s > 0 else float("inf")
         return Status(self._feed.status(), mb_s, free / 1e9, minutes)

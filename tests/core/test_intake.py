@@ -41,6 +41,19 @@ def test_a_clock_that_began_anew_goes_on_as_far_as_the_hosts_did() -> None:
     assert intake.stretches == 2
 
 
+def test_what_was_left_over_from_before_a_reconnection_is_left_out() -> None:
+    intake = Intake(RATES, 10.0)
+    told = stamps(
+        intake,
+        image(900 * MS, arrived_ns=5000 * MS),
+        image(3 * MS, arrived_ns=7000 * MS, epoch=1),
+        image(933 * MS, arrived_ns=7001 * MS),
+        image(36 * MS, arrived_ns=7030 * MS, epoch=1),
+    )
+    assert told == [900 * MS, 2900 * MS, 2933 * MS]
+    assert intake.stretches == 2
+
+
 HOST_NS = 1_760_000_000_000 * MS  # of the host's clock
 
 

@@ -172,9 +172,43 @@ def test_a_missing_partner_drops_the_frame():
 
 
 def test_a_dead_cam1_or_cam0_holds_nothing_up():
-    only = [m for m in recording(200) if m.stream != "cam1"]
-    assert run(only)[1].unpaired == 200
+    blind = [m for m in recording(200) if m.stream == "cam0"]
+    assert run(blind)[1].unpaired == 200
     assert run([m for m in recording(200) if m.stream != "cam0"])[1].unpaired == 200
+
+
+def test_a_cam1_that_died_is_done_without_where_the_imu_is_alive():
+    died = [m for m in recording(200) if m.stream != "cam1" or not 50 * STEP < m.stamp_ns < 150 * STEP]
+    bundles, counters = run(died)
+    alone = [b.stamp_ns // STEP for b in bundles if b.image1 is None]
+    assert alone == list(range(151 - len(alone), 151))  # once that is certain, until it is back
+    assert 70 < len(alone) <= 85
+    assert [b.stamp_ns // STEP for b in bundles if b.image1] == [*range(51), *range(151, 200)]
+    assert counters.unpaired == 101 - len(alone)
+    assert run([m for m in died if m.stamp_ns < 140 * STEP])[0][-1].stamp_ns == 139 * STEP
+    assert run([m for m in died if m.stream != "imu"])[1].frames == 100  # none without its partner
+
+
+def test_depth_beside_stereo_may_be_missing_or_die_and_costs_no_frame():
+    times = STEP * np.arange(200)
+    kept = times[(times != 5 * STEP) & (times < 100 * STEP)]
+    ordered, fed, late = in_order(recording(200) + images("depth", kept)), [], []
+
+    def feed():
+        for m in ordered:
+            fed.append(m.stamp_ns)
+            yield m
+
+    streams = ("cam0", "cam1", "depth", "imu")
+    out = []
+    for b in sequence(feed(), streams, RATE, CONFIG, SequencerCounters()):
+        out.append(b)
+        late.append(fed[-1] - b.stamp_ns)
+    assert [b.stamp_ns for b in out] == times.tolist()
+    assert [b.stamp_ns for b in out if b.depth is not None] == kept.tolist()
+    assert all(b.image1 is not None and b.gap_ns == 0 for b in out)
+    assert max(late[:5]) == 0
+    assert max(late[130:-1]) == 0  # a dead stream is not waited for
 
 
 def test_a_silent_imu_does_not_end_the_run():

@@ -32,15 +32,23 @@ def test_nothing_is_asked_while_it_warms_up() -> None:
 def test_a_silent_imu_is_reset_once_and_then_done_without() -> None:
     dog = Watchdog(0, ALL)
     assert run(dog, 0, 5000, *ALL) == []
-    assert run(dog, 5000, 6100, "cam0", "cam1") == [Action.RESET]
-    assert dog.health is Health.AWAY
+    assert run(dog, 5000, 7100, "cam0", "cam1") == [Action.RESET]
+    assert (dog.health, dog.silent) == (Health.AWAY, IMU)
     dog.connected(8000 * MS)
-    assert run(dog, 8000, 20_000, "cam0", "cam1") == [Action.VISION_ONLY]
-    assert dog.health is Health.VISION_ONLY
+    assert run(dog, 8000, 20_000, "cam0", "cam1") == [Action.GO_WITHOUT]
+    assert (dog.health, dog.silent) == (Health.VISION_ONLY, IMU)
     assert run(dog, 20_000, 22_000, *ALL) == [Action.HEARD_AGAIN]
-    assert dog.health is Health.OK
-    assert run(dog, 22_000, 24_000, "cam0", "cam1") == [Action.VISION_ONLY]
+    assert (dog.health, dog.silent) == (Health.OK, IMU)
+    assert run(dog, 22_000, 25_000, "cam0", "cam1") == [Action.GO_WITHOUT]
     assert dog.resets == 1
+
+
+def test_after_its_reset_a_camera_is_given_time() -> None:
+    dog = Watchdog(0, ALL)
+    run(dog, 0, 5000, *ALL)
+    assert run(dog, 5000, 7100, "cam0", "cam1")[-1] is Action.RESET
+    assert run(dog, 7100, 9900) == []
+    assert run(dog, 9900, 11_000) == [Action.RECONNECT]
 
 
 def test_a_lost_camera_is_looked_for_once_a_second_until_it_is_there() -> None:
@@ -52,46 +60,104 @@ def test_a_lost_camera_is_looked_for_once_a_second_until_it_is_there() -> None:
     assert dog.resets == 0
 
 
-def test_an_unplugged_camera_is_lost_and_not_reset_though_its_last_image_came_after_the_imu() -> None:
-    dog = Watchdog(0, ALL)
+@pytest.mark.parametrize("later_ms", [300, 900, 1400])
+def test_an_unplugged_camera_is_lost_and_not_reset_though_its_last_image_came_after_the_imu(
+    later_ms: int,
+) -> None:
+    dog, end_ms = Watchdog(0, ALL), 5000 + later_ms
     run(dog, 0, 5000, *ALL)
-    run(dog, 5000, 5300, "cam0", "cam1")  # what was still under way
-    assert run(dog, 5300, 6400) == [Action.RECONNECT]
+    assert run(dog, 5000, end_ms, "cam0", "cam1") == []  # what was still under way
+    assert run(dog, end_ms, end_ms + 1100) == [Action.RECONNECT]
     assert (dog.health, dog.resets) == (Health.AWAY, 0)
 
 
-def test_without_images_a_silent_imu_is_a_lost_camera_after_its_reset() -> None:
+def test_who_has_slept_knows_nothing_of_silence_but_who_is_always_late_judges() -> None:
+    dog = Watchdog(0, ALL)
+    run(dog, 0, 5000, *ALL)
+    assert dog.tick(30_000 * MS) is Action.NOTHING  # the computer was asleep
+    assert run(dog, 30_100, 31_000, *ALL) == []
+    late = [dog.tick(now * MS) for now in range(33_000, 37_000, 2000)]
+    assert late == [Action.NOTHING, Action.RECONNECT]
+
+
+def test_without_images_a_silent_imu_is_a_lost_camera() -> None:
     dog = Watchdog(0, IMU)
-    assert run(dog, 0, 5000) == [Action.RESET]
-    dog.connected(5000 * MS)
-    assert run(dog, 5000, 9500) == [Action.RECONNECT]
+    run(dog, 0, 5000, *IMU)
+    assert run(dog, 5000, 6200) == [Action.RECONNECT]
 
 
 @pytest.mark.parametrize("left", IMU)
 def test_half_an_imu_is_a_silent_one(left: str) -> None:
     dog = Watchdog(0, ALL)
     run(dog, 0, 5000, *ALL)
-    assert run(dog, 5000, 6100, "cam0", "cam1", left) == [Action.RESET]
+    assert run(dog, 5000, 7100, "cam0", "cam1", left) == [Action.RESET]
     dog.connected(8000 * MS)
-    assert run(dog, 8000, 20_000, "cam0", "cam1", left) == [Action.VISION_ONLY]
+    assert run(dog, 8000, 20_000, "cam0", "cam1", left) == [Action.GO_WITHOUT]
+    assert (dog.health, dog.silent) == (Health.VISION_ONLY, tuple(name for name in IMU if name != left))
     assert run(dog, 20_000, 22_000, *ALL) == [Action.HEARD_AGAIN]
 
 
 def test_half_an_imu_without_images_is_looked_for_after_its_reset() -> None:
     dog = Watchdog(0, IMU)
-    assert run(dog, 0, 5000, "gyro") == [Action.RESET]
-    dog.connected(5000 * MS)
-    assert run(dog, 5000, 9500, "gyro") == [Action.RECONNECT]
+    run(dog, 0, 5000, *IMU)
+    assert run(dog, 5000, 7100, "gyro") == [Action.RESET]
+    dog.connected(9000 * MS)
+    assert run(dog, 9000, 14_200, "gyro") == [Action.RECONNECT]
 
 
-@pytest.mark.parametrize("silent", ["cam0", "cam1", "depth"])
-def test_a_stream_of_images_that_is_silent_is_looked_for(silent: str) -> None:
-    streams = (*ALL, "depth")
+@pytest.mark.parametrize(
+    ("streams", "silent"),
+    [(ALL, ("cam0",)), (ALL, ("cam0", "cam1")), (ALL, ("cam1", "gyro")), (("cam0", "cam1"), ("cam1",))],
+)
+def test_what_cannot_be_done_without_is_reset_once_and_then_looked_for(
+    streams: tuple[str, ...], silent: tuple[str, ...]
+) -> None:
+    others = [name for name in streams if name not in silent]
     dog = Watchdog(0, streams)
     run(dog, 0, 5000, *streams)
+    assert run(dog, 5000, 7100, *others) == [Action.RESET]
+    for began in range(10_000, 80_000, 10_000):
+        dog.connected(began * MS)
+        assert run(dog, began, began + 5200, *others) == [Action.RECONNECT]
+    assert (dog.resets, dog.silent) == (1, silent)
+
+
+@pytest.mark.parametrize("silent", ["cam1", "depth"])
+def test_what_tells_distance_too_is_reset_once_and_then_done_without(silent: str) -> None:
+    streams = (*ALL, "depth")
     others = [name for name in streams if name != silent]
-    assert run(dog, 5000, 6100, *others) == [Action.RECONNECT]
-    assert dog.resets == 0
+    dog = Watchdog(0, streams)
+    assert run(dog, 0, 5200, *others) == [Action.RESET]
+    dog.connected(9000 * MS)
+    assert run(dog, 9000, 30_000, *others) == [Action.GO_WITHOUT]
+    assert (dog.health, dog.silent) == (Health.DEGRADED, (silent,))
+    assert run(dog, 30_000, 33_000, "cam0", "cam1", "depth") == [Action.HEARD_AGAIN, Action.GO_WITHOUT]
+    assert (dog.health, dog.silent) == (Health.VISION_ONLY, IMU)
+
+
+@pytest.mark.parametrize(
+    ("streams", "comes"),
+    [(ALL, ()), (ALL, IMU), (ALL, ("cam0",)), (("cam0", "cam1"), ("cam0",)), (IMU, IMU[:1])],
+)
+def test_what_is_needed_and_never_came_is_given_up_after_a_reset(
+    streams: tuple[str, ...], comes: tuple[str, ...]
+) -> None:
+    dog, asked = Watchdog(0, streams), []
+    for began in range(0, 40_000, 10_000):
+        dog.connected(began * MS)
+        asked += run(dog, began, began + (5200 if comes else 4200), *comes)
+        if Action.GIVE_UP in asked:
+            break
+    assert asked == [Action.RESET, Action.RECONNECT, Action.GIVE_UP]
+    assert dog.silent == tuple(name for name in streams if name not in comes)
+
+
+def test_a_camera_that_is_away_is_not_given_up() -> None:
+    dog = Watchdog(0, ALL)
+    run(dog, 0, 4000, *IMU)  # then it was pulled out, before anybody missed its eyes
+    for began in range(5_000, 60_000, 10_000):
+        assert Action.GIVE_UP not in run(dog, began, began + 9000)
+        dog.connected((began + 9000) * MS)
 
 
 def test_a_stream_that_nobody_expects_does_not_count() -> None:

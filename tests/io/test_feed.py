@@ -7,8 +7,10 @@ import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
+import pytest
+
 from share.core.intake import Sample
-from share.core.watchdog import Watchdog
+from share.core.watchdog import Health, Watchdog
 from share.errors import NotAttachedError, ShareError, UsageError
 from share.geometry.camera import Rig
 from share.io.feed import Feed
@@ -38,7 +40,7 @@ class Fake:
 
 
 def quick(now_ns: int, streams: Collection[str]) -> Watchdog:
-    return Watchdog(now_ns, streams, silent_ms=100, warm_up_ms=100, retry_ms=10)
+    return Watchdog(now_ns, streams, silent_ms=100, warm_up_ms=100, retry_ms=10, reset_ms=10)
 
 
 def wait(until: Callable[[], bool]) -> None:
@@ -66,19 +68,86 @@ def test_why_a_camera_is_still_away_is_said_once_unless_it_is_just_not_there() -
             raise answer
         return answer
 
+    first = answers[0]
+    assert isinstance(first, Fake)
     feed = Feed(connect, None, RATES, 10.0, said.append, Handover(), quick)
     feed.open()
+    first.sink(Sample("cam0", 10**9, None, time.monotonic_ns()))
     reader = threading.Thread(target=lambda: list(feed.measurements()), daemon=True)
     reader.start()
     wait(lambda: len(said) >= 4)
     feed.stop()
     reader.join(5)
     assert said[:4] == [
-        "no more samples come; looks for camera 0123 until it is back",
+        "cam0, accel, gyro: no more samples come; looks for camera 0123 until it is back",
         "cannot be opened: busy",
         "is on USB 2.1, too slow",
         "camera 0123 is connected again; a new stretch begins",
     ]
+
+
+@dataclass
+class Playing(Fake):
+    """It delivers some streams, from a thread of its own, until it is stopped."""
+
+    streams: tuple[str, ...] = ()
+
+    def start(self, sink: Callable[[Sample], None]) -> None:
+        self.sink, self._ended = sink, threading.Event()
+        threading.Thread(target=self._play, daemon=True).start()
+
+    def _play(self) -> None:
+        while not self._ended.wait(0.005):
+            for stream in self.streams:
+                now = time.monotonic_ns()
+                self.sink(Sample(stream, now, (0, 0, 0), now))
+
+    def stop(self) -> None:
+        self._ended.set()
+
+
+def test_a_stream_that_is_needed_and_never_comes_ends_it_in_a_line_after_one_reset() -> None:
+    said: list[str] = []
+    feed = Feed(
+        lambda serial, epoch: Playing(streams=("accel", "gyro")),
+        None,
+        RATES,
+        10.0,
+        said.append,
+        Handover(),
+        quick,
+    )
+    feed.open()
+    with pytest.raises(
+        ShareError, match="camera 0123: cam0: no sample came, nor after a hardware reset; unplug"
+    ):
+        list(feed.measurements())
+    assert said == [
+        "cam0: silent; the camera is reset once",
+        "camera 0123 is connected again; a new stretch begins",
+        "cam0: no more samples come; looks for camera 0123 until it is back",
+        "camera 0123 is connected again; a new stretch begins",
+    ]
+    assert feed.in_vain
+
+
+def test_depth_beside_stereo_is_done_without_and_welcome_again() -> None:
+    said: list[str] = []
+    rates = RATES | {"cam1": 30.0, "depth": 30.0}
+    camera = Playing(streams=("cam0", "cam1", "accel", "gyro"))
+    feed = Feed(lambda serial, epoch: camera, None, rates, 10.0, said.append, Handover(), quick)
+    feed.open()
+    reader = threading.Thread(target=lambda: list(feed.measurements()), daemon=True)
+    reader.start()
+    wait(lambda: feed.health is Health.DEGRADED)
+    assert said[-1] == "depth: still silent; DEGRADED: goes on without"
+    assert str(feed.status()).startswith("DEGRADED  ")
+    camera.streams = (*camera.streams, "depth")
+    wait(lambda: feed.health is Health.OK)
+    assert said[-1] == "depth: heard again"
+    feed.stop()
+    reader.join(5)
+    assert (feed.report()["resets"], feed.in_vain) == (1, False)
 
 
 def test_gaps_are_told_by_the_rates_that_the_camera_has() -> None:

@@ -123,7 +123,9 @@ def test_a_rotation_of_the_sdk_is_read_column_by_column() -> None:
 
 
 def test_a_mode_that_the_camera_lacks_is_named(camera: SoftwareCamera) -> None:
-    with pytest.raises(UsageError, match=r"cam0 \(848x480@30\), cam1 \(848x480@30\); choose another mode"):
+    with pytest.raises(
+        UsageError, match=r"cam0 \(848x480@30\), cam1 \(848x480@30\); choose .* infrared has 640x480@30"
+    ):
         RealSense(Wanted(profile("d435i", "848x480@30")), context=camera.context)
     with pytest.raises(UsageError, match=r"does not offer depth"):
         RealSense(Wanted(D435I, depth=True), context=camera.context)
@@ -151,6 +153,67 @@ def test_the_rate_of_the_gyroscope_that_is_read_is_in_the_rig() -> None:
 def test_an_imu_with_none_of_the_rates_is_named() -> None:
     with pytest.raises(UsageError, match=r"does not offer accel \(250 or 200 or 100 or 63 Hz\)"):
         RealSense(Wanted(D435I), context=SoftwareCamera(rs, accel_hz=(50,)).context)
+
+
+def test_an_emitter_that_another_program_left_on_is_switched_off_and_no_longer_alternates(
+    camera: SoftwareCamera,
+) -> None:
+    for option in (rs.option.emitter_enabled, rs.option.emitter_on_off):
+        told = rs.option_range()
+        told.min, told.max, told.step, told.default = 0, 1, 1, 1
+        camera.stereo.add_option(option, told, True)
+        camera.stereo.set_option(option, 1)
+    read(camera, 0, lambda: None)
+    assert camera.stereo.get_option(rs.option.emitter_enabled) == 0
+    assert camera.stereo.get_option(rs.option.emitter_on_off) == 0
+
+
+def test_dots_of_an_emitter_that_should_be_off_are_said_once(camera: SoftwareCamera) -> None:
+    said, got = list[str](), list[Sample]()
+    with RealSense(Wanted(D435I), context=camera.context, say=said.append) as device:
+        device.start(got.append)
+        for k in range(4):
+            camera.stereo.set_metadata(rs.frame_metadata_value.frame_laser_power_mode, int(k > 1))
+            camera.image(0, 1_000_000 + 33_333 * k, np.zeros((480, 640), np.uint8))
+            time.sleep(0.05)
+        assert len(got) == 4
+    assert [text.partition(":")[0] for text in said] == ["the emitter is on though it was switched off"]
+
+
+def test_an_interleaved_emitter_that_does_not_alternate_is_said(camera: SoftwareCamera) -> None:
+    said, got = list[str](), list[Sample]()
+    interleaved = replace(D435I, device=replace(FACTS, emitter="interleaved"))
+    with RealSense(Wanted(interleaved), context=camera.context, say=said.append) as device:
+        device.start(got.append)
+        camera.stereo.set_metadata(rs.frame_metadata_value.frame_laser_power_mode, 1)
+        for k in range(40):
+            camera.image(0, 1_000_000 + 33_333 * k, np.zeros((480, 640), np.uint8))
+            time.sleep(0.01)
+        time.sleep(0.1)
+    assert got == []
+    assert said == [
+        "emitter interleaved: all images have dots, so none is kept; use a profile with emitter off"
+    ]
+
+
+def test_a_frame_that_cannot_be_read_is_said_once_and_those_after_it_are_read(
+    camera: SoftwareCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said, got, as_sample = list[str](), list[Sample](), adapter.to_sample
+
+    def sometimes(sdk: Any, frame: Any, *more: Any) -> Sample:
+        if frame.frame_number in (1, 2):
+            raise RuntimeError("null pointer passed for argument")
+        return as_sample(sdk, frame, *more)
+
+    monkeypatch.setattr(adapter, "to_sample", sometimes)
+    with RealSense(Wanted(D435I), context=camera.context, say=said.append) as device:
+        device.start(got.append)
+        for k in range(4):
+            camera.image(0, 1_000_000 + 33_333 * k, np.zeros((480, 640), np.uint8))
+            time.sleep(0.05)
+    assert [sample.number for sample in got] == [0, 3]
+    assert said == ["a frame cannot be read: null pointer passed for argument"]
 
 
 def test_without_a_camera_one_line_says_so() -> None:

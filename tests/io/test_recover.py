@@ -162,8 +162,9 @@ def test_sigkill_leaves_a_file_that_can_be_recovered(tmp_path):
     process.wait()
     process.stdout.close()
     assert os.listdir(tmp_path) == ["walk.mcap.part"]
-    with pytest.raises(UsageError, match=f"was not closed; `share dataset recover {out}.part --out {out}`"):
-        open_source(str(out) + ".part")
+    for given in (f"{out}.part", str(out)):
+        with pytest.raises(UsageError, match=f"recorded; `share dataset recover {out}.part --out {out}`"):
+            open_source(given)
     recover(tmp_path / "walk.mcap.part", out)
     stamps = open_source(str(out)).stamps()["cam0"]
     assert last - stamps[-1] <= 10**9 + STEP_NS

@@ -1,14 +1,20 @@
-"""A process that captures from a camera of software until it is ended. Argument: the recording."""
+"""A process that captures from a camera of software until it is ended. Argument: the recording.
+CHILD_SLOW_DISK_S in its environment: what an image of cam0 costs the disk."""
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
+import time
 
 import numpy as np
 import pyrealsense2 as rs
 from software_camera import SoftwareCamera
 from software_share import share
+
+from share.core.measurement import Measurement
+from share.io.mcap.recorder import Recorder
 
 CAMERA = SoftwareCamera(rs)
 
@@ -25,6 +31,15 @@ def play(ended: threading.Event) -> None:
         if ended.wait(0.033):
             return
 
+
+if pause_s := float(os.environ.get("CHILD_SLOW_DISK_S", 0)):
+    write = Recorder.write
+
+    def slow(self: Recorder, measurement: Measurement, log_ns: int | None = None) -> None:
+        time.sleep(pause_s if measurement.stream == "cam0" else 0)
+        write(self, measurement, log_ns)
+
+    Recorder.write = slow  # type: ignore[method-assign]
 
 share(
     ["capture", "--profile", "d435i", "--min-free-gb", "0", "--out", sys.argv[1], *sys.argv[2:]], CAMERA, play

@@ -28,9 +28,10 @@ ENV = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, CHILD.parents[1:3]))
 
 
 @contextmanager
-def capturing(out: Path, *more: str) -> Iterator[subprocess.Popen[str]]:
+def capturing(out: Path, *more: str, slow: bool = False) -> Iterator[subprocess.Popen[str]]:
     command = [sys.executable, str(CHILD), str(out), *more]
-    child = subprocess.Popen(command, env=ENV, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    env = ENV | ({"CHILD_SLOW_DISK_S": "0.2"} if slow else {})
+    child = subprocess.Popen(command, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
         yield child
     finally:
@@ -77,6 +78,24 @@ def test_a_terminal_that_is_closed_costs_nothing_of_the_recording(tmp_path: Path
         child.wait()
     assert len(open_source(str(tmp_path / "a.mcap")).stamps()["cam0"]) > 10
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_who_does_not_want_to_wait_for_the_disk_is_told_how_to_save_it(tmp_path: Path) -> None:
+    part = tmp_path / "a.mcap.part"
+    with capturing(tmp_path / "a.mcap", slow=True) as child:
+        grown(part, 3_000_000)
+        child.send_signal(signal.SIGINT)
+        time.sleep(0.3)
+        child.send_signal(signal.SIGINT)
+        told, complaints = child.communicate(timeout=20)
+    assert (child.returncode, told) == (130, "")
+    assert complaints.splitlines() == [
+        f"share: {part}: is not closed; `share dataset recover {part} --out {tmp_path / 'a.mcap'}` "
+        "saves what it has",
+        "share: interrupted",
+    ]
+    recover(part, tmp_path / "b.mcap")
+    assert len(open_source(str(tmp_path / "b.mcap")).stamps()["cam0"]) > 2
 
 
 def test_what_a_power_cut_leaves_is_mended(tmp_path: Path) -> None:

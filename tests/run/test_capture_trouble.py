@@ -14,16 +14,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from capture_bench import PICTURE, WANTED, Bench
+from capture_bench import PICTURE, WANTED, Bench, Fake, quick
 
+from share.config import Config
+from share.core.sequencer import SequencerCounters
+from share.core.watchdog import Health
 from share.io.imu_table import read_imu
 from share.io.mcap.recover import recover
 from share.io.realsense.streams import Wanted
 from share.io.source import open_source
+from share.run.pipeline import frames_of
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 
 CHILD = Path(__file__).with_name("capture_child.py")
+MOST_US = 60_000_000  # of the camera's time, for what is waited for
 ENV = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, CHILD.parents[1:3]))}  # tests, and the checkout
 
 
@@ -93,6 +98,41 @@ def test_of_an_interleaved_emitter_the_images_without_dots_are_recorded(tmp_path
     assert (told["gaps"], told["missing"]) == (0, 0)
 
 
+@pytest.mark.parametrize(("missing", "eyes"), [("depth", (0, 1)), ("cam1", (0,))])
+def test_what_tells_distance_too_and_never_comes_costs_one_reset_and_the_rest_goes_on(
+    tmp_path: Path, missing: str, eyes: tuple[int, ...]
+) -> None:
+    now, wanted = 1_000_000, replace(WANTED, depth=missing == "depth")
+    with Bench(tmp_path / "a.mcap", quick, wanted) as bench:
+        while bench.source.health is not Health.DEGRADED:
+            now = bench.feed(now, 5, eyes=eyes)
+            assert now < MOST_US
+        bench.feed(now, 20, eyes=eyes)
+        bench.run.stop()
+    assert Fake.resets == 1
+    assert bench.said[-1] == f"{missing}: still silent; DEGRADED: goes on without"
+    assert bench.report["health"] == "DEGRADED"
+    source, counters = open_source(str(tmp_path / "a.mcap")), SequencerCounters()
+    assert source.notes == (f"has no images of {missing}: done without",)
+    assert source.rig.kind == ("stereo+imu" if missing == "depth" else "mono+imu")
+    frames = list(frames_of(source, Config(), counters))
+    assert len(frames) >= bench.report["streams"]["cam0"]["samples"] - 2  # a pair cut by the reset
+
+
+def test_eyes_that_never_see_end_it_in_a_line_after_one_reset(tmp_path: Path) -> None:
+    now = 1_000_000
+    with Bench(tmp_path / "a.mcap", quick) as bench:
+        while bench.thread.is_alive():
+            now = bench.feed(now, 5, eyes=())
+            assert now < MOST_US
+    assert bench.error == (
+        "camera 0123: cam0, cam1: no sample came, nor after a hardware reset; unplug it and plug it in "
+        "again, with another cable or port if need be; nothing was recorded"
+    )
+    assert (Fake.resets, bench.connected) == (1, 3)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_disk_that_fills_ends_the_recording_in_a_line_and_what_was_written_is_saved(tmp_path: Path) -> None:
     most = 15_000_000  # bytes; the kernel refuses more, as a full disk does
     child = subprocess.run(
@@ -105,7 +145,11 @@ def test_a_disk_that_fills_ends_the_recording_in_a_line_and_what_was_written_is_
     )
     reason = os.strerror(errno.EFBIG)
     assert child.returncode == 1
-    assert child.stderr == f"share: {tmp_path / 'a.mcap'}: cannot be written: {reason}\n"
+    out = tmp_path / "a.mcap"
+    assert child.stderr.splitlines() == [
+        f"share: {out}.part: is not closed; `share dataset recover {out}.part --out {out}` saves what it has",
+        f"share: {out}: cannot be written: {reason}",
+    ]
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap.part"]
     recover(tmp_path / "a.mcap.part", tmp_path / "b.mcap")
     assert len(open_source(str(tmp_path / "b.mcap")).stamps()["cam0"]) > 15

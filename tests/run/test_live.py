@@ -137,7 +137,7 @@ def test_a_camera_that_was_unplugged_is_tracked_on_with_its_new_clock(plain_sess
 
     def plugged() -> None:
         time.sleep(0.2)
-        room.play()
+        room.play(room.taken(feed))
         room.there = False
         wait_for(heard("looks for camera"))
         time.sleep(0.3)
@@ -161,5 +161,6 @@ def test_a_camera_that_was_unplugged_is_tracked_on_with_its_new_clock(plain_sess
 
 def wait_for(what: Callable[[], bool]) -> None:
     until = time.monotonic() + 20
-    while not what() and time.monotonic() < until:
+    while not what():
+        assert time.monotonic() < until
         time.sleep(0.02)

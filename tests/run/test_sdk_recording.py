@@ -16,6 +16,7 @@ from software_camera import BASELINE, SoftwareCamera
 
 from share.config import Config
 from share.geometry import se3
+from share.io.imu_table import read_imu
 from share.io.profile import profile
 from share.io.realsense.camera import RealSense
 from share.io.realsense.streams import Wanted
@@ -117,6 +118,28 @@ def test_it_is_converted_and_told_of(
     stamps = converted.stamps()
     assert converted.serial == "0123"
     np.testing.assert_array_equal(stamps["cam0"], open_source(str(path)).stamps()["cam0"][5:15])
+
+
+def test_its_imu_is_calibrated_as_that_of_any_recording(
+    stereo: tuple[RoomCamera, Path], share: Callable[..., Done], tmp_path: Path
+) -> None:
+    _, path = stereo
+    share("dataset", "convert", path, "--out", tmp_path / "a.mcap")
+    ours, converted = read_imu(str(path)), read_imu(str(tmp_path / "a.mcap"))
+    assert (ours.name, ours.dropped, len(ours.imu)) == ("walk", 0, 1199)
+    np.testing.assert_array_equal(ours.imu.stamps_ns, converted.imu.stamps_ns)
+    np.testing.assert_array_equal(ours.imu.gyro, converted.imu.gyro)
+    np.testing.assert_array_equal(ours.imu.accel, converted.imu.accel)
+
+
+def test_without_an_accelerometer_there_is_no_imu_to_calibrate(
+    share: Callable[..., Done], tmp_path: Path
+) -> None:
+    camera = SoftwareCamera(rs)
+    record(camera, tmp_path / "a.db3", lambda: [camera.turn(10**6 + k * 2500, 0, 0, 0) for k in range(9)])
+    done = share("calibrate", "imu", tmp_path / "a.db3", "--out", tmp_path / "out")
+    assert (done.code, done.out, done.err.count("\n")) == (1, "", 1)
+    assert "a.db3: has no" in done.err
 
 
 def test_a_file_that_is_none_is_said_in_a_line(share: Callable[..., Done], tmp_path: Path) -> None:

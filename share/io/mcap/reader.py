@@ -7,6 +7,7 @@ rig is our own record of it, else CameraInfo and /tf_static; --calib goes before
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -58,14 +59,15 @@ class McapSource(Source):
         rig = calibration.rig if calibration else own
         if rig is None:
             raise ConfigError(f"{file.path}: carries no calibration; give one with --calib")
-        self.name, self.rig = file.path.stem, _fit(rig, topics, file.path)
+        shown = rig if calibration else _seen(rig, topics)
+        self.name, self.rig = file.path.stem, _fit(shown, topics, file.path)
         self._file, self._own, self.serial = file, own, own_serial(file)
         cameras = ros_rig.cameras(self.rig)
         used = {s for s in topics if s in cameras or (s == IMU and self.rig.imu)}
         self._topics = {s: topics[s] for s in used}
         self.notes = tuple(
             f"{topics[s]} is not used: the calibration has no {s}" for s in topics if s not in used
-        )
+        ) + tuple(f"has no images of {s}: done without" for s in ros_rig.cameras(rig) if s not in cameras)
         if calibration and (wrong := of_another(calibration.serials, self.serial)):
             self.notes += (wrong,)
         self._span = self._find_span(frames)
@@ -246,6 +248,17 @@ def _camera_info(file: McapFile, topic: str) -> Any | None:
         return None
     first = next(file.messages([name]), None)
     return None if first is None else ros.decode(first[2], ros.CAMERA_INFO)
+
+
+def _seen(rig: Rig, topics: dict[str, str]) -> Rig:
+    """The rig that a recording carries, less a partner of cam0 that a broken camera never delivered, if
+    something else that was recorded tells how far things are."""
+    have = [s for s in (CAM1, DEPTH, IMU) if s in topics]
+    if CAM1 not in topics and have:
+        rig = replace(rig, cam1=None, T_cam1_cam0=None)
+    if DEPTH not in topics and have:
+        rig = replace(rig, depth=None, T_depth_cam0=None)
+    return rig
 
 
 def _fit(rig: Rig, topics: dict[str, str], path: Path) -> Rig:

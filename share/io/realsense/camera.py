@@ -27,6 +27,9 @@ _UNKNOWN_DOTS = (
     "emitter interleaved: images do not tell which of them have dots, so all are kept: kernel patch missing, "
     "see docs/capture.md"
 )
+_DOTS = "the emitter is on though it was switched off: its dots spoil tracking; plug the camera in anew"
+_MANY = 30  # images with dots and none without: it does not alternate
+_NEVER_DARK = "emitter interleaved: all images have dots, so none is kept; use a profile with emitter off"
 
 Sink = Callable[[Sample], None]
 
@@ -57,7 +60,8 @@ class RealSense:
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self.lit = 0
-        self._told = False  # that nobody knows which images have dots
+        self._dark = False  # whether an image without dots came
+        self._told = set[str]()
 
     @property
     def serial(self) -> str:
@@ -138,35 +142,56 @@ class RealSense:
         """Options of a sensor, each where it has it: emitter by the profile, stamps of the device."""
         option, emitter = self._rs.option, self._wanted.profile.device.emitter
         dots = {
-            "off": {option.emitter_enabled: 0},
+            "off": {option.emitter_on_off: 0, option.emitter_enabled: 0},  # others may have left it on
             "on": {option.emitter_enabled: 1, option.emitter_on_off: 0},
             "interleaved": {option.emitter_enabled: 1, option.emitter_on_off: 1},
             "none": {},
         }[emitter]
         for name, value in ({option.global_time_enabled: 0} | dots).items():
-            if sensor.supports(name):
+            if not sensor.supports(name):
+                continue
+            try:
                 sensor.set_option(name, value)
+            except RuntimeError:
+                if name != option.emitter_on_off or value:  # not to alternate is usual, and dots are said
+                    raise
 
     def _pump(self, queue: Any, sink: Sink, depth_unit_m: float) -> None:
         while not self._stop.is_set():
             there, frame = queue.try_wait_for_frame(_WAIT_MS)
             if not there:
                 continue
-            sample = to_sample(self._rs, frame, depth_unit_m, time.monotonic_ns(), self._epoch)
-            if self._wanted.interleaved and sample.stream in (CAM0, CAM1):
-                if self._lit(frame):
-                    self.lit += 1
-                    continue
-                sample = replace(sample, number=None)  # it counts those with dots too, which are not missing
-            sink(sample)
+            try:
+                sample = to_sample(self._rs, frame, depth_unit_m, time.monotonic_ns(), self._epoch)
+                wanted = self._without_dots(sample, frame)
+            except RuntimeError as error:  # of this frame; where all are so, the stream is silent
+                self._once(f"a frame cannot be read: {str(error).partition(chr(10))[0]}")
+                continue
+            if wanted is not None:
+                sink(wanted)
 
-    def _lit(self, frame: Any) -> bool:
-        """Whether an image is known to have dots."""
+    def _without_dots(self, sample: Sample, frame: Any) -> Sample | None:
+        """The sample, None for an image that has dots where others come without."""
+        emitter = self._wanted.profile.device.emitter
+        if sample.stream not in (CAM0, CAM1) or emitter not in ("interleaved", "off"):
+            return sample
         dots = has_dots(self._rs, frame)
-        if dots is None and not self._told:
-            self._told = True
-            self._say(_UNKNOWN_DOTS)
-        return bool(dots)
+        if emitter == "off":
+            if dots:
+                self._once(_DOTS)
+            return sample
+        if dots is None:
+            self._once(_UNKNOWN_DOTS)
+        self.lit, self._dark = self.lit + bool(dots), self._dark or not dots
+        if self.lit >= _MANY and not self._dark:
+            self._once(_NEVER_DARK)
+        # the number counts those with dots too, which are not missing
+        return None if dots else replace(sample, number=None)
+
+    def _once(self, text: str) -> None:
+        if text not in self._told:
+            self._told.add(text)
+            self._say(text)
 
 
 def _depth_unit(one: Opened) -> float:

@@ -33,7 +33,7 @@ def to_sample(rs: Any, frame: Any, depth_unit_m: float, arrived_ns: int, epoch: 
 def has_dots(rs: Any, frame: Any) -> bool | None:
     """Whether the emitter was on; None where the frame does not say, for want of metadata."""
     told = rs.frame_metadata_value
-    for kind in (told.frame_emitter_mode, told.frame_laser_power_mode, told.frame_laser_power):
+    for kind in (told.frame_emitter_mode, told.frame_laser_power_mode):  # the power itself is a setting
         if frame.supports_frame_metadata(kind):
             return bool(frame.get_frame_metadata(kind))
     return None

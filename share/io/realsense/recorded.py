@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -84,18 +84,34 @@ class RecordedSource(Source):
 
     def _repaired(self, images: bool) -> Iterator[Measurement]:
         used = [*self._cameras, *((ACCEL, GYRO) if self.rig.imu else ())]
-        intake = Intake({name: self._rate_of(name) for name in used}, SequencerConfig().max_jump_s)
-        for sample in self._file.samples(images):
-            yield from intake.feed(sample)
-        yield from intake.end()
-
-    def _rate_of(self, stream: str) -> float:
-        return float(self._file.told(f"{self._file.streams[stream]}/info").get("fps", "30"))
+        return repaired(self._file, used, images)
 
     def _image(self, m: Measurement) -> EncodedImage:
         camera, scale = self._cameras[m.stream], self._depth_scale if m.stream == DEPTH else 0.0
         where = f"{self._file.path}: {m.stream} at {m.stamp_ns}"
         return EncodedImage(m.payload, where, camera.width, camera.height, scale)
+
+
+def repaired(file: Db3, streams: Collection[str], images: bool) -> Iterator[Measurement]:
+    """These streams of the file as a live camera's: in one time that goes forward, accel and gyro joined.
+    images: with pixels. Raises DataError."""
+    rates = {name: float(file.told(f"{file.streams[name]}/info").get("fps", "30")) for name in streams}
+    intake = Intake(rates, SequencerConfig().max_jump_s)
+    for sample in file.samples(images):
+        yield from intake.feed(sample)
+    yield from intake.end()
+
+
+def recorded_imu(path: Path) -> tuple[I64, F64]:
+    """Stamps (N,) ns and (N, 6) wx wy wz ax ay az, rad/s and m/s^2. Raises DataError."""
+    file = Db3(path)
+    if missing := [name for name in (ACCEL, GYRO) if name not in file.streams]:
+        raise DataError(f"{path}: has no {' and no '.join(missing)}; record both")
+    samples = [(m.stamp_ns, m.payload) for m in repaired(file, (ACCEL, GYRO), images=False)]
+    if not samples:
+        raise DataError(f"{path}: has no IMU samples")
+    stamps, values = zip(*samples, strict=True)
+    return np.array(stamps, np.int64), np.array(values)
 
 
 def recorded_rig(file: Db3) -> Rig:

@@ -66,8 +66,21 @@ def choose_streams(rs: Any, device: Any, wanted: Wanted) -> list[Opened]:
             out.append(Opened(sensor, found))
     if missing:
         told = ", ".join(f"{name} ({what})" for name, (_, what) in missing.items())
-        raise UsageError(f"the camera does not offer {told}; choose another mode or another --profile")
+        modes = ", ".join(_modes(rs, device)) or "none"
+        raise UsageError(
+            f"the camera does not offer {told}; choose another --mode or --profile; infrared has {modes}"
+        )
     return out
+
+
+def _modes(rs: Any, device: Any) -> list[str]:
+    """Of the left eye, as --mode takes them."""
+    found = set()
+    for p in (p for sensor in device.query_sensors() for p in sensor.get_stream_profiles()):
+        if (p.stream_type(), p.stream_index(), p.format()) == (rs.stream.infrared, 1, rs.format.y8):
+            video = p.as_video_stream_profile()
+            found.add((video.width(), video.height(), p.fps()))
+    return [f"{width}x{height}@{hz}" for width, height, hz in sorted(found)]
 
 
 def rates_hz(opened: list[Opened], wanted: Wanted) -> dict[str, float]:
