@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from share.calibration.neighbours import by_neighbours
 from share.geometry.target import AprilGrid, CharucoBoard, Target
 from share.types import F64, I64, U8
 
 _OURS = [1, 0, 3, 2]  # OpenCV's corners of a tag in the order of ours
 _WINDOW = 0.4  # of the gap: half the window in which a corner is refined; more of it sees the next corner
 _TO_TELL = 6  # tags; four make a homography, and one of them may be wrong
-_NEIGHBOURS, _LEAST_NEIGHBOURS = 12, 6
 _LEAST_PX = 2  # half a window below this refines nothing
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
 
@@ -97,23 +97,9 @@ def _corners(image: U8, grid: AprilGrid, ids: I64, px: np.ndarray) -> Detection:
     halves = np.repeat(np.round(_WINDOW * grid.tag_spacing * shortest).astype(int), 4)
     names = ids.reshape(-1)
     first = _refined(image, px.reshape(-1, 2), halves)
-    second = _refined(image, _by_neighbours(grid.corners[names, :2], first), halves)
+    second = _refined(image, by_neighbours(grid.corners[names, :2], first), halves)
     seen = np.isfinite(second).all(axis=1)
     return _detection(names[seen], second[seen])
-
-
-def _by_neighbours(board: F64, px: F64) -> F64:
-    """Where each corner (N, 2) m is by a homography of the nearest others that were found; NaN if too few."""
-    known = np.flatnonzero(np.isfinite(px).all(axis=1))
-    out = np.full(px.shape, np.nan)
-    for k, corner in enumerate(board):
-        others = known[known != k]
-        near = others[np.argsort(((board[others] - corner) ** 2).sum(axis=1), kind="stable")[:_NEIGHBOURS]]
-        if len(near) >= _LEAST_NEIGHBOURS:
-            H, _ = cv2.findHomography(board[near], px[near], cv2.LMEDS)
-            if H is not None:
-                out[k] = cv2.perspectiveTransform(corner[None, None], H)[0, 0]
-    return out
 
 
 def _refined(image: U8, px: np.ndarray, halves: I64) -> F64:
