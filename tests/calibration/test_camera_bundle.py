@@ -107,7 +107,7 @@ def test_its_sigmas_are_honest() -> None:
                 for f, t in zip(solution.state.cameras, (LEFT, RIGHT), strict=True)
             ]
         )
-        nees.append(error @ np.linalg.solve(solution.covariance[:16, :16], error))
+        nees.append(error @ np.linalg.solve(solution.independent[:16, :16], error))
         assert solution.sigma_px == pytest.approx(0.2, rel=0.05)
     assert 110 < sum(nees) < 280  # chi-square of 12 x 16 = 192: its 1e-5 quantiles are about 117 and 285
 
@@ -129,7 +129,7 @@ def test_so_they_are_where_the_board_bends_anew_in_each_view() -> None:
         solution = calibrate(views, GRID, SIZE)
         error = intrinsics(solution.state.cameras[0]) - intrinsics(LEFT)
         z.append(error / solution.sigmas)
-        naive.append(error / np.sqrt(np.diag(solution.covariance)))
+        naive.append(error / np.sqrt(np.diag(solution.independent)))
     assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.5
     assert np.sqrt(np.mean(np.square(naive))) > 2.5
 

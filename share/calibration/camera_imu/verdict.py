@@ -124,16 +124,24 @@ def _imu_reasons(gyro: float, accel: float, gravity: F64, limits: Limits) -> lis
 
 
 def _sigma_reasons(fit: Fit, limits: Limits) -> list[str]:
-    told = (
-        ("rotation", float(np.degrees(fit.sigma_rotation).max()), limits.rotation_deg, "deg"),
-        ("position", 1e3 * float(fit.sigma_position.max()), limits.position_mm, "mm"),
-        ("time offset", 1e3 * fit.sigma_shift, limits.shift_ms, "ms"),
+    whole = _three(fit.sigmas_of(fit.covariance))
+    noise = _three(fit.sigmas_of(fit.by_noise))
+    names = (
+        ("rotation", limits.rotation_deg, "deg"),
+        ("position", limits.position_mm, "mm"),
+        ("time offset", limits.shift_ms, "ms"),
     )
     return [
-        f"{name} known to {sigma:.2g} {unit} (one sigma), {limit:g} needed: record longer, turn quicker"
-        for name, sigma, limit, unit in told
+        f"{name} known to {sigma:.2g} {unit} (one sigma), {limit:g} needed: "
+        + ("record longer, turn quicker" if alone**2 > sigma**2 / 2 else "calibrate the cameras better first")
+        for (name, limit, unit), sigma, alone in zip(names, whole, noise, strict=True)
         if not sigma <= limit
     ]
+
+
+def _three(sigmas: F64) -> tuple[float, float, float]:
+    """The largest of seven sigmas: deg, mm, ms."""
+    return float(np.degrees(sigmas[:3]).max()), 1e3 * float(sigmas[3:6].max()), 1e3 * float(sigmas[6])
 
 
 @dataclass(frozen=True)
