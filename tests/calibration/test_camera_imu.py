@@ -260,7 +260,7 @@ def test_sigmas_know_of_cameras_that_are_off() -> None:
         nees.append(off @ np.linalg.solve(found.covariance, off))
         naive.append(off @ np.linalg.solve(found.by_noise, off))
     assert 71 < sum(nees) < 163, nees
-    assert np.median(naive) > 30, naive
+    assert sum(naive) > 2 * 163, naive  # held for exact it would not do
 
 
 @pytest.mark.slow
