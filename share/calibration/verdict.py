@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from share.calibration import corners
 from share.calibration.bundle import LEAST_VIEWS, Solution, View
@@ -34,16 +35,22 @@ class Limits:
 @dataclass(frozen=True, eq=False)
 class Verdict:
     """reasons: what fails, none where it passes; rms_px: of each camera, of the corners kept; rms_all_px: of
-    all; wrong: how many were not kept; view_rms (V, cameras) px, NaN where a camera saw nothing; outliers:
-    rows of views; pair_px: that half of what both cameras saw lies from its epipolar lines, None of one."""
+    all; wrong: how many were not kept; view_rms (V, cameras) px, NaN where a camera saw nothing, and which
+    of these are outlying; pair_px: that half of what both cameras saw lies from its epipolar lines, None of
+    one."""
 
     reasons: tuple[str, ...]
     rms_px: tuple[float, ...]
     rms_all_px: tuple[float, ...]
     wrong: tuple[int, ...]
     view_rms: F64
-    outliers: tuple[int, ...]
+    outlying: NDArray[np.bool_]
     pair_px: float | None
+
+    @property
+    def outliers(self) -> tuple[int, ...]:
+        """Rows of views that outlie in any camera."""
+        return tuple(np.flatnonzero(self.outlying.any(axis=1)).tolist())
 
     @property
     def passed(self) -> bool:
@@ -80,7 +87,7 @@ def judge(
             f"the pair: half of the corners are {pair:.2f} px or more off their epipolar lines, at most "
             f"{limits.pair_px:g}: do both cameras expose at once, is one loose?"
         )
-    return Verdict(tuple(reasons), rms, rms_all, wrong, view_rms, _outliers(view_rms), pair)
+    return Verdict(tuple(reasons), rms, rms_all, wrong, view_rms, _outlying(view_rms), pair)
 
 
 def _reasons(solution: Solution, eye: int, rms: float, wrong: int, limits: Limits) -> list[str]:
@@ -109,9 +116,8 @@ def residuals(solution: Solution, eye: int) -> F64:
     return np.concatenate([view[eye] for view in solution.residuals])
 
 
-def _outliers(view_rms: F64) -> tuple[int, ...]:
-    """Views whose RMS is beyond median + 5 MAD of a camera."""
+def _outlying(view_rms: F64) -> NDArray[np.bool_]:
+    """Whose RMS (V, cameras) is beyond median + 5 MAD of a camera's."""
     middle = np.nanmedian(view_rms, axis=0)
     spread = _MAD * np.nanmedian(np.abs(view_rms - middle), axis=0)
-    far = (view_rms > middle + _OUTLYING * spread).any(axis=1)
-    return tuple(np.flatnonzero(far).tolist())
+    return np.asarray(view_rms > middle + _OUTLYING * spread)

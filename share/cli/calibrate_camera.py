@@ -159,5 +159,6 @@ def _summary(outcome: Outcome, files: tuple[Path, ...]) -> str:
         )
     if verdict.outliers:
         names = ", ".join(outcome.views[k].name for k in verdict.outliers[:6])
-        lines.append(f"{len(verdict.outliers)} views fit worse than the rest: {names}")
+        more = ", …" if len(verdict.outliers) > 6 else ""
+        lines.append(f"{len(verdict.outliers)} views fit worse than the rest: {names}{more}")
     return "\n".join([*lines, f"{files[0].parent}: {', '.join(path.name for path in files)}"])

@@ -207,7 +207,7 @@ def _draw_scatter(panel: Any, outcome: Outcome, eye: int) -> None:
 
 def _draw_views(panel: Any, outcome: Outcome, eye: int) -> None:
     rms = outcome.verdict.view_rms[:, eye]
-    colours = ["#d1495b" if k in outcome.verdict.outliers else "#00798c" for k in range(len(rms))]
+    colours = ["#d1495b" if far else "#00798c" for far in outcome.verdict.outlying[:, eye]]
     panel.bar(np.arange(len(rms)), np.nan_to_num(rms), color=colours)
     panel.set(title="each view's RMS, outliers red", xlabel="view", ylabel="px")
     panel.set_ylim(0, 1.2 * float(np.nanpercentile(rms, 95)) + 0.05)

@@ -18,7 +18,7 @@ ALL = Coverage(np.full(GRID, 5), np.zeros((20, 2)), np.linspace(0.5, 1.0, 20))
 def _solution(residuals: list[F64], focal_sigma: float = 0.1) -> Solution:
     state = State((CAMERA,), np.eye(4), np.stack([np.eye(4)] * len(residuals)))
     covariance = np.diag([focal_sigma**2] * 2 + [0.01] * 6)
-    return Solution(state, covariance, np.zeros(len(covariance)), tuple((r,) for r in residuals), 0.2)
+    return Solution(state, covariance, np.zeros_like(covariance), tuple((r,) for r in residuals), 0.2)
 
 
 def _views(rng: np.random.Generator, count: int = 20) -> list[F64]:

@@ -132,7 +132,7 @@ def _sigma_reasons(fit: Fit, limits: Limits) -> list[str]:
         ("time offset", limits.shift_ms, "ms"),
     )
     return [
-        f"{name} known to {sigma:.2g} {unit} (one sigma), {limit:g} needed: "
+        f"{name} known to {sigma:.3g} {unit} (one sigma), {limit:g} needed: "
         + ("record longer, turn quicker" if alone**2 > sigma**2 / 2 else "calibrate the cameras better first")
         for (name, limit, unit), sigma, alone in zip(names, whole, noise, strict=True)
         if not sigma <= limit
