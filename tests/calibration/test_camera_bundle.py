@@ -187,6 +187,13 @@ def test_the_views_that_are_chosen_reach_more_of_the_image_than_the_first(rng: n
     assert reached(chosen) >= reached(list(range(8)))
 
 
+def test_of_views_that_are_nearly_copies_few_are_chosen(rng: np.random.Generator) -> None:
+    """A hand rests: each view comes ten times in a row."""
+    views = [View(f"{v.name}-{k}", v.seen[:1]) for v in _views(rng, 0.1, count=20) for k in range(10)]
+    chosen = choose(views, GRID, SIZE, 20)
+    assert len(chosen) == 20 and len({k // 10 for k in chosen}) >= 19
+
+
 def test_what_is_missing_is_said_in_words() -> None:
     facing = se3.exp(np.array([[np.pi, 0, 0, 0, 0, 0.8]]))
     said = coverage([np.array([[300.0, 200.0]])], facing, GRID, SIZE).missing
