@@ -17,6 +17,7 @@ MOST, LEAST = 12, 6  # neighbours
 _FOURS = 64  # where two fifths were found wrongly, one of them is without these, 99 of 100 times
 _TRUSTED = 2.5 * 1.4826  # of the median distance, as Rousseeuw and Leroy have it
 _STEPS = 2
+_HELD = 1e-10
 _FLOOR_PX = 0.05  # what no corner is better known than
 
 
@@ -29,8 +30,8 @@ def by_neighbours(board: F64, px: F64) -> F64:
     there /= np.abs(there).max(axis=(1, 2), keepdims=True)
     middle = px[near].mean(axis=1)
     seen = px[near] - middle[:, None]
-    H = _fitted(_least_median(there, seen), there, seen)
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(all="ignore"):  # three of four on one line; tags that lie anywhere
+        H = _fitted(_least_median(there, seen), there, seen)
         out: F64 = H[:, :2, 2] / H[:, 2:, 2] + middle
     return out
 
@@ -53,10 +54,9 @@ def _fours(count: int) -> I64:
 def _least_median(there: F64, seen: F64) -> F64:
     """(N, 3, 3) from (N, M, 2) to (N, M, 2): of all fours the one that half of the others agree with best."""
     fours = _fours(there.shape[1])
-    with np.errstate(invalid="ignore", divide="ignore"):  # three of four on one line
-        H = _basis(seen[:, fours]) @ _adjugate(_basis(there[:, fours]))
-        H = H / np.abs(H).max(axis=(2, 3), keepdims=True)
-        off = np.linalg.norm(_mapped(H, there[:, None]) - seen[:, None], axis=3)
+    H = _basis(seen[:, fours]) @ _adjugate(_basis(there[:, fours]))
+    H = H / np.abs(H).max(axis=(2, 3), keepdims=True)
+    off = np.linalg.norm(_mapped(H, there[:, None]) - seen[:, None], axis=3)
     median = np.median(np.where(np.isfinite(off), off, np.inf), axis=2)
     out: F64 = np.take_along_axis(H, median.argmin(axis=1)[:, None, None, None], axis=1)[:, 0]
     return out
@@ -95,9 +95,16 @@ def _fitted(H: F64, there: F64, seen: F64) -> F64:
         weighted = (J * trusted[..., None, None]).reshape(len(H), -1, 8)
         A = weighted.swapaxes(1, 2) @ J.reshape(len(H), -1, 8)
         b = (weighted * r.reshape(len(H), -1, 1)).sum(axis=1)
-        step = np.linalg.solve(A + 1e-12 * np.eye(8), b[..., None])[..., 0]
+        step = np.linalg.solve(_regular(A), b[..., None])[..., 0]
         H = H + np.concatenate([step, np.zeros((len(H), 1))], axis=1).reshape(-1, 3, 3)
     return H
+
+
+def _regular(A: F64) -> F64:
+    """(N, 8, 8) with which something can be solved, also where a board is none and nothing fits."""
+    size = np.trace(A, axis1=1, axis2=2)[:, None, None]
+    out: F64 = np.where(np.isfinite(size) & (size > 0), A + _HELD * size * np.eye(8), np.eye(8))
+    return out
 
 
 def _linear(H: F64, there: F64, seen: F64) -> tuple[F64, F64]:

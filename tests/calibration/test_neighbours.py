@@ -45,3 +45,15 @@ def test_too_few_tell_nothing() -> None:
 def test_neighbours_on_one_line_are_no_error() -> None:
     line = np.column_stack([np.arange(8.0), np.zeros(8)])
     assert by_neighbours(line, 10 * line).shape == (8, 2)
+
+
+def test_corners_that_lie_anywhere_are_no_error(rng: np.random.Generator) -> None:
+    """As by a --target of other columns; also many in one place, or in whole pixels."""
+    for px in (
+        rng.uniform(0, 480, BOARD.shape),
+        np.repeat(rng.uniform(0, 480, (36, 2)), 4, axis=0),
+        np.full(BOARD.shape, 7.0),
+        rng.integers(0, 4, BOARD.shape).astype(float),
+        np.column_stack([np.arange(144.0), np.arange(144.0)]),
+    ):
+        assert by_neighbours(BOARD, px).shape == px.shape
