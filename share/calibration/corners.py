@@ -22,6 +22,13 @@ def kept(residuals: F64, sigma_px: float) -> NDArray[np.bool_]:
     return np.asarray(np.linalg.norm(residuals, axis=1) <= _KEPT * sigma_px)
 
 
+def lost(residuals: F64, sigma_px: float, least_px: float) -> int:
+    """How many are beyond what is kept and beyond `least_px`: near the camera corners are found so well that
+    those of a board far away look wrong beside them, and are none the worse."""
+    far = np.linalg.norm(residuals, axis=1) > least_px
+    return int((far & ~kept(residuals, sigma_px)).sum())
+
+
 def rms(residuals: F64) -> float:
     """Of the distances, px; NaN of none."""
     return float(np.sqrt((residuals**2).sum(axis=1).mean())) if len(residuals) else float("nan")

@@ -72,7 +72,8 @@ def judge(
     rms = tuple(corners.rms(r[k]) for r, k in zip(told, inside, strict=True))
     rms_all = tuple(corners.rms(r) for r in told)
     wrong = tuple(int((~k).sum()) for k in inside)
-    reasons = [reason for eye in eyes for reason in _reasons(solution, eye, rms[eye], wrong[eye], limits)]
+    lost = [corners.lost(r, solution.sigma_px, limits.rms_px) for r in told]
+    reasons = [reason for eye in eyes for reason in _reasons(solution, eye, rms[eye], lost[eye], limits)]
     for eye, cover in enumerate(covers):
         if cover.share < limits.covered:
             reasons.append(
@@ -90,7 +91,7 @@ def judge(
     return Verdict(tuple(reasons), rms, rms_all, wrong, view_rms, _outlying(view_rms), pair)
 
 
-def _reasons(solution: Solution, eye: int, rms: float, wrong: int, limits: Limits) -> list[str]:
+def _reasons(solution: Solution, eye: int, rms: float, lost: int, limits: Limits) -> list[str]:
     views = sum(len(view[eye]) > 0 for view in solution.residuals)
     corners = sum(len(view[eye]) for view in solution.residuals)
     part = slice(INTRINSICS * eye, INTRINSICS * eye + 2)
@@ -102,8 +103,11 @@ def _reasons(solution: Solution, eye: int, rms: float, wrong: int, limits: Limit
         out.append(
             f"cam{eye}: {rms:.2f} px RMS, at most {limits.rms_px:g}: blur, a bent board or a wrong --target"
         )
-    if wrong > _WRONG_SHARE * corners:
-        out.append(f"cam{eye}: {wrong} of {corners} corners do not fit, at most {_WRONG_SHARE:.0%}")
+    if lost > _WRONG_SHARE * corners:
+        out.append(
+            f"cam{eye}: {lost} of {corners} corners do not fit within {limits.rms_px:g} px, at most "
+            f"{_WRONG_SHARE:.0%}"
+        )
     if not loose <= limits.focal:
         out.append(
             f"cam{eye}: focal length known to {loose:.2%}, {limits.focal:.2%} needed: tilt the board more"

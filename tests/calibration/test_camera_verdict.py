@@ -55,7 +55,7 @@ def test_each_reason_is_given(rng: np.random.Generator) -> None:
         (_solution(_views(rng, 11)), ALL, "11 views, 12 needed"),
         (_solution(_views(rng), focal_sigma=1.5), ALL, "focal length known to 0.30%"),
         (_solution(_views(rng)), half, "corners in 50% of the image"),
-        (_solution(spoilt), ALL, "100 of 1000 corners do not fit"),
+        (_solution(spoilt), ALL, "100 of 1000 corners do not fit within 0.5 px"),
         (blurred, ALL, "px RMS, at most 0.5"),
     ):
         reasons = judge(solution, [cover]).reasons

@@ -62,7 +62,7 @@ def judge(fit: Fit, limits: Limits = Limits()) -> Verdict:
     accel = rough(fit.imu.stamps_ns, fit.accel) / fit.stated.accel
     turning, moving = _excitation(fit)
     reasons = [
-        *_corner_reasons(fit, rms, wrong, limits),
+        *_corner_reasons(fit, rms, limits),
         *_motion_reasons(turning, moving, limits),
         *_imu_reasons(gyro, accel, fit.state.gravity, limits),
         *_sigma_reasons(fit, limits),
@@ -77,7 +77,7 @@ def _excitation(fit: Fit) -> tuple[F64, F64]:
     return turning, moving
 
 
-def _corner_reasons(fit: Fit, rms: tuple[float, ...], wrong: tuple[int, ...], limits: Limits) -> list[str]:
+def _corner_reasons(fit: Fit, rms: tuple[float, ...], limits: Limits) -> list[str]:
     out = []
     for eye, residuals in enumerate(fit.corners):
         if len(residuals) and not rms[eye] <= limits.rms_px:
@@ -85,9 +85,11 @@ def _corner_reasons(fit: Fit, rms: tuple[float, ...], wrong: tuple[int, ...], li
                 f"cam{eye}: {rms[eye]:.2f} px RMS, at most {limits.rms_px:g}: blur, or --target or "
                 "intrinsics of something else"
             )
-        if wrong[eye] > limits.wrong * len(residuals):
+        lost = corners.lost(residuals, fit.sigmas.px, limits.rms_px)
+        if lost > limits.wrong * len(residuals):
             out.append(
-                f"cam{eye}: {wrong[eye]} of {len(residuals)} corners do not fit, at most {limits.wrong:.0%}"
+                f"cam{eye}: {lost} of {len(residuals)} corners do not fit within {limits.rms_px:g} px, at "
+                f"most {limits.wrong:.0%}"
             )
     return out
 
