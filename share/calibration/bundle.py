@@ -16,6 +16,7 @@ import numpy as np
 from share.calibration import start
 from share.calibration.corners import spread
 from share.calibration.detect import Detection
+from share.calibration.doubt import jackknife, larger
 from share.calibration.projection import INTRINSICS, camera_of, intrinsics, moved, project
 from share.geometry import se3
 from share.geometry.camera import Camera
@@ -47,21 +48,26 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """`state`, with the covariance (S, S) of 8 intrinsics a camera and, of two, xi of T_cam1_cam0 Exp(xi), if
-    corners err independently; by_views (S,): one sigma of each as views contradict one another; of each view
-    and camera the residuals (N, 2) px, seen less predicted; sigma_px: noise of a coordinate."""
+    """`state`, with two covariances (S, S) of 8 intrinsics a camera and, of two, xi of T_cam1_cam0 Exp(xi):
+    `independent`, if corners err so; `by_views`, as views contradict one another. Of each view and camera
+    the residuals (N, 2) px, seen less predicted; sigma_px: noise of a coordinate."""
 
     state: State
-    covariance: F64
+    independent: F64
     by_views: F64
     residuals: tuple[tuple[F64, ...], ...]
     sigma_px: float
 
     @property
+    def covariance(self) -> F64:
+        """(S, S): in each direction the larger of both. Corners of a view err together: by a bent board, by
+        blur, by what a detector makes of a slant."""
+        return larger(self.independent, self.by_views)
+
+    @property
     def sigmas(self) -> F64:
-        """(S,): one sigma, the larger of both. Corners of a view err together: by a bent board, by blur, by
-        what a detector makes of a slant."""
-        return np.maximum(np.sqrt(np.diag(self.covariance)), self.by_views)
+        """(S,): one sigma of each."""
+        return np.sqrt(np.diag(self.covariance))
 
 
 def calibrate(views: Sequence[View], target: Target, size: tuple[int, int]) -> Solution:
@@ -146,21 +152,22 @@ def _linear(state: State, view: View, k: int, eye: int, target: Target) -> tuple
 def _block(state: State, view: View, k: int, target: Target) -> tuple[F64, F64]:
     """Residuals (M, 2) of one view and derivatives (M, 2, S + 6): shared parameters, then its pose."""
     eyes = len(state.cameras)
-    shared = _shared(eyes)
+    size = shared(eyes)
     rs, Js = [], []
     for eye in range(eyes):
         r, by_intrinsics, by_mount, by_pose = _linear(state, view, k, eye, target)
-        J = np.zeros((len(r), 2, shared + 6))
+        J = np.zeros((len(r), 2, size + 6))
         J[:, :, INTRINSICS * eye : INTRINSICS * (eye + 1)] = by_intrinsics
-        J[:, :, shared:] = by_pose
+        J[:, :, size:] = by_pose
         if eyes == 2:
-            J[:, :, shared - 6 : shared] = by_mount
+            J[:, :, size - 6 : size] = by_mount
         rs.append(r)
         Js.append(J)
     return np.concatenate(rs), np.concatenate(Js)
 
 
-def _shared(eyes: int) -> int:
+def shared(eyes: int) -> int:
+    """How many parameters the views share: 8 intrinsics of each camera, and xi of T_cam1_cam0."""
     return INTRINSICS * eyes + 6 * (eyes - 1)
 
 
@@ -252,13 +259,5 @@ def _solution(views: Sequence[View], target: Target, state: State, limit: float)
     told, _ = _eliminated(*_normals(blocks, limit), damping=0.0)
     sigma_px = spread(np.concatenate([r for r, _ in blocks]))
     H, g = told[..., :-1], told[..., -1]
-    covariance = sigma_px**2 * np.linalg.inv(H.sum(axis=0))
-    return Solution(state, covariance, _jackknife(H, g), errors(state, views, target), sigma_px)
-
-
-def _jackknife(H: F64, g: F64) -> F64:
-    """One sigma (S,) of what V views tell together by H (V, S, S) and g (V, S) each, by how far it moves
-    without each of them (MacKinnon, Nielsen and Webb, *Cluster-robust inference*, 2023: CV3)."""
-    moved = np.linalg.solve(H.sum(axis=0) - H, g[..., None])[..., 0]
-    out: F64 = np.sqrt((1 - 1 / len(H)) * (moved**2).sum(axis=0))
-    return out
+    independent = sigma_px**2 * np.linalg.inv(H.sum(axis=0))
+    return Solution(state, independent, jackknife(H, g), errors(state, views, target), sigma_px)

@@ -24,6 +24,7 @@ _NAMES = (
 )
 _LEANT_DEG = 15.0
 _SHAPE_WEIGHT = 3.0  # of how a board lies, in cells
+_STRETCH_WEIGHT = 10.0  # of its stretch of the recording: neighbours are nearly copies, and err alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +79,11 @@ def cells_of(px: F64, size: tuple[int, int]) -> I64:
 
 def choose(views: Sequence[View], target: Target, size: tuple[int, int], most: int) -> list[int]:
     """Which views, rising, at most `most`: one after another the one that adds most of what is still rare,
-    cells of the image and ways a board lies in it."""
+    cells of the image, ways a board lies in it, stretches of the recording (views are in its order)."""
     told = [_told(view, target, size) for view in views]
+    for k, what in enumerate(told):
+        if what:
+            what["stretch", k * most // len(views)] = _STRETCH_WEIGHT
     met: dict[object, int] = {}
     chosen: list[int] = []
     left = [k for k, what in enumerate(told) if what]

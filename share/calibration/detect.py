@@ -12,15 +12,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from share.calibration.neighbours import by_neighbours
+from share.calibration.saddle import is_saddle, refined
 from share.geometry.target import AprilGrid, CharucoBoard, Target
 from share.types import F64, I64, U8
 
 _OURS = [1, 0, 3, 2]  # OpenCV's corners of a tag in the order of ours
 _WINDOW = 0.4  # of the gap: half the window in which a corner is refined; more of it sees the next corner
 _TO_TELL = 6  # tags; four make a homography, and one of them may be wrong
-_NEIGHBOURS, _LEAST_NEIGHBOURS = 12, 6
-_LEAST_PX = 2  # half a window below this refines nothing
-_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,45 +90,19 @@ def _corners(image: U8, grid: AprilGrid, ids: I64, px: np.ndarray) -> Detection:
     """Tags (N, 4) of corners (N, 4, 2), where their edges meet.
 
     A quad often reaches into the black square at its corner, by more than a window. So each corner is looked
-    for a second time, from where its neighbours say it is.
+    for a second time, from where its neighbours say it is. These err, too, at the border of a board that a
+    lens bends: where that leads to no saddle, the first is taken, if it is one and no other corner is meant.
     """
     shortest = np.linalg.norm(px - np.roll(px, 1, axis=1), axis=2).min(axis=1, initial=np.inf)
     halves = np.repeat(np.round(_WINDOW * grid.tag_spacing * shortest).astype(int), 4)
     names = ids.reshape(-1)
-    first = _refined(image, px.reshape(-1, 2), halves)
-    second = _refined(image, _by_neighbours(grid.corners[names, :2], first), halves)
-    seen = np.isfinite(second).all(axis=1)
-    return _detection(names[seen], second[seen])
-
-
-def _by_neighbours(board: F64, px: F64) -> F64:
-    """Where each corner (N, 2) m is by a homography of the nearest others that were found; NaN if too few."""
-    known = np.flatnonzero(np.isfinite(px).all(axis=1))
-    out = np.full(px.shape, np.nan)
-    for k, corner in enumerate(board):
-        others = known[known != k]
-        near = others[np.argsort(((board[others] - corner) ** 2).sum(axis=1), kind="stable")[:_NEIGHBOURS]]
-        if len(near) >= _LEAST_NEIGHBOURS:
-            H, _ = cv2.findHomography(board[near], px[near], cv2.LMEDS)
-            if H is not None:
-                out[k] = cv2.perspectiveTransform(corner[None, None], H)[0, 0]
-    return out
-
-
-def _refined(image: U8, px: np.ndarray, halves: I64) -> F64:
-    """Corners (N, 2) moved to the saddle in a window of 2 half + 1; NaN where it leaves its window or the
-    image, or is too small."""
-    room = np.array(image.shape[::-1]) - 1 - halves[:, None]
-    fit = ((px >= halves[:, None]) & (px <= room)).all(axis=1) & (halves >= _LEAST_PX)
-    out = np.full((len(px), 2), np.nan)
-    for half in np.unique(halves[fit]).tolist():
-        here = fit & (halves == half)
-        start = np.ascontiguousarray(px[here], np.float32)
-        moved = cv2.cornerSubPix(image, start.copy(), (half, half), (-1, -1), _STOP).reshape(-1, 2)
-        step = np.linalg.norm(moved - start, axis=1)
-        good = (step > 0) & (step < half)  # OpenCV gives the start itself where it would go too far
-        out[here] = np.where(good[:, None], moved, np.nan)
-    return out
+    first = refined(image, px.reshape(-1, 2), halves)
+    there = by_neighbours(grid.corners[names, :2], first)
+    second = refined(image, there, halves)
+    sound = is_saddle(image, second, halves)
+    near = np.linalg.norm(first - there, axis=1) < 2 * halves
+    seen = sound | (near & is_saddle(image, first, halves))
+    return _detection(names[seen], np.where(sound[:, None], second, first)[seen])
 
 
 def _charuco(board: CharucoBoard) -> Callable[[U8], Detection]:

@@ -29,7 +29,10 @@ def first_camera(boards: Sequence[F64], pixels: Sequence[F64], size: tuple[int, 
     A, b = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     inverse_squares = np.linalg.lstsq(A, b, rcond=None)[0]
     if not (np.isfinite(inverse_squares).all() and (inverse_squares > 0).all()):
-        raise ValueError("the views do not tell the focal length: tilt the board against the camera")
+        raise ValueError(
+            "the views do not tell the focal length: tilt the board against the camera; or is --target "
+            "another board?"
+        )
     fx, fy = inverse_squares**-0.5
     return Camera(*size, float(fx), float(fy), float(middle[0]), float(middle[1]), (0.0,) * 4)
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from share.calibration import corners
 from share.calibration.bundle import LEAST_VIEWS, Solution, View
@@ -34,16 +35,22 @@ class Limits:
 @dataclass(frozen=True, eq=False)
 class Verdict:
     """reasons: what fails, none where it passes; rms_px: of each camera, of the corners kept; rms_all_px: of
-    all; wrong: how many were not kept; view_rms (V, cameras) px, NaN where a camera saw nothing; outliers:
-    rows of views; pair_px: that half of what both cameras saw lies from its epipolar lines, None of one."""
+    all; wrong: how many were not kept; view_rms (V, cameras) px, NaN where a camera saw nothing, and which
+    of these are outlying; pair_px: that half of what both cameras saw lies from its epipolar lines, None of
+    one."""
 
     reasons: tuple[str, ...]
     rms_px: tuple[float, ...]
     rms_all_px: tuple[float, ...]
     wrong: tuple[int, ...]
     view_rms: F64
-    outliers: tuple[int, ...]
+    outlying: NDArray[np.bool_]
     pair_px: float | None
+
+    @property
+    def outliers(self) -> tuple[int, ...]:
+        """Rows of views that outlie in any camera."""
+        return tuple(np.flatnonzero(self.outlying.any(axis=1)).tolist())
 
     @property
     def passed(self) -> bool:
@@ -65,7 +72,8 @@ def judge(
     rms = tuple(corners.rms(r[k]) for r, k in zip(told, inside, strict=True))
     rms_all = tuple(corners.rms(r) for r in told)
     wrong = tuple(int((~k).sum()) for k in inside)
-    reasons = [reason for eye in eyes for reason in _reasons(solution, eye, rms[eye], wrong[eye], limits)]
+    lost = [corners.lost(r, solution.sigma_px, limits.rms_px) for r in told]
+    reasons = [reason for eye in eyes for reason in _reasons(solution, eye, rms[eye], lost[eye], limits)]
     for eye, cover in enumerate(covers):
         if cover.share < limits.covered:
             reasons.append(
@@ -80,10 +88,10 @@ def judge(
             f"the pair: half of the corners are {pair:.2f} px or more off their epipolar lines, at most "
             f"{limits.pair_px:g}: do both cameras expose at once, is one loose?"
         )
-    return Verdict(tuple(reasons), rms, rms_all, wrong, view_rms, _outliers(view_rms), pair)
+    return Verdict(tuple(reasons), rms, rms_all, wrong, view_rms, _outlying(view_rms), pair)
 
 
-def _reasons(solution: Solution, eye: int, rms: float, wrong: int, limits: Limits) -> list[str]:
+def _reasons(solution: Solution, eye: int, rms: float, lost: int, limits: Limits) -> list[str]:
     views = sum(len(view[eye]) > 0 for view in solution.residuals)
     corners = sum(len(view[eye]) for view in solution.residuals)
     part = slice(INTRINSICS * eye, INTRINSICS * eye + 2)
@@ -95,8 +103,11 @@ def _reasons(solution: Solution, eye: int, rms: float, wrong: int, limits: Limit
         out.append(
             f"cam{eye}: {rms:.2f} px RMS, at most {limits.rms_px:g}: blur, a bent board or a wrong --target"
         )
-    if wrong > _WRONG_SHARE * corners:
-        out.append(f"cam{eye}: {wrong} of {corners} corners do not fit, at most {_WRONG_SHARE:.0%}")
+    if lost > _WRONG_SHARE * corners:
+        out.append(
+            f"cam{eye}: {lost} of {corners} corners do not fit within {limits.rms_px:g} px, at most "
+            f"{_WRONG_SHARE:.0%}"
+        )
     if not loose <= limits.focal:
         out.append(
             f"cam{eye}: focal length known to {loose:.2%}, {limits.focal:.2%} needed: tilt the board more"
@@ -109,9 +120,8 @@ def residuals(solution: Solution, eye: int) -> F64:
     return np.concatenate([view[eye] for view in solution.residuals])
 
 
-def _outliers(view_rms: F64) -> tuple[int, ...]:
-    """Views whose RMS is beyond median + 5 MAD of a camera."""
+def _outlying(view_rms: F64) -> NDArray[np.bool_]:
+    """Whose RMS (V, cameras) is beyond median + 5 MAD of a camera's."""
     middle = np.nanmedian(view_rms, axis=0)
     spread = _MAD * np.nanmedian(np.abs(view_rms - middle), axis=0)
-    far = (view_rms > middle + _OUTLYING * spread).any(axis=1)
-    return tuple(np.flatnonzero(far).tolist())
+    return np.asarray(view_rms > middle + _OUTLYING * spread)

@@ -50,8 +50,8 @@ def camera(
     """Find focal lengths, principal point and distortion of a camera or a stereo pair, and how the pair sits,
     from a recording of a calibration board or a folder with cam0/*.png and cam1/*.png.
 
-    Exit code 1 where the result is not to be believed; the files are written all the same. A camchain that
-    is in DIR is then kept.
+    Exit code 1 where the result is not to be believed; the files are written all the same. A camchain and a
+    report that are in DIR are then kept.
 
     \b
     Example:  share calibrate camera board.mcap --target aprilgrid --out calib/mine
@@ -59,7 +59,9 @@ def camera(
     """
     from share.io import camera_report
     from share.io.board_views import open_pictures
-    from share.io.earlier import camchain_path, written
+    from share.io.calibration import CAMCHAIN
+    from share.io.camera_report import PICTURE, REPORT
+    from share.io.earlier import places, written
     from share.io.files import atomic_write, writable_dir
     from share.io.json_file import known
     from share.io.kalibr import to_kalibr
@@ -73,11 +75,12 @@ def camera(
     writable_dir(out)
     outcome = _calibrated(source, pictures, target, every, most, workers)
     text = json.dumps(known(camera_report.to_json(outcome)), indent=1)
-    chain = camchain_path(out, outcome.verdict.passed)
-    atomic_write(chain, camera_report.kalibr_text(outcome, source))
-    atomic_write(out / "camera-report.json", text + "\n")
-    atomic_write(out / "camera-report.png", camera_report.picture(outcome, source))
-    click.echo(text if as_json else _summary(outcome, chain))
+    files = places(out, outcome.verdict.passed, CAMCHAIN, REPORT, PICTURE)
+    chain, report, picture = files
+    atomic_write(chain, camera_report.kalibr_text(outcome, source, report.name))
+    atomic_write(report, text + "\n")
+    atomic_write(picture, camera_report.picture(outcome, source))
+    click.echo(text if as_json else _summary(outcome, files))
     if not outcome.verdict.passed:
         raise ShareError(
             f"{source}: not to be believed ({written(chain)}): " + "; ".join(outcome.verdict.reasons)
@@ -127,7 +130,7 @@ def _calibrated(
     )  # fmt: skip
 
 
-def _summary(outcome: Outcome, chain: Path) -> str:
+def _summary(outcome: Outcome, files: tuple[Path, ...]) -> str:
     from share.io.camera_report import table
 
     verdict = outcome.verdict
@@ -144,6 +147,11 @@ def _summary(outcome: Outcome, chain: Path) -> str:
             f"corners in {cover.share:.0%} of the image"
         )
         lines += [f"  {what}" for what in cover.missing]
+        if (radius := outcome.reach(eye)) is not None:
+            lines.append(
+                f"  most corners beyond {radius:.0f} px of the principal point do not fit: there the lens is "
+                "not of this model"
+            )
     if verdict.pair_px is not None:
         was = (
             "" if outcome.pair_before_px is None else f" ({outcome.pair_before_px:.3f} px by the one before)"
@@ -153,5 +161,6 @@ def _summary(outcome: Outcome, chain: Path) -> str:
         )
     if verdict.outliers:
         names = ", ".join(outcome.views[k].name for k in verdict.outliers[:6])
-        lines.append(f"{len(verdict.outliers)} views fit worse than the rest: {names}")
-    return "\n".join([*lines, f"{chain.parent}: {chain.name}, camera-report.json, camera-report.png"])
+        more = ", …" if len(verdict.outliers) > 6 else ""
+        lines.append(f"{len(verdict.outliers)} views fit worse than the rest: {names}{more}")
+    return "\n".join([*lines, f"{files[0].parent}: {', '.join(path.name for path in files)}"])

@@ -68,9 +68,9 @@ def camera_imu(
                 --imu calib/mine --out calib/mine
     """
     from share.io import camera_imu_report as report
-    from share.io.calibration import IMU_CHAIN
+    from share.io.calibration import CAMCHAIN, IMU_CHAIN
     from share.io.camera_imu_chart import residual_png
-    from share.io.earlier import camchain_path, says_noise, written
+    from share.io.earlier import places, says_noise, written
     from share.io.files import atomic_write, writable_dir
     from share.io.json_file import known
     from share.io.rig_pictures import open_rig_pictures
@@ -83,8 +83,9 @@ def camera_imu(
     outcome = _calibrated(source, pictures, noise, target_name, every, within, workers)
     text = json.dumps(known(report.to_json(outcome)), indent=1)
     verdict = "passed" if outcome.verdict.passed else "FAILED"
-    chain, imu_chain = camchain_path(out, outcome.verdict.passed), out / IMU_CHAIN
-    atomic_write(chain, report.camchain_text(outcome, source))
+    chain, told, picture = places(out, outcome.verdict.passed, CAMCHAIN, report.REPORT, report.PICTURE)
+    imu_chain = out / IMU_CHAIN
+    atomic_write(chain, report.camchain_text(outcome, source, told.name))
     warnings = _warnings(outcome)
     if not imu_chain.exists():
         as_given = None if imu is None else chain_file(imu, "--imu").read_text(encoding="utf-8")
@@ -92,9 +93,9 @@ def camera_imu(
     elif not says_noise(imu_chain, noise):
         used = "the recording's own" if imu is None else f"that of --imu {imu}"
         warnings.append(f"{imu_chain} is of other noise and is kept; used was {used}; --imu {out} uses it")
-    atomic_write(out / "camera-imu-report.json", text + "\n")
-    atomic_write(out / "camera-imu-report.png", residual_png(outcome.fit, f"{source}: {verdict}"))
-    click.echo(text if as_json else _summary(outcome, chain))
+    atomic_write(told, text + "\n")
+    atomic_write(picture, residual_png(outcome.fit, f"{source}: {verdict}"))
+    click.echo(text if as_json else _summary(outcome, (chain, imu_chain, told, picture)))
     for warning in warnings:
         click.echo(f"share: {source}: {warning}", err=True)
     if not outcome.verdict.passed:
@@ -126,14 +127,14 @@ def _calibrated(
         seen = find_stamped(pictures, target, every, partial(stages, "looking for the board"), workers)
         found = fit(
             seen.stamps, seen.views, target, pictures.rig, table.imu, noise, within,
-            partial(stages, "fitting"),
+            partial(stages, "fitting"), pictures.doubt.covariance,
         )  # fmt: skip
     before = None if pictures.before is None else compare(found.T_imu_cam0, pictures.before)
     of = pictures.pictures
-    return Outcome(found, judge(found), pictures.rig, noise, before, seen, of.said, of.serial)
+    return Outcome(found, judge(found), pictures.rig, pictures.doubt, noise, before, seen, of.said, of.serial)
 
 
-def _summary(outcome: Outcome, chain: Path) -> str:
+def _summary(outcome: Outcome, files: tuple[Path, ...]) -> str:
     import numpy as np
 
     from share.geometry import se3
@@ -154,6 +155,7 @@ def _summary(outcome: Outcome, chain: Path) -> str:
         "in the IMU's frame (rotation vector); ± one sigma",
         "",
         f"time offset: {shift} (t_imu = t_cam + offset)",
+        _of_cameras(outcome),
         *(
             f"cam{eye}: {rms:.3f} px RMS, {wrong} of {len(r)} corners left out"
             for eye, (rms, wrong, r) in enumerate(
@@ -164,9 +166,23 @@ def _summary(outcome: Outcome, chain: Path) -> str:
         f"{_list(verdict.turning)} rad/s rms",
         f"accelerometer: {verdict.accel:.2f} times; moved by {_list(verdict.moving)} m/s^2 rms; "
         f"gravity {np.linalg.norm(fit.state.gravity):.4f} m/s^2",
-        f"{chain.parent}: {chain.name}, kalibr_imu_chain.yaml, camera-imu-report.json, camera-imu-report.png",
+        f"{files[0].parent}: {', '.join(path.name for path in files)}",
     ]
     return "\n".join(lines)
+
+
+def _of_cameras(outcome: Outcome) -> str:
+    """What of the sigmas comes from the cameras' own."""
+    import numpy as np
+
+    fit, doubt = outcome.fit, outcome.doubt
+    if fit.by_rig is None:
+        return f"cameras: taken as exact, the sigmas leave their errors out ({doubt.where})"
+    sigmas = fit.sigmas_of(fit.by_rig)
+    return (
+        f"cameras: as well known as {doubt.where} says; of the sigmas that is up to "
+        f"{np.degrees(sigmas[:3].max()):.3f} deg, {1e3 * sigmas[3:6].max():.2f} mm, {1e3 * sigmas[6]:.3f} ms"
+    )
 
 
 def _cells(values: F64, errors: F64, digits: int) -> list[str]:
@@ -181,6 +197,8 @@ def _warnings(outcome: Outcome) -> list[str]:
     """What a person ought to know before believing it: a line each."""
     verdict = outcome.verdict
     out = _of_given(outcome.before)
+    if not outcome.doubt.passed:
+        out.append(f"{outcome.doubt.where} does not believe these cameras; calibrate them again first")
     if dropped := outcome.pictures.dropped:
         out.append(
             f"{dropped} pictures of the board are left out: their stamps are not later than those before"

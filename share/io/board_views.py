@@ -95,8 +95,8 @@ def _pictures(folder: Path) -> dict[str, Path]:
 def find_views(
     pictures: Pictures, target: Target, every: int, told: Callable[[int, int], None], workers: int = 1
 ) -> tuple[list[View], list[tuple[int, int]]]:
-    """Views of every `every`-th picture, also empty ones, and each camera's size. Finding a board takes a
-    tenth of a second: `workers` processes share that.
+    """Views of every `every`-th picture, also empty ones, and each camera's size. Finding a board takes
+    some hundredths of a second: `workers` processes share that.
 
     told: how many are done, of how many. Raises DataError where pictures of a camera differ in size.
     """

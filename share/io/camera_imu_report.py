@@ -14,19 +14,23 @@ from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
 from share.io.calibration import Calibration
 from share.io.kalibr import to_kalibr
+from share.io.rig_doubt import RigDoubt
 from share.io.rig_pictures import Stamped
 from share.types import F64
+
+REPORT, PICTURE = "camera-imu-report.json", "camera-imu-report.png"
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """All that is told of one calibration. rig: the cameras as they were known; before: how T_imu_cam0 that
-    was given compares; pictures: what was looked at; said: the cameras' calibration that was given;
-    serial: of the device."""
+    """All that is told of one calibration. rig: the cameras as they were known, doubt: how well; before: how
+    T_imu_cam0 that was given compares; pictures: what was looked at; said: the cameras' calibration that was
+    given; serial: of the device."""
 
     fit: Fit
     verdict: Verdict
     rig: Rig
+    doubt: RigDoubt
     noise: ImuNoise
     before: Comparison | None
     pictures: Stamped
@@ -46,13 +50,14 @@ class Outcome:
         return tuple(mount @ T for mount in self.fit.sights.mounts)
 
 
-def camchain_text(outcome: Outcome, source: str) -> str:
-    """Kalibr's camchain-imucam: intrinsics as they were, T_cam_imu and timeshift_cam_imu of each camera."""
+def camchain_text(outcome: Outcome, source: str, report: str) -> str:
+    """Kalibr's camchain-imucam: intrinsics as they were, T_cam_imu and timeshift_cam_imu of each camera.
+    report: the name of the file that says why it failed."""
     chain = to_kalibr(outcome.calibrated, outcome.said, outcome.serial)
     del chain["imu0"]
     for eye, T in enumerate(outcome.T_cam_imu):
         chain[f"cam{eye}"] |= {"T_cam_imu": T.tolist(), "timeshift_cam_imu": outcome.fit.shift_s}
-    verdict = "passed" if outcome.verdict.passed else "FAILED, see camera-imu-report.json"
+    verdict = "passed" if outcome.verdict.passed else f"FAILED, see {report}"
     head = f"# share calibrate camera-imu {source}: {verdict}\n# t_imu = t_cam + timeshift_cam_imu\n"
     return head + yaml.safe_dump(chain, sort_keys=False, default_flow_style=None)
 
@@ -76,11 +81,10 @@ def to_json(outcome: Outcome) -> dict[str, Any]:
         "T_cam_imu": [T.tolist() for T in outcome.T_cam_imu],
         "T_imu_cam0": fit.T_imu_cam0.tolist(),
         "timeshift_cam_imu": fit.shift_s,
-        "sigmas": {
-            "rotation_rad": fit.sigma_rotation.tolist(),
-            "position_m": fit.sigma_position.tolist(),
-            "timeshift_s": fit.sigma_shift,
-        },
+        "sigmas": _sigmas(fit.sigmas_of(fit.covariance)),
+        "sigmas_by_noise": _sigmas(fit.sigmas_of(fit.by_noise)),
+        "sigmas_by_cameras": None if fit.by_rig is None else _sigmas(fit.sigmas_of(fit.by_rig)),
+        "cameras_known_by": outcome.doubt.where,
         "covariance": fit.covariance.tolist(),
         "gravity": fit.state.gravity.tolist(),
         "gravity_norm": float(np.linalg.norm(fit.state.gravity)),
@@ -91,6 +95,14 @@ def to_json(outcome: Outcome) -> dict[str, Any]:
         "residuals": _residuals(outcome),
         "began": {"timeshift_cam_imu": fit.began.shift_s, "correlation": fit.began.correlation},
         "given": None if before is None else vars(before) | {"far": before.far},
+    }
+
+
+def _sigmas(seven: F64) -> dict[str, Any]:
+    return {
+        "rotation_rad": seven[:3].tolist(),
+        "position_m": seven[3:6].tolist(),
+        "timeshift_s": float(seven[6]),
     }
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from share.calibration.bundle import Solution, View
-from share.calibration.corners import kept
+from share.calibration.corners import kept, reach
 from share.calibration.coverage import Coverage
 from share.calibration.projection import INTRINSICS, intrinsics
 from share.calibration.verdict import Verdict, residuals
@@ -19,8 +19,12 @@ from share.geometry import se3
 from share.geometry.camera import Rig
 from share.io.calibration import Calibration
 from share.io.kalibr import to_kalibr
+from share.types import F64
 
+REPORT, PICTURE = "camera-report.json", "camera-report.png"
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+
+_ARROWS = 1500  # more hide each other
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +43,18 @@ class Outcome:
     said: Calibration | None = None
     serial: str | None = None
 
+    def seen_by(self, eye: int) -> tuple[F64, F64, np.ndarray]:
+        """Corners (N, 2) px of a camera, their residuals (N, 2) and which (N,) were kept."""
+        r = residuals(self.solution, eye)
+        px = np.concatenate([view.seen[eye].px for view in self.views])
+        return px, r, kept(r, self.solution.sigma_px)
+
+    def reach(self, eye: int) -> float | None:
+        """`corners.reach` of a camera, from its principal point."""
+        px, _, inside = self.seen_by(eye)
+        camera = self.solution.state.cameras[eye]
+        return reach(px, np.array([camera.cx, camera.cy]), inside)
+
     @property
     def rig(self) -> Rig:
         """The new cameras; where the body's IMU sits on cam0 is kept from before."""
@@ -53,22 +69,23 @@ class Outcome:
         )
 
 
-def kalibr_text(outcome: Outcome, source: str) -> str:
+def kalibr_text(outcome: Outcome, source: str, report: str) -> str:
     """The camchain, with what was given of how the cameras sit on an IMU. The IMU's own noise is of another
-    file, `share calibrate imu` writes it."""
+    file, `share calibrate imu` writes it. report: the name of the file that says why it failed."""
     told = to_kalibr(outcome.rig, outcome.said, outcome.serial)
     chain = {key: value for key, value in told.items() if key != "imu0"}
     if "T_cam_imu" in chain["cam0"] and "cam1" in chain:  # by the new pair
         T_cam1_cam0 = np.array(chain["cam1"]["T_cn_cnm1"])
         chain["cam1"]["T_cam_imu"] = (T_cam1_cam0 @ chain["cam0"]["T_cam_imu"]).tolist()
-    verdict = "passed" if outcome.verdict.passed else "FAILED, see camera-report.json"
+    verdict = "passed" if outcome.verdict.passed else f"FAILED, see {report}"
     return f"# share calibrate camera {source}: {verdict}\n" + yaml.safe_dump(
         chain, sort_keys=False, default_flow_style=None
     )
 
 
 def to_json(outcome: Outcome) -> dict[str, Any]:
-    """Plain data: verdict, each camera, the mounting, each view."""
+    """Plain data: verdict, each camera, the mounting, each view. covariance: of `NAMES` of each camera and,
+    of two, xi of T_cam1_cam0 Exp(xi)."""
     verdict = outcome.verdict
     out: dict[str, Any] = {
         "passed": verdict.passed,
@@ -77,6 +94,7 @@ def to_json(outcome: Outcome) -> dict[str, Any]:
         "views_with_target": outcome.seen,
         "corner_sigma_px": outcome.solution.sigma_px,
         "cameras": [_camera(outcome, eye) for eye in range(len(outcome.covers))],
+        "covariance": outcome.solution.covariance.tolist(),
         "outlier_views": [outcome.views[k].name for k in verdict.outliers],
         "per_view": [
             {"name": view.name, "rms_px": rms.tolist(), "corners": [len(seen) for seen in view.seen]}
@@ -101,6 +119,7 @@ def _camera(outcome: Outcome, eye: int) -> dict[str, Any]:
         "rms_px": outcome.verdict.rms_px[eye],
         "rms_all_px": outcome.verdict.rms_all_px[eye],
         "corners_left_out": outcome.verdict.wrong[eye],
+        "lens_fits_to_px": outcome.reach(eye),
         "covered": cover.share,
         "missing": list(cover.missing),
     }
@@ -166,11 +185,16 @@ def _draw_where(panel: Any, outcome: Outcome, eye: int) -> None:
     camera, cover = outcome.solution.state.cameras[eye], outcome.covers[eye]
     extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
     panel.imshow(np.minimum(cover.cells, 40), cmap="YlGn", extent=extent, vmin=0, vmax=80, aspect="equal")
-    px = np.concatenate([view.seen[eye].px for view in outcome.views])
-    r = residuals(outcome.solution, eye)
-    inside = kept(r, outcome.solution.sigma_px)
-    panel.quiver(*px[inside].T, *r[inside].T, angles="xy", scale_units="xy", scale=0.01, width=0.0015)
+    px, r, inside = outcome.seen_by(eye)
+    some = np.flatnonzero(inside)[:: 1 + int(inside.sum()) // _ARROWS]
+    panel.quiver(*px[some].T, *r[some].T, angles="xy", scale_units="xy", scale=0.01, width=0.0015)
     panel.plot(*px[~inside].T, "x", color="#d1495b", markersize=4)
+    panel.set(xlim=extent[:2], ylim=extent[2:])
+    if (radius := outcome.reach(eye)) is not None:
+        turn = np.linspace(0, 2 * np.pi, 200)
+        panel.plot(
+            camera.cx + radius * np.cos(turn), camera.cy + radius * np.sin(turn), "--", color="#d1495b", lw=1
+        )
     panel.set(title=f"cam{eye}: {cover.share:.0%} of the image; residuals × 100, × left out")
 
 
@@ -185,7 +209,7 @@ def _draw_scatter(panel: Any, outcome: Outcome, eye: int) -> None:
 
 def _draw_views(panel: Any, outcome: Outcome, eye: int) -> None:
     rms = outcome.verdict.view_rms[:, eye]
-    colours = ["#d1495b" if k in outcome.verdict.outliers else "#00798c" for k in range(len(rms))]
+    colours = ["#d1495b" if far else "#00798c" for far in outcome.verdict.outlying[:, eye]]
     panel.bar(np.arange(len(rms)), np.nan_to_num(rms), color=colours)
     panel.set(title="each view's RMS, outliers red", xlabel="view", ylabel="px")
     panel.set_ylim(0, 1.2 * float(np.nanpercentile(rms, 95)) + 0.05)

@@ -11,18 +11,27 @@ from share.io.calibration import CAMCHAIN, imu_noise
 from share.io.section import read_yaml
 from share.io.target import read_target
 
-_FAILED = ".failed.yaml"
+_FAILED = ".failed"
 
 
-def camchain_path(out: Path, passed: bool) -> Path:
-    """Where a camchain goes: beside the one that is there, if the new one is not to be believed."""
-    chain = out / CAMCHAIN
-    return chain if passed or not chain.exists() else chain.with_suffix(_FAILED)
+def places(out: Path, passed: bool, *names: str) -> tuple[Path, ...]:
+    """Where files of one calibration go: under their names in `out`; or, if it is not to be believed and any
+    of them is there already, all beside them, as NAME.failed.EXT."""
+    paths = tuple(out / name for name in names)
+    kept = not passed and any(path.exists() for path in paths)
+    return tuple(failed(path) for path in paths) if kept else paths
+
+
+def failed(path: Path) -> Path:
+    """NAME.failed.EXT."""
+    return path.with_name(path.stem + _FAILED + path.suffix)
 
 
 def written(chain: Path) -> str:
-    """What `camchain_path` came to, for a person."""
-    return f"{chain} is written" + ("" if chain.name == CAMCHAIN else f"; {CAMCHAIN} is kept as it was")
+    """What `places` came to for a camchain, for a person."""
+    return f"{chain} is written" + (
+        "" if chain.name == CAMCHAIN else f"; {CAMCHAIN} is kept as it was, and its report"
+    )
 
 
 def says_noise(chain: Path, noise: ImuNoise) -> bool:

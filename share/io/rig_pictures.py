@@ -16,6 +16,7 @@ from share.geometry.camera import Camera, Rig
 from share.geometry.target import Target
 from share.io.board_views import Pictures, find_views, open_pictures
 from share.io.calibration import CAMCHAIN
+from share.io.rig_doubt import UNTOLD, RigDoubt, rig_doubt
 from share.types import F64, I64
 
 _ALONE = "for one camera, give --camera a camchain without cam1"
@@ -23,25 +24,30 @@ _ALONE = "for one camera, give --camera a camchain without cam1"
 
 @dataclass(frozen=True, eq=False)
 class RigPictures:
-    """rig: the cameras; before: T_imu_cam0 (4, 4) as it was given, if it was."""
+    """rig: the cameras; before: T_imu_cam0 (4, 4) as it was given, if it was; doubt: how well the cameras are
+    known."""
 
     name: str
     pictures: Pictures
     rig: Rig
     before: F64 | None
+    doubt: RigDoubt = UNTOLD
 
 
 def open_rig_pictures(source: str, camera: str | None) -> RigPictures:
     """Of a recording, or a folder with cam0/STAMP.png. camera: a camchain or a folder with one, in place
     of the source's own. Raises UsageError, ConfigError or DataError."""
-    chain = None if camera is None else str(_chain(camera))
+    path = None if camera is None else _chain(camera)
+    chain = None if path is None else str(path)
     first = open_pictures(source, (CAM0,), chain)
     if first.rig is None:
         raise UsageError(f"{source}: does not say what its cameras are like; give --camera FILE")
     two = first.rig.cam1 is not None
     pictures = open_pictures(source, (CAM0, CAM1), chain, _ALONE) if two else first
     own = first.rig.T_body_cam0 if first.rig.imu is not None else None
-    return RigPictures(source, pictures, first.rig, own if first.said is None else first.said.T_imu_cam0)
+    before = own if first.said is None else first.said.T_imu_cam0
+    doubt = UNTOLD if path is None else rig_doubt(path, first.rig)
+    return RigPictures(source, pictures, first.rig, before, doubt)
 
 
 def _chain(camera: str) -> Path:

@@ -107,7 +107,7 @@ def test_its_sigmas_are_honest() -> None:
                 for f, t in zip(solution.state.cameras, (LEFT, RIGHT), strict=True)
             ]
         )
-        nees.append(error @ np.linalg.solve(solution.covariance[:16, :16], error))
+        nees.append(error @ np.linalg.solve(solution.independent[:16, :16], error))
         assert solution.sigma_px == pytest.approx(0.2, rel=0.05)
     assert 110 < sum(nees) < 280  # chi-square of 12 x 16 = 192: its 1e-5 quantiles are about 117 and 285
 
@@ -129,7 +129,7 @@ def test_so_they_are_where_the_board_bends_anew_in_each_view() -> None:
         solution = calibrate(views, GRID, SIZE)
         error = intrinsics(solution.state.cameras[0]) - intrinsics(LEFT)
         z.append(error / solution.sigmas)
-        naive.append(error / np.sqrt(np.diag(solution.covariance)))
+        naive.append(error / np.sqrt(np.diag(solution.independent)))
     assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.5
     assert np.sqrt(np.mean(np.square(naive))) > 2.5
 
@@ -185,6 +185,13 @@ def test_the_views_that_are_chosen_reach_more_of_the_image_than_the_first(rng: n
         return coverage([one[k].seen[0].px for k in numbers], poses, GRID, SIZE).share
 
     assert reached(chosen) >= reached(list(range(8)))
+
+
+def test_of_views_that_are_nearly_copies_few_are_chosen(rng: np.random.Generator) -> None:
+    """A hand rests: each view comes ten times in a row."""
+    views = [View(f"{v.name}-{k}", v.seen[:1]) for v in _views(rng, 0.1, count=20) for k in range(10)]
+    chosen = choose(views, GRID, SIZE, 20)
+    assert len(chosen) == 20 and len({k // 10 for k in chosen}) >= 19
 
 
 def test_what_is_missing_is_said_in_words() -> None:

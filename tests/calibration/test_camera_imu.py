@@ -7,6 +7,7 @@ import pytest
 from camera_imu_sim import GRAVITY, NOISE, SHIFT_S, START_NS, T_IMU_CAM0, TARGET, Dance, Recorded, record
 
 from share.calibration.camera_imu import normal
+from share.calibration.camera_imu.batch import Batch
 from share.calibration.camera_imu.fit import Fit, fit
 from share.calibration.camera_imu.sights import sights
 from share.calibration.camera_imu.solve import arrow, solve
@@ -14,6 +15,7 @@ from share.calibration.camera_imu.spline import EDGE, ORDER, Curve
 from share.calibration.camera_imu.start import align
 from share.calibration.camera_imu.state import KNOTS, LOCAL, SHARED, State, nodes
 from share.calibration.camera_imu.verdict import compare, judge
+from share.calibration.projection import camera_of, intrinsics
 from share.errors import DataError, MisfitError
 from share.geometry import se3
 from share.types import F64
@@ -21,8 +23,10 @@ from share.types import F64
 SIGMAS = normal.Sigmas(0.1, 3e-3, 2e-2, huber=1e6)
 
 
-def calibrated(run: Recorded) -> Fit:
-    return fit(run.stamps_ns, run.views, TARGET, run.rig, run.imu, NOISE)
+def calibrated(run: Recorded, rig_covariance: F64 | None = None) -> Fit:
+    return fit(
+        run.stamps_ns, run.views, TARGET, run.rig, run.imu, NOISE, rig_covariance=rig_covariance
+    )  # fmt: skip
 
 
 def error(found: Fit) -> F64:
@@ -213,6 +217,50 @@ def test_an_inverted_extrinsic_is_told_from_a_wrong_one() -> None:
     assert not wrong.inverted and wrong.far
     d435i = se3.compose(np.eye(3), np.array([-0.00552, 0.0051, 0.01174]))  # turned by nothing
     assert compare(d435i, se3.inverse(d435i)).inverted and not compare(d435i, d435i).inverted
+
+
+RIG_SIGMAS = np.array([0.2, 0.2, 0.4, 0.4, 1e-3, 1e-3, 1e-4, 1e-4] * 2 + [2e-4] * 3 + [1e-4] * 3)
+
+
+def with_moved_cameras(run: Recorded, step: F64) -> Recorded:
+    """As one would be given it whose cameras are off by `step` (22,)."""
+    rig = run.rig
+    assert rig.cam1 is not None and rig.T_cam1_cam0 is not None
+    cam0, cam1 = (
+        camera_of(intrinsics(camera) + part, (camera.width, camera.height))
+        for camera, part in ((rig.cam0, step[:8]), (rig.cam1, step[8:16]))
+    )
+    return replace(
+        run, rig=replace(rig, cam0=cam0, cam1=cam1, T_cam1_cam0=rig.T_cam1_cam0 @ se3.exp(step[16:]))
+    )
+
+
+def test_other_cameras_move_it_as_the_derivatives_say(dance: Recorded, found: Fit) -> None:
+    step = RIG_SIGMAS * np.random.default_rng(3).choice([-0.1, 0.1], len(RIG_SIGMAS))
+    other = calibrated(with_moved_cameras(dance, step))
+    batch = Batch(found.sights, found.imu, NOISE)
+    moved = np.append(
+        se3.log(se3.inverse(found.T_imu_cam0) @ other.T_imu_cam0), other.shift_s - found.shift_s
+    )
+    predicted = batch.by_rig(found.state, found.sigmas) @ step
+    np.testing.assert_allclose(moved, predicted, atol=0.05 * np.abs(predicted[:3]).max())
+    assert np.abs(predicted[3:6]).max() > 2e-5  # m: it is worth looking at
+    np.testing.assert_allclose(moved[3:6], predicted[3:6], atol=0.05 * np.abs(predicted[3:6]).max())
+
+
+@pytest.mark.slow
+def test_sigmas_know_of_cameras_that_are_off() -> None:
+    """By what is stated of them: chi-square of 16 x 7, its 0.1 % quantiles."""
+    nees, naive = [], []
+    for seed in range(200, 216):
+        step = np.random.default_rng(seed).normal(0, RIG_SIGMAS)
+        run = with_moved_cameras(record(Dance(seed), 12.0, hz=8.0), step)
+        found = calibrated(run, np.diag(RIG_SIGMAS**2))
+        off = error(found)
+        nees.append(off @ np.linalg.solve(found.covariance, off))
+        naive.append(off @ np.linalg.solve(found.by_noise, off))
+    assert 71 < sum(nees) < 163, nees
+    assert sum(naive) > 2 * 163, naive  # held for exact it would not do
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ ALL = Coverage(np.full(GRID, 5), np.zeros((20, 2)), np.linspace(0.5, 1.0, 20))
 def _solution(residuals: list[F64], focal_sigma: float = 0.1) -> Solution:
     state = State((CAMERA,), np.eye(4), np.stack([np.eye(4)] * len(residuals)))
     covariance = np.diag([focal_sigma**2] * 2 + [0.01] * 6)
-    return Solution(state, covariance, np.zeros(len(covariance)), tuple((r,) for r in residuals), 0.2)
+    return Solution(state, covariance, np.zeros_like(covariance), tuple((r,) for r in residuals), 0.2)
 
 
 def _views(rng: np.random.Generator, count: int = 20) -> list[F64]:
@@ -55,7 +55,7 @@ def test_each_reason_is_given(rng: np.random.Generator) -> None:
         (_solution(_views(rng, 11)), ALL, "11 views, 12 needed"),
         (_solution(_views(rng), focal_sigma=1.5), ALL, "focal length known to 0.30%"),
         (_solution(_views(rng)), half, "corners in 50% of the image"),
-        (_solution(spoilt), ALL, "100 of 1000 corners do not fit"),
+        (_solution(spoilt), ALL, "100 of 1000 corners do not fit within 0.5 px"),
         (blurred, ALL, "px RMS, at most 0.5"),
     ):
         reasons = judge(solution, [cover]).reasons

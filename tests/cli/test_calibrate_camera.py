@@ -94,6 +94,8 @@ def test_a_known_camera_is_found_from_a_folder_of_pictures(
     report = json.loads(done.out)
     assert report == json.loads((out / "camera-report.json").read_text())
     assert report["passed"]
+    sigmas = np.sqrt(np.diag(report["covariance"]))
+    np.testing.assert_allclose(sigmas, list(report["cameras"][0]["sigmas"].values()))
     assert "row" not in [view["name"] for view in report["per_view"]]
     assert (out / "camera-report.png").read_bytes().startswith(b"\x89PNG")
 
@@ -107,9 +109,15 @@ def test_what_is_not_to_be_believed_does_not_replace_what_was(
     first = share(*asked, out)
     assert first.code == 1 and "kalibr_imucam_chain.yaml is written)" in first.err
     assert "FAILED" in (out / "kalibr_imucam_chain.yaml").read_text()
-    (out / "kalibr_imucam_chain.yaml").write_text("a good one")
+    good = ("kalibr_imucam_chain.yaml", "camera-report.json", "camera-report.png")
+    for name in good:
+        (out / name).write_text("a good one")
     again = share(*asked, out)
     assert again.code == 1 and again.err.count("\n") == 1
     assert "kalibr_imucam_chain.failed.yaml is written; kalibr_imucam_chain.yaml is kept" in again.err
-    assert (out / "kalibr_imucam_chain.yaml").read_text() == "a good one"
-    assert "FAILED" in (out / "kalibr_imucam_chain.failed.yaml").read_text()
+    assert [(out / name).read_text() for name in good] == ["a good one"] * 3
+    failed = (out / "kalibr_imucam_chain.failed.yaml").read_text()
+    assert "FAILED, see camera-report.failed.json" in failed
+    assert not json.loads((out / "camera-report.failed.json").read_text())["passed"]
+    assert (out / "camera-report.failed.png").read_bytes().startswith(b"\x89PNG")
+    assert "camera-report.failed.json" in again.out

@@ -12,10 +12,12 @@ from board_pictures import printed
 from camera_imu_sim import NOISE, SHIFT_S, T_IMU_CAM0, Dance, record
 from shell import Done
 
+from share.calibration.projection import intrinsics
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.geometry.target import CharucoBoard
 from share.io.calibration import read_calibration
+from share.io.camera_report import NAMES
 from share.io.kalibr import to_kalibr
 
 SECONDS, HZ = 7.5, 8.0
@@ -69,13 +71,26 @@ def test_mounting_and_offset_are_found_and_an_inverted_one_is_said(
     report = json.loads(done.out)
     assert report == json.loads((tmp_path / "camera-imu-report.json").read_text())
     assert report["passed"] and report["given"]["inverted"]
+    assert report["sigmas_by_cameras"] is None and "no camera-report.json" in report["cameras_known_by"]
     assert (tmp_path / "camera-imu-report.png").read_bytes().startswith(b"\x89PNG")
+
+
+def badly_known(dance: Path, folder: Path) -> Path:
+    """bare.yaml and a report beside it, of half a pixel: 2e-3 rad."""
+    folder.mkdir()
+    (folder / "kalibr_imucam_chain.yaml").write_text((dance / "bare.yaml").read_text())
+    parameters = dict(zip(NAMES, intrinsics(CAMERA).tolist(), strict=True))
+    covariance = np.diag([0.3, 0.3, 0.5, 0.5, 1e-3, 1e-3, 1e-4, 1e-4]) ** 2
+    told = {"passed": False, "cameras": [{"parameters": parameters}], "covariance": covariance.tolist()}
+    (folder / "camera-report.json").write_text(json.dumps(told))
+    return folder
 
 
 def test_what_is_not_to_be_believed_fails_and_leaves_what_was_there(
     share: Callable[..., Done], dance: Path, tmp_path: Path
 ) -> None:
-    """Beside a measured IMU chain and a camchain that somebody believes in."""
+    """Beside a measured IMU chain and a camchain that somebody believes in. The cameras are known badly, by
+    the report beside their own camchain, which did not believe in them."""
     proud = yaml.safe_load((dance / "imu.yaml").read_text())
     proud["imu0"]["gyroscope_noise_density"] /= 30
     (tmp_path / "proud.yaml").write_text(yaml.safe_dump(proud))
@@ -85,9 +100,16 @@ def test_what_is_not_to_be_believed_fails_and_leaves_what_was_there(
     }
     for name, text in before.items():
         (tmp_path / name).write_text(text)
-    done = share(*asked(dance, tmp_path, "--imu", tmp_path / "proud.yaml"))
+    known = badly_known(dance, tmp_path / "known")
+    done = share(*asked(dance, tmp_path, "--imu", tmp_path / "proud.yaml", camera=str(known)))
     assert done.code == 1
-    kept, failed = done.err.splitlines()
+    doubted, kept, failed = done.err.splitlines()
+    assert "camera-report.json does not believe these cameras" in doubted
+    assert f"cameras: as well known as {known / 'camera-report.json'} says" in done.out
+    assert "position known to 2." in failed and "calibrate the cameras better first" in failed
+    told = json.loads((tmp_path / "camera-imu-report.failed.json").read_text())
+    parts = [np.array(told[f"sigmas{part}"]["rotation_rad"]) for part in ("", "_by_noise", "_by_cameras")]
+    np.testing.assert_allclose(parts[0] ** 2, parts[1] ** 2 + parts[2] ** 2)
     assert "kalibr_imu_chain.yaml is of other noise and is kept; used was that of --imu" in kept
     assert "not to be believed" in failed and "gyroscope's residuals" in failed
     assert "kalibr_imucam_chain.failed.yaml is written; kalibr_imucam_chain.yaml is kept" in failed

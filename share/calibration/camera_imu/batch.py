@@ -9,7 +9,7 @@ import numpy as np
 from share.calibration.camera_imu import normal
 from share.calibration.camera_imu.normal import Sigmas
 from share.calibration.camera_imu.sights import Sights, seen
-from share.calibration.camera_imu.solve import Arrow, arrow, solve
+from share.calibration.camera_imu.solve import Arrow, arrow, border_steps, gathered, solve
 from share.calibration.camera_imu.start import NODE_S
 from share.calibration.camera_imu.state import SHARED, State
 from share.calibration.corners import LEAST_SPREAD, spread
@@ -103,8 +103,14 @@ class Batch:
         return left[:, :3], left[:, 3:]
 
     def covariance(self, state: State, sigmas: Sigmas) -> F64:
-        """(7, 7) of the mounting and the shift."""
+        """(7, 7) of the mounting and the shift, if intrinsics and T_cam1_cam0 are exact."""
         return _solved(self._at(state, sigmas)[0], 0.0)[2][:7, :7]
+
+    def by_rig(self, state: State, sigmas: Sigmas) -> F64:
+        """(7, P): where mounting and shift go if the rig's own parameters, in the order of
+        `bundle.Solution`, are moved by one each."""
+        falls = normal.rig_sensitivity(state, self.sights, sigmas)
+        return -border_steps(self._at(state, sigmas)[0], *gathered(falls, state))[:7]
 
 
 def _solved(system: Arrow, damping: float) -> tuple[F64, F64, F64]:

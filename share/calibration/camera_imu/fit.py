@@ -36,12 +36,14 @@ _ROUNDS = 3
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What was found. covariance (7, 7): of T_imu_cam0 Exp(xi) and the shift. sigmas: what residuals were
-    judged by; stated: as the IMU's file has them. of each camera corners (C, 2) px and their frames (C,);
-    gyro, accel (N, 3): residuals. stamps_ns: of pictures, camera's clock; imu: samples used."""
+    """What was found. Of T_imu_cam0 Exp(xi) and the shift two covariances (7, 7): by_noise of corners and
+    IMU; by_rig of what intrinsics and T_cam1_cam0 may be off, None where nobody told that. sigmas: what
+    residuals were judged by; stated: as the IMU's file has them. of each camera corners (C, 2) px and their
+    frames (C,); gyro, accel (N, 3): residuals. stamps_ns: of pictures, camera's clock; imu: samples used."""
 
     state: State
-    covariance: F64
+    by_noise: F64
+    by_rig: F64 | None
     sigmas: Sigmas
     stated: Sigmas
     sights: Sights
@@ -60,22 +62,29 @@ class Fit:
         return self.state.shift_s
 
     @property
+    def covariance(self) -> F64:
+        """(7, 7): both together. Other pictures told the rig, so they are independent."""
+        return self.by_noise if self.by_rig is None else self.by_noise + self.by_rig
+
+    @property
     def sigma_rotation(self) -> F64:
         """(3,) rad, about the IMU's axes."""
-        return self._in_imu(slice(0, 3))
+        return self.sigmas_of(self.covariance)[:3]
 
     @property
     def sigma_position(self) -> F64:
         """(3,) m, of cam0 along the IMU's axes."""
-        return self._in_imu(slice(3, 6))
+        return self.sigmas_of(self.covariance)[3:6]
 
     @property
     def sigma_shift(self) -> float:
-        return float(np.sqrt(self.covariance[SHIFT, SHIFT]))
+        return float(self.sigmas_of(self.covariance)[SHIFT])
 
-    def _in_imu(self, part: slice) -> F64:
-        R = self.T_imu_cam0[:3, :3]
-        return np.sqrt(np.diag(R @ self.covariance[part, part] @ R.T))
+    def sigmas_of(self, covariance: F64) -> F64:
+        """(7,) rad, m, s, along the IMU's axes, of one of the covariances (7, 7)."""
+        turn = np.eye(7)
+        turn[:3, :3] = turn[3:6, 3:6] = self.T_imu_cam0[:3, :3]
+        return np.sqrt(np.diag(turn @ covariance @ turn.T))
 
 
 def fit(
@@ -87,9 +96,11 @@ def fit(
     noise: ImuNoise,
     within_s: float = 0.5,
     told: Callable[[int, int], None] = lambda done, total: None,
+    rig_covariance: F64 | None = None,
 ) -> Fit:
-    """From views at stamps (F,) rising and the IMU of one recording; intrinsics and T_cam1_cam0 are `rig`'s.
-    told: rounds done, of how many.
+    """From views at stamps (F,) rising and the IMU of one recording; intrinsics and T_cam1_cam0 are `rig`'s,
+    with a covariance (P, P) in the order of `bundle.Solution` where it is known. told: rounds done, of how
+    many.
 
     Raises DataError where something is missing or not told, MisfitError where the two are not of one motion.
     """
@@ -110,10 +121,14 @@ def fit(
         sigmas = batch.spread(state, stated)
     told(_ROUNDS, _ROUNDS)
     gyro, accel = batch.inertial(state)
-    covariance = batch.covariance(state, sigmas)
+    by_noise, by_rig = batch.covariance(state, sigmas), None
+    if rig_covariance is not None:
+        follows = batch.by_rig(state, sigmas)
+        by_rig = follows @ rig_covariance @ follows.T
     return Fit(
-        state, covariance, sigmas, stated, batch.sights, batch.imu, batch.corners(state), gyro, accel, found
-    )
+        state, by_noise, by_rig, sigmas, stated, batch.sights, batch.imu, batch.corners(state), gyro, accel,
+        found,
+    )  # fmt: skip
 
 
 def _during(imu: ImuBatch, state: State) -> ImuBatch:

@@ -7,7 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from share.calibration.camera_imu.sights import Sights, pose_normal
+from share.calibration.bundle import shared
+from share.calibration.camera_imu.sights import Sights, pose_normal, rig_normal
 from share.calibration.camera_imu.spline import ORDER, Curve
 from share.calibration.camera_imu.state import GRAVITY, KNOTS, LOCAL, MOUNT, SHARED, SHIFT, State, twist
 from share.geometry import se3
@@ -69,6 +70,15 @@ def _add_sights(out: Normal, state: State, sights: Sights, sigmas: Sigmas) -> fl
     np.add.at(out.H, segment, J.swapaxes(1, 2) @ frames.H @ J)
     np.add.at(out.g, segment, (J.swapaxes(1, 2) @ frames.g[..., None])[..., 0])
     return frames.cost
+
+
+def rig_sensitivity(state: State, sights: Sights, sigmas: Sigmas) -> F64:
+    """By how much each segment's gradient (S, LOCAL) falls with the rig's own parameters, (S, LOCAL, P):
+    intrinsics and T_cam1_cam0, which are not sought."""
+    T, J, segment = pose_derivatives(state, sights.stamps_ns)
+    out: F64 = np.zeros((state.curve.segments, LOCAL, shared(len(sights.cameras))))
+    np.add.at(out, segment, J.swapaxes(1, 2) @ rig_normal(sights, T, sigmas.px, sigmas.huber))
+    return out
 
 
 def inertial(state: State, imu: ImuBatch) -> tuple[F64, F64, I64]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from share.calibration.bundle import View
-from share.calibration.projection import project
+from share.calibration.bundle import View, shared
+from share.calibration.projection import INTRINSICS, moved, project
 from share.geometry import se3
 from share.geometry.camera import Camera
 from share.geometry.target import Target
@@ -59,12 +59,30 @@ def sights(
 def seen(sights: Sights, eye: int, T_target_cam0: F64) -> tuple[F64, F64]:
     """Residuals (C, 2) px of a camera, seen less predicted, and the derivatives (C, 2, 6) of what is
     predicted by eta of T_target_cam0 Exp(eta). Behind the camera it is NaN."""
-    one, mount = sights.corners[eye], sights.mounts[eye]
-    T = se3.inverse(T_target_cam0)[one.frame]
-    at = (T[:, :3, :3] @ one.points[..., None])[..., 0] + T[:, :3, 3]
-    moved = np.concatenate([se3.hat(at), np.broadcast_to(-np.eye(3), (len(at), 3, 3))], axis=2)
+    one, mount, at = sights.corners[eye], sights.mounts[eye], _in_cam0(sights, eye, T_target_cam0)
+    shifted = np.concatenate([se3.hat(at), np.broadcast_to(-np.eye(3), (len(at), 3, 3))], axis=2)
     px, _, by = project(sights.cameras[eye], se3.transform(mount, at))
-    return one.px - px, by @ (mount[:3, :3] @ moved)
+    return one.px - px, by @ (mount[:3, :3] @ shifted)
+
+
+def by_rig(sights: Sights, eye: int, T_target_cam0: F64) -> F64:
+    """Derivatives (C, 2, S) of what `seen` predicts, by 8 intrinsics of each camera and, of two, xi of
+    T_cam1_cam0 Exp(xi): the order of `bundle.Solution`."""
+    points, by_mount = moved(sights.mounts[eye], _in_cam0(sights, eye, T_target_cam0))
+    _, by_intrinsics, by = project(sights.cameras[eye], points)
+    out = np.zeros((len(points), 2, shared(len(sights.cameras))))
+    out[:, :, INTRINSICS * eye : INTRINSICS * (eye + 1)] = by_intrinsics
+    if eye == 1:
+        out[:, :, -6:] = by @ by_mount
+    return out
+
+
+def _in_cam0(sights: Sights, eye: int, T_target_cam0: F64) -> F64:
+    """The points (C, 3) of a camera's corners."""
+    one = sights.corners[eye]
+    T = se3.inverse(T_target_cam0)[one.frame]
+    at: F64 = (T[:, :3, :3] @ one.points[..., None])[..., 0] + T[:, :3, 3]
+    return at
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,10 +104,27 @@ def pose_normal(sights: Sights, T_target_cam0: F64, sigma_px: float, huber: floa
         d = np.linalg.norm(r, axis=1) / sigma_px
         if np.isnan(d).any():
             return PoseNormal(H, g, np.inf)
-        root = np.sqrt(np.minimum(1, huber / np.maximum(d, 1e-12)))[:, None] / sigma_px
+        root = _roots(d, huber)[:, None] / sigma_px
         A, b = J * root[..., None], r * root
         first = np.flatnonzero(np.diff(one.frame, prepend=-1))
         H[one.frame[first]] += np.add.reduceat(A.swapaxes(1, 2) @ A, first)
         g[one.frame[first]] += np.add.reduceat((A.swapaxes(1, 2) @ b[..., None])[..., 0], first)
         cost += float(np.where(d <= huber, d * d / 2, huber * (d - huber / 2)).sum())
     return PoseNormal(H, g, cost)
+
+
+def rig_normal(sights: Sights, T_target_cam0: F64, sigma_px: float, huber: float) -> F64:
+    """What the normal equations have between each frame's eta and the rig's own parameters, (F, 6, S), by
+    the weights of `pose_normal`."""
+    out = np.zeros((len(T_target_cam0), 6, shared(len(sights.cameras))))
+    for eye, one in enumerate(sights.corners):
+        r, J = seen(sights, eye, T_target_cam0)
+        weight = (_roots(np.linalg.norm(r, axis=1) / sigma_px, huber) / sigma_px) ** 2
+        crossed = J.swapaxes(1, 2) @ (by_rig(sights, eye, T_target_cam0) * weight[:, None, None])
+        np.add.at(out, one.frame, crossed)
+    return out
+
+
+def _roots(d: F64, huber: float) -> F64:
+    """Of Huber's weights (C,) of corners that miss by d (C,) sigmas."""
+    return np.sqrt(np.minimum(1, huber / np.maximum(d, 1e-12)))

@@ -34,20 +34,30 @@ def arrow(normal: Normal, state: State) -> Arrow:
     """Of all segments together. B = SHARED + 6 M."""
     S, K = state.curve.segments, len(state.curve.p)
     border = SHARED + state.biases.size
-    blocks, edge, g_knots = np.zeros((K, ORDER, 6, 6)), np.zeros((K, 6, border)), np.zeros((K, 6))
-    corner, g_border = np.zeros((border, border)), np.zeros(border)
+    blocks, edge = np.zeros((K, ORDER, 6, 6)), np.zeros((K, 6, border))
+    corner = np.zeros((border, border))
     spans = _spans(state)
     for a in range(ORDER):
         rows = slice(6 * a, 6 * a + 6)
-        g_knots[a : a + S] += normal.g[:, rows]
         for b in range(a, ORDER):
             blocks[a : a + S, b - a] += normal.H[:, rows, 6 * b : 6 * b + 6]
         for part, columns in spans:
             edge[a : a + S][part][:, :, columns] += normal.H[part, rows, KNOTS:LOCAL]
     for part, columns in spans:
         corner[np.ix_(columns, columns)] += normal.H[part, KNOTS:, KNOTS:].sum(axis=0)
-        g_border[columns] += normal.g[part, KNOTS:].sum(axis=0)
-    return Arrow(_band(blocks), edge.reshape(6 * K, border), corner, g_knots.reshape(-1), g_border)
+    return Arrow(_band(blocks), edge.reshape(6 * K, border), corner, *gathered(normal.g, state))
+
+
+def gathered(g: F64, state: State) -> tuple[F64, F64]:
+    """What segments have by their own columns, (S, LOCAL, ...), of the knots (6 K, ...) and of the border
+    (B, ...)."""
+    S, K, more = state.curve.segments, len(state.curve.p), g.shape[2:]
+    knots, border = np.zeros((K, 6, *more)), np.zeros((SHARED + state.biases.size, *more))
+    for a in range(ORDER):
+        knots[a : a + S] += g[:, 6 * a : 6 * a + 6]
+    for part, columns in _spans(state):
+        border[columns] += g[part, KNOTS:].sum(axis=0)
+    return knots.reshape(6 * K, *more), border
 
 
 def _spans(state: State) -> list[tuple[slice, np.ndarray]]:
@@ -89,3 +99,14 @@ def solve(system: Arrow, damping: float) -> tuple[F64, F64, F64]:
     covariance = np.linalg.inv(corner - system.edge.T @ back[:, :-1])
     step = covariance @ (system.g_border - system.edge.T @ back[:, -1])
     return (back[:, -1] - back[:, :-1] @ step).reshape(-1, 6), step, (covariance + covariance.T) / 2
+
+
+def border_steps(system: Arrow, knots: F64, border: F64) -> F64:
+    """The border's steps (B, G) for G other gradients, of the knots (6 K, G) and of the border (B, G)."""
+    from scipy.linalg import cho_solve_banded, cholesky_banded
+
+    back = cho_solve_banded((cholesky_banded(system.band), False), np.column_stack([system.edge, knots]))
+    size = system.edge.shape[1]
+    left = system.corner - system.edge.T @ back[:, :size]
+    out: F64 = np.linalg.solve(left, border - system.edge.T @ back[:, size:])
+    return out

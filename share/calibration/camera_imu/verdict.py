@@ -62,7 +62,7 @@ def judge(fit: Fit, limits: Limits = Limits()) -> Verdict:
     accel = rough(fit.imu.stamps_ns, fit.accel) / fit.stated.accel
     turning, moving = _excitation(fit)
     reasons = [
-        *_corner_reasons(fit, rms, wrong, limits),
+        *_corner_reasons(fit, rms, limits),
         *_motion_reasons(turning, moving, limits),
         *_imu_reasons(gyro, accel, fit.state.gravity, limits),
         *_sigma_reasons(fit, limits),
@@ -77,7 +77,7 @@ def _excitation(fit: Fit) -> tuple[F64, F64]:
     return turning, moving
 
 
-def _corner_reasons(fit: Fit, rms: tuple[float, ...], wrong: tuple[int, ...], limits: Limits) -> list[str]:
+def _corner_reasons(fit: Fit, rms: tuple[float, ...], limits: Limits) -> list[str]:
     out = []
     for eye, residuals in enumerate(fit.corners):
         if len(residuals) and not rms[eye] <= limits.rms_px:
@@ -85,9 +85,11 @@ def _corner_reasons(fit: Fit, rms: tuple[float, ...], wrong: tuple[int, ...], li
                 f"cam{eye}: {rms[eye]:.2f} px RMS, at most {limits.rms_px:g}: blur, or --target or "
                 "intrinsics of something else"
             )
-        if wrong[eye] > limits.wrong * len(residuals):
+        lost = corners.lost(residuals, fit.sigmas.px, limits.rms_px)
+        if lost > limits.wrong * len(residuals):
             out.append(
-                f"cam{eye}: {wrong[eye]} of {len(residuals)} corners do not fit, at most {limits.wrong:.0%}"
+                f"cam{eye}: {lost} of {len(residuals)} corners do not fit within {limits.rms_px:g} px, at "
+                f"most {limits.wrong:.0%}"
             )
     return out
 
@@ -124,16 +126,24 @@ def _imu_reasons(gyro: float, accel: float, gravity: F64, limits: Limits) -> lis
 
 
 def _sigma_reasons(fit: Fit, limits: Limits) -> list[str]:
-    told = (
-        ("rotation", float(np.degrees(fit.sigma_rotation).max()), limits.rotation_deg, "deg"),
-        ("position", 1e3 * float(fit.sigma_position.max()), limits.position_mm, "mm"),
-        ("time offset", 1e3 * fit.sigma_shift, limits.shift_ms, "ms"),
+    whole = _three(fit.sigmas_of(fit.covariance))
+    noise = _three(fit.sigmas_of(fit.by_noise))
+    names = (
+        ("rotation", limits.rotation_deg, "deg"),
+        ("position", limits.position_mm, "mm"),
+        ("time offset", limits.shift_ms, "ms"),
     )
     return [
-        f"{name} known to {sigma:.2g} {unit} (one sigma), {limit:g} needed: record longer, turn quicker"
-        for name, sigma, limit, unit in told
+        f"{name} known to {sigma:.3g} {unit} (one sigma), {limit:g} needed: "
+        + ("record longer, turn quicker" if alone**2 > sigma**2 / 2 else "calibrate the cameras better first")
+        for (name, limit, unit), sigma, alone in zip(names, whole, noise, strict=True)
         if not sigma <= limit
     ]
+
+
+def _three(sigmas: F64) -> tuple[float, float, float]:
+    """The largest of seven sigmas: deg, mm, ms."""
+    return float(np.degrees(sigmas[:3]).max()), 1e3 * float(sigmas[3:6].max()), 1e3 * float(sigmas[6])
 
 
 @dataclass(frozen=True)

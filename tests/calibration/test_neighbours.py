@@ -1,0 +1,59 @@
+"""Corners by their neighbours, some of which were found wrongly."""
+
+import numpy as np
+
+from share.calibration.neighbours import by_neighbours
+from share.geometry.target import AprilGrid
+from share.types import F64
+
+BOARD = AprilGrid().corners[:, :2]
+H = np.array([[380.0, -60.0, 40.0], [45.0, -330.0, 400.0], [0.12, -0.2, 1.0]])
+
+
+def seen() -> F64:
+    at = np.column_stack([BOARD, np.ones(len(BOARD))]) @ H.T
+    return at[:, :2] / at[:, 2:]
+
+
+def test_without_errors_each_is_where_it_is() -> None:
+    np.testing.assert_allclose(by_neighbours(BOARD, seen()), seen(), atol=1e-6)
+
+
+def test_those_found_wrongly_or_not_at_all_change_nothing(rng: np.random.Generator) -> None:
+    """A sixth off by many pixels, one in ten missing, the others within 0.1 px."""
+    px = seen() + rng.normal(0, 0.1, BOARD.shape)
+    wrong = rng.random(len(px)) < 1 / 6
+    px[wrong] += rng.choice([-1, 1], (wrong.sum(), 2)) * rng.uniform(3, 9, (wrong.sum(), 2))
+    px[rng.random(len(px)) < 0.1] = np.nan
+    off = np.linalg.norm(by_neighbours(BOARD, px) - seen(), axis=1)
+    assert np.median(off) < 0.15 and np.quantile(off, 0.97) < 0.6
+
+
+def test_a_corner_does_not_tell_of_itself(rng: np.random.Generator) -> None:
+    px = seen()
+    px[70] += 5
+    np.testing.assert_allclose(by_neighbours(BOARD, px)[70], seen()[70], atol=1e-6)
+
+
+def test_too_few_tell_nothing() -> None:
+    px = np.full(BOARD.shape, np.nan)
+    px[:6] = seen()[:6]
+    assert np.isnan(by_neighbours(BOARD, px)).all()
+    assert by_neighbours(np.empty((0, 2)), np.empty((0, 2))).shape == (0, 2)
+
+
+def test_neighbours_on_one_line_are_no_error() -> None:
+    line = np.column_stack([np.arange(8.0), np.zeros(8)])
+    assert by_neighbours(line, 10 * line).shape == (8, 2)
+
+
+def test_corners_that_lie_anywhere_are_no_error(rng: np.random.Generator) -> None:
+    """As by a --target of other columns; also many in one place, or in whole pixels."""
+    for px in (
+        rng.uniform(0, 480, BOARD.shape),
+        np.repeat(rng.uniform(0, 480, (36, 2)), 4, axis=0),
+        np.full(BOARD.shape, 7.0),
+        rng.integers(0, 4, BOARD.shape).astype(float),
+        np.column_stack([np.arange(144.0), np.arange(144.0)]),
+    ):
+        assert by_neighbours(BOARD, px).shape == px.shape
