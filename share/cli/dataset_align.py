@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from share.mocap.options import FitOptions
 
 _CLOCK = ("device", "offset s", "± ms", "drift ppm", "alike", "next")
-_MOUNTING = ("body deg", "±", "body mm", "±", "tilt deg")
+_MOUNTING = ("body deg", "±", "body mm", "±", "up", "tilt deg")
 _LEFT = ("left mm", "left deg", "doubted %", "gaps", "truth s")
 
 
@@ -32,7 +32,7 @@ _LEFT = ("left mm", "left deg", "doubted %", "gaps", "truth s")
     multiple=True,
     required=True,
     metavar="[NAME=]FILE",
-    help="What the motion capture saw: Vicon's CSV, TUM, or CSV with t[ns], x y z, qw qx qy qz.",
+    help="What the motion capture saw: Vicon's or Motive's CSV, TUM, or CSV with t[ns], x y z, qw qx qy qz.",
 )
 @click.option(
     "--body",
@@ -127,8 +127,8 @@ def align(
         found = write_session(work, devices, stages)
     click.echo(json.dumps(found) if as_json else _text(found))
     for name, one in found.items():
-        for doubt in one["doubts"]:
-            click.echo(f"share: {name}: {doubt}", err=True)
+        for line in (*_said_of_up(one), *one["doubts"]):
+            click.echo(f"share: {name}: {line}", err=True)
     if not as_json:
         click.echo(f"{out}: ready; `share evaluate run {out} --virtual --out RUN` plays it")
 
@@ -229,6 +229,10 @@ def _mounted(chosen: FitOptions, mounting: str | None) -> FitOptions:
     return replace(chosen, T_body_mocap=T, guess_sigma=sigma)
 
 
+def _said_of_up(one: dict[str, Any]) -> list[str]:
+    return [] if one["up"] == "z" else [f"the motion capture has {one['up']} up; in the session z is"]
+
+
 def _text(found: dict[str, Any]) -> str:
     """A line a device."""
     rows = [
@@ -243,6 +247,7 @@ def _text(found: dict[str, Any]) -> str:
             f"{one['body_turned_sigma_deg']:.2f}",
             f"{one['body_shifted_mm']:.1f}",
             f"{one['body_shifted_sigma_mm']:.1f}",
+            one["up"],
             f"{one['tilt_deg']:.3f}",
             f"{one['left_mm']:.1f}",
             f"{one['left_deg']:.2f}",

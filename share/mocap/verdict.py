@@ -1,19 +1,56 @@
-"""How well a recording told where the motion capture's body sits."""
+"""Whether a fit can be believed, and what its recording did not tell."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from share.errors import MisfitError
 from share.mocap.fit import Fit
 from share.types import F64
 
 MOST_TURN = np.radians(0.1)  # one sigma on the worst axis; more is said
 MOST_SHIFT = 0.003  # m, likewise
+MOST_DOUBTED = 1 / 3  # of the poses: markers that are swapped for longer leave too little to go by
+_SAY_DOUBTED = 0.1
+MOST_LEFT = 3.0  # times what was said of the mocap's noise; raw ones come to 0.3, a mirrored one to 3.6
+_SAY_LEFT = 1.7
 
 
 def sigmas(fit: Fit) -> F64:
     """(10,) of `fit.cov_shared`: tilt (2) rad, body rotation (3) rad and position (3) m, offset s, drift."""
     return np.asarray(np.sqrt(np.diag(fit.cov_shared)), np.float64)
+
+
+def check_fit(fit: Fit) -> None:
+    """Raises MisfitError for a fit that comes together without telling of one motion, as with a mirrored
+    world it may."""
+    left = fit.residuals
+    if left.doubted > MOST_DOUBTED:
+        raise MisfitError(
+            f"mocap and IMU do not tell of one motion: {100 * left.doubted:.0f} % of the mocap's poses are "
+            "elsewhere; were markers swapped for long (cut there), or is an axis mirrored? "
+            "Export as the system shows it"
+        )
+    if left.position_sigmas > MOST_LEFT:
+        raise MisfitError(
+            f"mocap and IMU do not tell of one motion: {_noisy(fit)} (--sigma-mm); is an axis mirrored, or a "
+            "scale wrong? If the motion capture is so noisy, say so"
+        )
+
+
+def doubts(fit: Fit) -> list[str]:
+    """What is not as it should be, each in a line."""
+    left, out = fit.residuals, []
+    if (told := unsure(fit)) is not None:
+        out.append(told)
+    if left.doubted > _SAY_DOUBTED:
+        out.append(
+            f"{100 * left.doubted:.0f} % of the motion capture's poses are elsewhere and do not count; were "
+            "its markers swapped?"
+        )
+    if left.position_sigmas > _SAY_LEFT:
+        out.append(f"{_noisy(fit)}; say by --sigma-mm how noisy the motion capture is, or calibrate it anew")
+    return out
 
 
 def unsure(fit: Fit) -> str | None:
@@ -27,3 +64,8 @@ def unsure(fit: Fit) -> str | None:
         f"{np.degrees(MOST_TURN):.1f} deg, {MOST_SHIFT * 1e3:.0f} mm); record a minute in which the device "
         "turns about all three axes, by a radian or more each"
     )
+
+
+def _noisy(fit: Fit) -> str:
+    left = fit.residuals
+    return f"{left.position_mm:.1f} mm rms are left, {left.position_sigmas:.1f} times the noise that was said"
