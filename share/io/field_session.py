@@ -82,6 +82,8 @@ def found_of(device: Device) -> dict[str, Any]:
         "body_shifted_sigma_mm": float(sigma[5:8].max() * 1e3),
         "up": fit.up,
         "tilt_deg": fit.tilt_deg,
+        "too_long_percent": (100 * fit.too_long).tolist(),
+        "too_long_sigma_percent": (100 * fit.too_long_sigma).tolist(),
         "left_mm": fit.residuals.position_mm,
         "left_deg": fit.residuals.rotation_deg,
         "left_sigmas": fit.residuals.position_sigmas,

@@ -77,6 +77,8 @@ def mocap_json(fit: Fit, name: str, truth: str, checked: Check | None) -> dict[s
             "timeshift_s": float(sigma[8]),
             "drift_ppm": float(sigma[9] * 1e6),
         },
+        "too_long_percent": (100 * fit.too_long).tolist(),
+        "too_long_sigma_percent": (100 * fit.too_long_sigma).tolist(),
         "unsure": unsure(fit),
         "doubts": doubts(fit),
         "residuals": {

@@ -95,7 +95,7 @@ class Batch:
         return Solved(state, chain, seen, weight, normal, solve(normal, 0.0)[2])
 
     @property
-    def _share(self) -> float:
+    def share(self) -> float:
         """What one mocap sample counts for: samples denser than they err independently share."""
         return min(1.0, self.options.independent_hz * self.mocap.spacing_ns * 1e-9)
 
@@ -109,7 +109,7 @@ class Batch:
     def _measure(self, state: State) -> tuple[Chain, Sightings, float]:
         chain = imu_chain(state, self.imu, self.noise, self.options.gravity, self.breaks)
         seen = self._seen(state)
-        robust = -6 * self.options.cauchy**2 * np.log(self._weight(seen)).sum() * self._share
+        robust = -6 * self.options.cauchy**2 * np.log(self._weight(seen)).sum() * self.share
         first = np.concatenate([state.gyro_bias[0], state.accel_bias[0]]) / _BIAS_SIGMA
         prior = (self._prior() * self._strayed(state) ** 2).sum()
         return chain, seen, float((chain.residual**2).sum() + robust + (first**2).sum() + prior)
@@ -119,7 +119,7 @@ class Batch:
         return sightings(state, self.imu, self.options.gravity, t, T, self._sigma())
 
     def _normal(self, state: State, chain: Chain, seen: Sightings) -> Normal:
-        weight = self._weight(seen) * self._share
+        weight = self._weight(seen) * self.share
         out = normal_equations(chain, seen, weight, self._prior(), self._strayed(state), len(state.p))
         out.diagonal[0, 9:, 9:] += np.diag(_BIAS_SIGMA**-2)
         out.b_nodes[0, 9:] += np.concatenate([state.gyro_bias[0], state.accel_bias[0]]) / _BIAS_SIGMA**2

@@ -20,6 +20,7 @@ from share.mocap.mocap import Mocap, check_imu, holes
 from share.mocap.offset import coarse_offset
 from share.mocap.options import FitOptions
 from share.mocap.residuals import Residuals, residuals
+from share.mocap.scale import axis_scales
 from share.mocap.solve import node_covariances
 from share.mocap.start import first_state, hand_eye, standing, up_in
 from share.types import F64, I64, ImuBatch
@@ -42,6 +43,8 @@ class Fit:
     how much it grows, microseconds a second.
     cov_shared (10, 10): of tilt (2) rad, T_body_mocap (rotation rad, translation m; at the right), offset
     s, drift. cov_poses (N, 6, 6): of T_world_body, perturbed at the right.
+    too_long (3,): by how much the mocap's x, y, z are too long for the accelerometer (0.01: 1 %), which is
+    not taken off; too_long_sigma (3,).
     """
 
     stamps_ns: I64
@@ -57,6 +60,8 @@ class Fit:
     drift_ppm: float
     cov_shared: F64
     cov_poses: F64
+    too_long: F64
+    too_long_sigma: F64
     residuals: Residuals
     gravity: float
 
@@ -162,6 +167,7 @@ def _report(batch: Batch, solved: Solved, coarse_ns: int, turn: F64) -> Fit:
         raise MisfitError(_apart(f"{left.position_mm:.0f} mm rms are left"))
     offset_ns = coarse_ns + round(state.offset_s * 1e9)
     at = state.in_imu_clock(batch.mocap.stamps_ns[trusted])
+    scales, scales_cov = axis_scales(solved, batch.mocap, options.sigma_position, batch.share)
     covs = node_covariances(solved.normal, solved.cov_shared)
     return Fit(
         stamps_ns=state.stamps_ns,
@@ -177,6 +183,8 @@ def _report(batch: Batch, solved: Solved, coarse_ns: int, turn: F64) -> Fit:
         drift_ppm=state.drift * 1e6,
         cov_shared=solved.cov_shared,
         cov_poses=_right(state.R, covs[:, :6, :6]),
+        too_long=np.abs(turn.T) @ scales,
+        too_long_sigma=np.abs(turn.T) @ np.sqrt(np.diag(scales_cov)),
         residuals=left,
         gravity=options.gravity,
     )

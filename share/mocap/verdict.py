@@ -14,6 +14,9 @@ MOST_DOUBTED = 1 / 3  # of the poses: markers that are swapped for longer leave 
 _SAY_DOUBTED = 0.1
 MOST_LEFT = 3.0  # times what was said of the mocap's noise; raw ones come to 0.3, a mirrored one to 3.6
 _SAY_LEFT = 1.7
+MOST_LONG = 0.1  # of a way along an axis: a mirrored one comes to 1.7; accelerometers err by 0.02
+_SAY_LONG = 0.03
+_LONG_SIGMAS = 5.0
 
 
 def sigmas(fit: Fit) -> F64:
@@ -25,6 +28,10 @@ def check_fit(fit: Fit) -> None:
     """Raises MisfitError for a fit that comes together without telling of one motion, as with a mirrored
     world it may."""
     left = fit.residuals
+    if (told := _too_long(fit, MOST_LONG)) is not None:
+        raise MisfitError(
+            f"mocap and IMU do not tell of one motion: {told}; is an axis mirrored, or a scale or unit wrong?"
+        )
     if left.doubted > MOST_DOUBTED:
         raise MisfitError(
             f"mocap and IMU do not tell of one motion: {100 * left.doubted:.0f} % of the mocap's poses are "
@@ -50,6 +57,8 @@ def doubts(fit: Fit) -> list[str]:
         )
     if left.position_sigmas > _SAY_LEFT:
         out.append(f"{_noisy(fit)}; say by --sigma-mm how noisy the motion capture is, or calibrate it anew")
+    if (told := _too_long(fit, _SAY_LONG)) is not None:
+        out.append(f"{told}; calibrate the motion capture anew, or the accelerometer")
     return out
 
 
@@ -64,6 +73,17 @@ def unsure(fit: Fit) -> str | None:
         f"{np.degrees(MOST_TURN):.1f} deg, {MOST_SHIFT * 1e3:.0f} mm); record a minute in which the device "
         "turns about all three axes, by a radian or more each"
     )
+
+
+def _too_long(fit: Fit, most: float) -> str | None:
+    """The axis whose ways are most in doubt; None where none is off by more than `most` beyond its sigmas."""
+    off = np.where(np.abs(fit.too_long) > _LONG_SIGMAS * fit.too_long_sigma, np.abs(fit.too_long), 0.0)
+    k = int(off.argmax())
+    if off[k] <= most:
+        return None
+    size = f"{100 * off[k]:.1f} ± {100 * fit.too_long_sigma[k]:.1f} %"
+    way = "longer" if fit.too_long[k] > 0 else "shorter"
+    return f"along its {'xyz'[k]} the motion capture's ways are {size} {way} than the accelerometer's"
 
 
 def _noisy(fit: Fit) -> str:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from mocap_sim import BODY, NOISE, START_NS, Motion, record_imu, record_mocap
+from numpy.typing import ArrayLike
 
 from share.errors import MisfitError
 from share.geometry import se3
@@ -14,6 +15,7 @@ from share.mocap.align import Aligned, align
 from share.mocap.mocap import Mocap
 from share.mocap.options import FitOptions
 from share.mocap.verdict import sigmas
+from share.types import F64
 
 SECONDS, NEAR = 16.0, FitOptions(within_s=1.0)
 SWAP = se3.exp(np.array([0.6, -1.0, 0.8, 0.04, 0.03, -0.05]))
@@ -33,6 +35,12 @@ def mirrored(mocap: Mocap, axis: int, rotations: bool) -> Mocap:
     T[:, :3, 3] = T[:, :3, 3] @ flip
     if rotations:
         T[:, :3, :3] = flip @ T[:, :3, :3] @ flip
+    return Mocap(mocap.stamps_ns, T)
+
+
+def scaled(mocap: Mocap, by: ArrayLike) -> Mocap:
+    T = mocap.T.copy()
+    T[:, :3, 3] *= by
     return Mocap(mocap.stamps_ns, T)
 
 
@@ -63,6 +71,46 @@ def test_markers_swapped_for_most_of_the_time_are_refused() -> None:
 def test_a_mirrored_world_is_refused(axis: int, rotations: bool) -> None:
     with pytest.raises(MisfitError):
         found_in(mirrored(record_mocap(Motion(3), SECONDS), axis, rotations))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [0.8, 1.2])
+def test_a_wrong_scale_is_refused(scale: float) -> None:
+    with pytest.raises(MisfitError, match="mocap and IMU"):
+        found_in(scaled(record_mocap(Motion(3), SECONDS), scale))
+
+
+def test_a_scale_that_is_off_by_little_is_said() -> None:
+    coarse = replace(NEAR, sigma_position=0.004)
+    doubts = found_in(scaled(record_mocap(Motion(3), SECONDS), 1.035), coarse).doubts
+    assert any("longer than the accelerometer's; calibrate" in doubt for doubt in doubts)
+
+
+@dataclass(frozen=True, eq=False)
+class Level(Motion):
+    """Hardly up and down."""
+
+    def pose(self, t: F64) -> F64:
+        T = super().pose(t)
+        T[:, 2, 3] *= 0.05
+        return T
+
+
+def test_a_mirrored_axis_along_which_little_goes_is_refused_too() -> None:
+    """The path comes together all the same, and would be centimetres off."""
+    coarse = replace(NEAR, sigma_position=0.01)
+    imu, mocap = record_imu(Level(3), SECONDS), record_mocap(Level(3), SECONDS)
+    align(imu, NOISE, mocap, coarse)
+    with pytest.raises(MisfitError, match=r"along its z the .* longer than .* is an axis mirrored"):
+        align(imu, NOISE, mirrored(mocap, 2, rotations=False), coarse)
+
+
+def test_the_scale_of_each_axis_is_found_within_its_sigma() -> None:
+    """Of a world that lies on its side, so that the axes are the file's."""
+    mocap = record_mocap(Motion(3), SECONDS).turned(se3.so3_exp(np.array([-np.pi / 2, 0, 0])))
+    fit = found_in(scaled(mocap, (1.03, 0.98, 1.0))).fit
+    assert fit.too_long_sigma.max() < 0.005
+    np.testing.assert_array_less(np.abs(fit.too_long - (0.03, -0.02, 0.0)), 4 * fit.too_long_sigma)
 
 
 def test_noise_that_was_not_said_is_asked_for() -> None:
