@@ -124,13 +124,18 @@ def align(
         devices = {
             name: _device(name, path, told, seen[name], chosen, stages) for name, path in names.items()
         }
-        found = write_session(work, devices, stages)
+        found = write_session(work, devices, _settings(**fitting), stages)
     click.echo(json.dumps(found) if as_json else _text(found))
     for name, one in found.items():
         for line in (*_said_of_up(one), *one["doubts"]):
             click.echo(f"share: {name}: {line}", err=True)
     if not as_json:
         click.echo(f"{out}: ready; `share evaluate run {out} --virtual --out RUN` plays it")
+
+
+def _settings(rotations: str, within: float | None, sigma_mm: float, bridge: float) -> dict[str, Any]:
+    """For the session's provenance."""
+    return {"rotations": rotations, "within_s": within, "sigma_mm": sigma_mm, "bridge_s": bridge}
 
 
 def _devices(recordings: tuple[str, ...]) -> dict[str, str]:
@@ -209,7 +214,8 @@ def _device(
         raise type(error)(f"{name}: {error}") from None
     stages(f"fitting {name}", 1, 1)
     as_it_is = Path(recording) if recording.endswith(".mcap") and calib is None else None
-    return Device(kind, source, as_it_is, seen[0], found)
+    given = (("recording", recording), ("calib", calib), ("mounting", of("--mounting")))
+    return Device(kind, source, as_it_is, seen[0], {key: text for key, text in given if text}, found)
 
 
 def _kind(text: str) -> Any:

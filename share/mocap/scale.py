@@ -20,7 +20,8 @@ from share.types import F64
 def axis_scales(solved: Solved, mocap: Mocap, sigma: float, share: float) -> tuple[F64, F64]:
     """By how much positions (3,) along the axes of the mocap's world are too long, 0.01: 1 %, and the
     covariance (3, 3). sigma m: noise of a position; share: what one sample counts for."""
-    p = mocap.T[:, :3, 3] - mocap.T[:, :3, 3].mean(0)
+    p = mocap.T[:, :3, 3] + solved.seen.residual[:, 3:] * sigma  # as fitted: noise has no length
+    p = p - p.mean(0)
     J = np.zeros((len(p), 6, 3))
     J[:, 3:] = -p[:, None] * np.eye(3) / sigma
     weight = solved.weight * solved.trusted * share

@@ -14,9 +14,10 @@ MOST_DOUBTED = 1 / 3  # of the poses: markers that are swapped for longer leave 
 _SAY_DOUBTED = 0.1
 MOST_LEFT = 3.0  # times what was said of the mocap's noise; raw ones come to 0.3, a mirrored one to 3.6
 _SAY_LEFT = 1.7
-MOST_LONG = 0.1  # of a way along an axis: a mirrored one comes to 1.7; accelerometers err by 0.02
+MOST_LONG = 0.1  # of a way along an axis: a mirrored one comes to 1.5 to 2, an accelerometer errs by 0.02
 _SAY_LONG = 0.03
 _LONG_SIGMAS = 5.0
+_KNOWN_LONG = 0.05  # one sigma; where less is known, as of a robot's height, errors of the path seem long
 
 
 def sigmas(fit: Fit) -> F64:
@@ -76,8 +77,9 @@ def unsure(fit: Fit) -> str | None:
 
 
 def _too_long(fit: Fit, most: float) -> str | None:
-    """The axis whose ways are most in doubt; None where none is off by more than `most` beyond its sigmas."""
-    off = np.where(np.abs(fit.too_long) > _LONG_SIGMAS * fit.too_long_sigma, np.abs(fit.too_long), 0.0)
+    """The axis whose ways are off most; None where none is by more than `most`, and surely so."""
+    known = (fit.too_long_sigma < _KNOWN_LONG) & (np.abs(fit.too_long) > _LONG_SIGMAS * fit.too_long_sigma)
+    off = np.where(known, np.abs(fit.too_long), 0.0)
     k = int(off.argmax())
     if off[k] <= most:
         return None

@@ -101,7 +101,7 @@ def test_a_mirrored_axis_along_which_little_goes_is_refused_too() -> None:
     coarse = replace(NEAR, sigma_position=0.01)
     imu, mocap = record_imu(Level(3), SECONDS), record_mocap(Level(3), SECONDS)
     align(imu, NOISE, mocap, coarse)
-    with pytest.raises(MisfitError, match=r"along its z the .* longer than .* is an axis mirrored"):
+    with pytest.raises(MisfitError, match=r"along its z the .* shorter than .* is an axis mirrored"):
         align(imu, NOISE, mirrored(mocap, 2, rotations=False), coarse)
 
 
