@@ -44,7 +44,8 @@ class Fit:
     cov_shared (10, 10): of tilt (2) rad, T_body_mocap (rotation rad, translation m; at the right), offset
     s, drift. cov_poses (N, 6, 6): of T_world_body, perturbed at the right.
     too_long (3,): by how much the mocap's x, y, z are too long for the accelerometer (0.01: 1 %), which is
-    not taken off; too_long_sigma (3,).
+    not taken off; too_long_sigma (3,). strayed: by how many of its sigmas T_body_mocap has left the guess
+    on its worst axis, 0 without one.
     """
 
     stamps_ns: I64
@@ -62,6 +63,7 @@ class Fit:
     cov_poses: F64
     too_long: F64
     too_long_sigma: F64
+    strayed: float
     residuals: Residuals
     gravity: float
 
@@ -185,9 +187,17 @@ def _report(batch: Batch, solved: Solved, coarse_ns: int, turn: F64) -> Fit:
         cov_poses=_right(state.R, covs[:, :6, :6]),
         too_long=np.abs(turn.T) @ scales,
         too_long_sigma=np.abs(turn.T) @ np.sqrt(np.diag(scales_cov)),
+        strayed=_strayed(state.T_body_mocap, options),
         residuals=left,
         gravity=options.gravity,
     )
+
+
+def _strayed(T_body_mocap: F64, options: FitOptions) -> float:
+    if options.T_body_mocap is None:
+        return 0.0
+    error = se3.log(se3.inverse(options.T_body_mocap) @ T_body_mocap)
+    return float(np.abs(error / np.repeat(options.guess_sigma, 3)).max())
 
 
 def _apart(what: str) -> str:

@@ -17,6 +17,7 @@ _SAY_LEFT = 1.7
 MOST_LONG = 0.1  # of a way along an axis: a mirrored one comes to 1.5 to 2, an accelerometer errs by 0.02
 _SAY_LONG = 0.03
 _LONG_SIGMAS = 5.0
+MOST_STRAYED = 3.0  # sigmas (told twice as wide) of the mounting that was given, on its worst axis
 _KNOWN_LONG = 0.05  # one sigma; where less is known, as of a robot's height, errors of the path seem long
 
 
@@ -32,6 +33,12 @@ def check_fit(fit: Fit) -> None:
     if (told := _too_long(fit, MOST_LONG)) is not None:
         raise MisfitError(
             f"mocap and IMU do not tell of one motion: {told}; is an axis mirrored, or a scale or unit wrong?"
+        )
+    if fit.strayed > MOST_STRAYED:
+        raise MisfitError(
+            "mocap and IMU do not tell of the mounting that was given (--mounting): the fit leaves it by "
+            f"{fit.strayed:.1f} of its sigmas; were markers moved since, or is it another device's? "
+            "Calibrate it again"
         )
     if left.doubted > MOST_DOUBTED:
         raise MisfitError(
@@ -84,8 +91,10 @@ def _too_long(fit: Fit, most: float) -> str | None:
     if off[k] <= most:
         return None
     size = f"{100 * off[k]:.1f} ± {100 * fit.too_long_sigma[k]:.1f} %"
-    way = "longer" if fit.too_long[k] > 0 else "shorter"
-    return f"along its {'xyz'[k]} the motion capture's ways are {size} {way} than the accelerometer's"
+    where, way = f"along its {'xyz'[k]} the motion capture", "longer" if fit.too_long[k] > 0 else "shorter"
+    if fit.too_long[k] < -1:
+        return f"{where} goes the other way than the accelerometer"
+    return f"{where}'s ways are {size} {way} than the accelerometer's"
 
 
 def _noisy(fit: Fit) -> str:

@@ -101,7 +101,7 @@ def test_a_mirrored_axis_along_which_little_goes_is_refused_too() -> None:
     coarse = replace(NEAR, sigma_position=0.01)
     imu, mocap = record_imu(Level(3), SECONDS), record_mocap(Level(3), SECONDS)
     align(imu, NOISE, mocap, coarse)
-    with pytest.raises(MisfitError, match=r"along its z the .* shorter than .* is an axis mirrored"):
+    with pytest.raises(MisfitError, match=r"along its z .* goes the other way .* is an axis mirrored"):
         align(imu, NOISE, mirrored(mocap, 2, rotations=False), coarse)
 
 
@@ -131,3 +131,14 @@ def test_a_thousand_poses_a_second_are_thinned() -> None:
     assert abs(found.offset_ns) < 0.5e6
     usual = record_mocap(Motion(3), 10, hz=240)
     assert usual.thinned(4_000_000) is usual
+
+
+@pytest.mark.parametrize("wrong", [(0.0, 0.09, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.05, 0.05)])
+def test_a_mounting_that_is_another_is_refused(wrong: tuple[float, ...]) -> None:
+    """Five degrees, or seven centimetres: what a robot's turning shows of it is not as it was given."""
+    motion = Motion(5, planar=True)
+    imu, mocap = record_imu(motion, SECONDS), record_mocap(motion, SECONDS)
+    known = replace(NEAR, guess_sigma=(np.radians(0.2), 0.004))
+    assert align(imu, NOISE, mocap, replace(known, T_body_mocap=BODY)).fit.strayed < 2
+    with pytest.raises(MisfitError, match=r"the mounting that was given \(--mounting\)"):
+        align(imu, NOISE, mocap, replace(known, T_body_mocap=BODY @ se3.exp(np.array(wrong))))
