@@ -87,6 +87,27 @@ def export(path: Path, bodies: dict[str, F64], quaternions: bool = False) -> Pat
     return path
 
 
+def export_motive(path: Path, bodies: dict[str, F64]) -> Path:
+    """Motive's CSV: quaternions and metres, y up."""
+    n, lying = len(bodies), se3.exp(np.array([-np.pi / 2, 0, 0, 0, 0, 0]))
+    lines = [
+        "Format Version,1.23,Take Name,x,Capture Frame Rate,120.000000,Rotation Type,Quaternion,Length Units,"
+        "Meters,Coordinate Space,Global",
+        "",
+        ",Type," + ",".join(["Rigid Body"] * 7 * n),
+        ",Name," + ",".join(name for name in bodies for _ in range(7)),
+        ",ID," + ",".join(str(k) for k in range(n) for _ in range(7)),
+        ",," + ",".join((["Rotation"] * 4 + ["Position"] * 3) * n),
+        "Frame,Time (Seconds)," + ",".join(["X,Y,Z,W,X,Y,Z"] * n),
+    ]
+    columns = [_cells(lying @ T, True) for T in bodies.values()]
+    for frame in range(max(map(len, columns))):
+        cells = [column[frame] if frame < len(column) else "," * 6 for column in columns]
+        lines.append(f"{frame},{frame / RATE_HZ:.6f}," + ",".join(cells))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
 def _cells(T: F64, quaternions: bool) -> list[str]:
     """A body's part of each line."""
     gone = np.isnan(T[:, 0, 3])

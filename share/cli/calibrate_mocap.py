@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     required=True,
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="What the motion capture saw: Vicon's CSV, TUM, or CSV with t[ns], x y z, qw qx qy qz.",
+    help="What the motion capture saw: Vicon's or Motive's CSV, TUM, or CSV with t[ns], x y z, qw qx qy qz.",
 )
 @click.option(
     "--body",
     metavar="BODY",
-    help="Which rigid body of Vicon's CSV.  [default: the one of the source's name, or the only one]",
+    help="Which rigid body of the file.  [default: the one of the source's name, or the only one]",
 )
 @options.rotations
 @click.option(
@@ -86,7 +86,7 @@ def mocap(
     from share.io.stated_noise import stated_noise
     from share.mocap.fit import fit
     from share.mocap.options import FitOptions
-    from share.mocap.verdict import unsure
+    from share.mocap.verdict import check_fit, doubts
 
     chosen = FitOptions(sigma_position=sigma_mm * 1e-3, within_s=within)
     if one_clock:
@@ -98,13 +98,14 @@ def mocap(
         table = read_imu(source, lambda done, total: stages("reading", done, total))
         stages("fitting", 0, 1)
         found = fit(table.imu, noise, seen, chosen)
+        check_fit(found)
         stages("fitting", 1, 1)
     checked = _check(found, track, seen) if track else None
     report = json.dumps(known(mocap_json(found, source, str(truth), checked)), indent=1)
     atomic_write(out / "mocap.yaml", mocap_text(found, source, str(truth)))
     atomic_write(out / "mocap-report.json", report + "\n")
     click.echo(report if as_json else _summary(found, checked))
-    if doubt := unsure(found):
+    for doubt in doubts(found):
         click.echo(f"share: {source}: {doubt}", err=True)
     if checked and not checked.agrees:
         click.echo(f"share: {track}: does not agree with the fit; is it of this recording?", err=True)
@@ -133,7 +134,7 @@ def _summary(found: Fit, checked: Check | None) -> str:
     lines = [
         f"body rotation   {_triple(turn, np.degrees(sigma[2:5]), 2)} deg (rotation vector)",
         f"body position   {_triple(T[:3, 3] * 1e3, sigma[5:8] * 1e3, 1)} mm, in the IMU's frame",
-        f"world tilt      {found.tilt_deg:.3f} ± {np.degrees(sigma[:2].max()):.3f} deg",
+        f"world tilt      {found.tilt_deg:.3f} ± {np.degrees(sigma[:2].max()):.3f} deg, its {found.up} up",
         f"clock           IMU's less mocap's {found.offset_ns * 1e-6:+.2f} ± {sigma[8] * 1e3:.2f} ms, "
         f"drift {found.drift_ppm:+.1f} ± {sigma[9] * 1e6:.1f} ppm",
         f"left            {left.position_mm:.1f} mm, {left.rotation_deg:.2f} deg rms of {left.samples} "

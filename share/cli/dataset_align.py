@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from share.mocap.options import FitOptions
 
 _CLOCK = ("device", "offset s", "± ms", "drift ppm", "alike", "next")
-_MOUNTING = ("body deg", "±", "body mm", "±", "tilt deg")
+_MOUNTING = ("body deg", "±", "body mm", "±", "up", "tilt deg")
 _LEFT = ("left mm", "left deg", "doubted %", "gaps", "truth s")
 
 
@@ -32,7 +32,7 @@ _LEFT = ("left mm", "left deg", "doubted %", "gaps", "truth s")
     multiple=True,
     required=True,
     metavar="[NAME=]FILE",
-    help="What the motion capture saw: Vicon's CSV, TUM, or CSV with t[ns], x y z, qw qx qy qz.",
+    help="What the motion capture saw: Vicon's or Motive's CSV, TUM, or CSV with t[ns], x y z, qw qx qy qz.",
 )
 @click.option(
     "--body",
@@ -124,13 +124,18 @@ def align(
         devices = {
             name: _device(name, path, told, seen[name], chosen, stages) for name, path in names.items()
         }
-        found = write_session(work, devices, stages)
+        found = write_session(work, devices, _settings(**fitting), stages)
     click.echo(json.dumps(found) if as_json else _text(found))
     for name, one in found.items():
-        for doubt in one["doubts"]:
-            click.echo(f"share: {name}: {doubt}", err=True)
+        for line in (*_said_of_up(one), *one["doubts"]):
+            click.echo(f"share: {name}: {line}", err=True)
     if not as_json:
         click.echo(f"{out}: ready; `share evaluate run {out} --virtual --out RUN` plays it")
+
+
+def _settings(rotations: str, within: float | None, sigma_mm: float, bridge: float) -> dict[str, Any]:
+    """For the session's provenance."""
+    return {"rotations": rotations, "within_s": within, "sigma_mm": sigma_mm, "bridge_s": bridge}
 
 
 def _devices(recordings: tuple[str, ...]) -> dict[str, str]:
@@ -210,7 +215,8 @@ def _device(
         raise type(error)(f"{name}: {error}") from None
     stages(f"fitting {name}", 1, 1)
     as_it_is = Path(recording) if recording.endswith(".mcap") and calib is None else None
-    return Device(kind, source, as_it_is, seen[0], found)
+    given = (("recording", recording), ("calib", calib), ("mounting", of("--mounting")))
+    return Device(kind, source, as_it_is, seen[0], {key: text for key, text in given if text}, found)
 
 
 def _kind(text: str) -> Any:
@@ -230,6 +236,10 @@ def _mounted(chosen: FitOptions, mounting: str | None) -> FitOptions:
     return replace(chosen, T_body_mocap=T, guess_sigma=sigma)
 
 
+def _said_of_up(one: dict[str, Any]) -> list[str]:
+    return [] if one["up"] == "z" else [f"the motion capture has {one['up']} up; in the session z is"]
+
+
 def _text(found: dict[str, Any]) -> str:
     """A line a device."""
     rows = [
@@ -244,6 +254,7 @@ def _text(found: dict[str, Any]) -> str:
             f"{one['body_turned_sigma_deg']:.2f}",
             f"{one['body_shifted_mm']:.1f}",
             f"{one['body_shifted_sigma_mm']:.1f}",
+            one["up"],
             f"{one['tilt_deg']:.3f}",
             f"{one['left_mm']:.1f}",
             f"{one['left_deg']:.2f}",

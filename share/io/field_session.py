@@ -36,17 +36,22 @@ REPORT, PICTURE = "align.json", "align.png"
 @dataclass(frozen=True, eq=False)
 class Device:
     """One that was in the room. recording: the file that can be taken as it is; None: it is written anew.
-    seen_in: the motion capture's file, and the body in it, for a person."""
+    seen_in: the motion capture's file, and the body in it; told: recording, calibration and mounting as they
+    were given. Both for a person."""
 
     kind: AgentKind
     source: Source
     recording: Path | None
     seen_in: str
+    told: Mapping[str, str]
     aligned: Aligned
 
 
-def write_session(folder: Path, devices: Mapping[str, Device], told: Told) -> dict[str, Any]:
-    """Fills `folder`, which is there and empty. What was found, by device. Raises ShareError."""
+def write_session(
+    folder: Path, devices: Mapping[str, Device], settings: Mapping[str, Any], told: Told
+) -> dict[str, Any]:
+    """Fills `folder`, which is there and empty. settings: of the fit, for its provenance. What was found, by
+    device. Raises ShareError."""
     R_mocap_world = level([device.aligned.fit for device in devices.values()])
     truths = {name: _truth(device.aligned, R_mocap_world) for name, device in devices.items()}
     (folder / "truth").mkdir()
@@ -56,7 +61,7 @@ def write_session(folder: Path, devices: Mapping[str, Device], told: Told) -> di
     found: dict[str, Any] = known({name: found_of(device) for name, device in devices.items()})
     draw_alignment(folder / PICTURE, {name: (d.aligned, truths[name]) for name, d in devices.items()})
     atomic_write(folder / REPORT, json.dumps(found, indent=1) + "\n")
-    atomic_write(folder / SESSION, _description(devices, found))
+    atomic_write(folder / SESSION, _description(devices, found, settings))
     return found
 
 
@@ -80,9 +85,13 @@ def found_of(device: Device) -> dict[str, Any]:
         "body_turned_sigma_deg": float(np.degrees(sigma[2:5].max())),
         "body_shifted_mm": float(np.linalg.norm(fit.T_body_mocap[:3, 3]) * 1e3),
         "body_shifted_sigma_mm": float(sigma[5:8].max() * 1e3),
+        "up": fit.up,
         "tilt_deg": fit.tilt_deg,
+        "too_long_percent": (100 * fit.too_long).tolist(),
+        "too_long_sigma_percent": (100 * fit.too_long_sigma).tolist(),
         "left_mm": fit.residuals.position_mm,
         "left_deg": fit.residuals.rotation_deg,
+        "left_sigmas": fit.residuals.position_sigmas,
         "doubted": fit.residuals.doubted,
         "truth_s": aligned.seconds,
         "gaps_s": gaps.tolist(),
@@ -108,7 +117,13 @@ def _record(device: Device, out: Path, told: Told) -> None:
     told(stage, 1, 1)
 
 
-def _description(devices: Mapping[str, Device], found: dict[str, Any]) -> str:
+def _origin(device: Device, found: dict[str, Any]) -> dict[str, Any]:
+    """Where a device's part comes from, and how well its clock is known; the rest is in align.json."""
+    known = ("offset_sigma_ms", "drift_ppm", "up", "truth_s")
+    return {**device.told, "mocap": device.seen_in, **{key: found[key] for key in known}}
+
+
+def _description(devices: Mapping[str, Device], found: dict[str, Any], settings: Mapping[str, Any]) -> str:
     """session.yaml."""
     import yaml
 
@@ -125,7 +140,8 @@ def _description(devices: Mapping[str, Device], found: dict[str, Any]) -> str:
     provenance = {
         "generator": "share dataset align",
         "share_version": __version__,
-        "devices": {name: {"recording": one["source"], "mocap": one["mocap"]} for name, one in found.items()},
+        "settings": dict(settings),
+        "devices": {name: _origin(devices[name], one) for name, one in found.items()},
     }
     data = {"schema": SCHEMA, "provenance": provenance, "agents": agents}
     return str(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))

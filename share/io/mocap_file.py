@@ -1,4 +1,4 @@
-"""A motion capture's poses from a file: TUM, CSV as EuRoC and TUM-VI have it, or Vicon's export."""
+"""A motion capture's poses from a file: TUM, CSV as EuRoC and TUM-VI have it, Vicon's or Motive's export."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from share.errors import DataError, UsageError
 from share.io import tables
+from share.io.motive import is_motive, read_motive
 from share.io.trajectory import poses, read_tum_table
 from share.io.vicon import is_vicon, read_vicon
 from share.mocap.mocap import Mocap
@@ -45,8 +46,11 @@ def read_bodies(path: Path, rotations: str = "helical") -> Mapping[str, Mocap | 
 
     rotations: as for `read_vicon`. Raises as `read_mocap`.
     """
-    if path.is_file() and path.suffix.lower() == ".csv" and is_vicon(path):
+    csv = path.is_file() and path.suffix.lower() == ".csv"
+    if csv and is_vicon(path):
         return read_vicon(path, rotations)
+    if csv and is_motive(path):
+        return read_motive(path)
     return {"": read_mocap(path)}
 
 

@@ -12,7 +12,7 @@ from share.calibration.mounting import Check
 from share.errors import UsageError
 from share.io.section import read_yaml
 from share.mocap.fit import Fit
-from share.mocap.verdict import sigmas, unsure
+from share.mocap.verdict import doubts, sigmas, unsure
 from share.types import F64
 
 MOCAP = "mocap.yaml"
@@ -31,6 +31,7 @@ def mocap_text(fit: Fit, name: str, truth: str) -> str:
             "# p_mocap = R_mocap_world p_world: the world is level, z up",
             "R_mocap_world:",
             *_matrix(fit.R_mocap_world),
+            f"up: {fit.up}  # the axis of the motion capture's world that is nearest to up; tilt: how near",
             f"tilt_deg: {fit.tilt_deg:.5f}",
             f"timeshift_imu_mocap: {fit.offset_ns * 1e-9:.9f}  # s, IMU's clock less mocap's, at mid-time",
             f"drift_ppm: {fit.drift_ppm:.3f}",
@@ -65,6 +66,7 @@ def mocap_json(fit: Fit, name: str, truth: str, checked: Check | None) -> dict[s
         "truth": truth,
         "T_body_mocap": fit.T_body_mocap.tolist(),
         "R_mocap_world": fit.R_mocap_world.tolist(),
+        "up": fit.up,
         "tilt_deg": fit.tilt_deg,
         "timeshift_imu_mocap_s": fit.offset_ns * 1e-9,
         "drift_ppm": fit.drift_ppm,
@@ -75,7 +77,10 @@ def mocap_json(fit: Fit, name: str, truth: str, checked: Check | None) -> dict[s
             "timeshift_s": float(sigma[8]),
             "drift_ppm": float(sigma[9] * 1e6),
         },
+        "too_long_percent": (100 * fit.too_long).tolist(),
+        "too_long_sigma_percent": (100 * fit.too_long_sigma).tolist(),
         "unsure": unsure(fit),
+        "doubts": doubts(fit),
         "residuals": {
             k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(fit.residuals).items()
         },

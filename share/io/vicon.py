@@ -22,6 +22,7 @@ import numpy as np
 
 from share.errors import DataError
 from share.geometry import se3
+from share.io.cells import numbers, point
 from share.io.tables import read_text
 from share.io.trajectory import poses
 from share.mocap.mocap import Mocap
@@ -121,35 +122,13 @@ def _block(path: Path) -> _Block:
             f"{path}, line {start + 1}: {titles[start]}: expected a rate, names, columns that begin with "
             "Frame, units and data below it; the file is cut short or of another make"
         )
-    return _Block(path, start + 1, rows[:_HEAD], _numbers(path, start + 1, rows))
-
-
-def _numbers(path: Path, line: int, rows: list[list[str]]) -> F64:
-    width = len(rows[3])
-    cells = [[_point(cell) or "nan" for cell in row[:width]] for row in rows[_HEAD:]]
-    cells = [row + ["nan"] * (width - len(row)) for row in cells]
-    try:
-        return np.array(cells, np.float64)
-    except ValueError:
-        pass
-    for k, row in enumerate(cells):
-        for cell in row:
-            try:
-                float(cell)
-            except ValueError:
-                where = f"{path}, line {line + _HEAD + k}"
-                raise DataError(f"{where}: '{cell}' is not a number; export again") from None
-    raise DataError(f"{path}: cannot be read as numbers; export again")
-
-
-def _point(number: str) -> str:
-    """With a decimal point, where some countries' exports have a comma."""
-    return number.replace(",", ".")
+    values = numbers(path, start + 1 + _HEAD, rows[_HEAD:], range(len(rows[3])))
+    return _Block(path, start + 1, rows[:_HEAD], values)
 
 
 def _stamps(block: _Block) -> I64:
     try:
-        rate = float(_point(block.head[1][0]))
+        rate = float(point(block.head[1][0]))
     except (ValueError, IndexError):
         rate = 0.0
     if not 0 < rate < 1e5:

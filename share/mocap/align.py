@@ -19,7 +19,8 @@ from share.mocap.mocap import Mocap, check_imu
 from share.mocap.offset import Peak, find_offset
 from share.mocap.options import FitOptions
 from share.mocap.path import FittedPath
-from share.mocap.verdict import unsure
+from share.mocap.start import standing, tilt_of
+from share.mocap.verdict import check_fit, doubts
 from share.types import F64, I64, ImuBatch
 
 LEAST_LEAD = 10.0  # e^10 to one; recordings that do not belong together come to 0.4, 10 s that do to 15
@@ -47,8 +48,9 @@ class Aligned:
         """(N,), IMU clock: where somebody vouches for the path. None in a gap."""
         first, last = int(self.fit.stamps_ns[0]), int(self.fit.stamps_ns[-1])
         stamps = np.arange(first, last + 1, _STEP_NS)
-        for start, end in self.fit.gaps:
-            stamps = stamps[(stamps <= start) | (stamps >= end)]
+        for start, end in self.fit.gaps:  # at an end of the path nobody saw the gap's far side
+            before, after = (stamps <= start) & (start > first), (stamps >= end) & (end < last)
+            stamps = stamps[before | after]
         return stamps
 
     @property
@@ -59,9 +61,7 @@ class Aligned:
     @property
     def doubts(self) -> list[str]:
         """What is not as it should be, each in a line."""
-        moved, out = self.fit.offset_ns, []
-        if (told := unsure(self.fit)) is not None:
-            out.append(told)
+        moved, out = self.fit.offset_ns, doubts(self.fit)
         if abs(moved) > _MOST_MOVED_NS:
             out.append(
                 f"the fit puts the clocks {moved * 1e-6:+.1f} ms from where the turning alone does, and may "
@@ -88,12 +88,16 @@ def align(imu: ImuBatch, noise: ImuNoise, mocap: Mocap, options: FitOptions) -> 
             "body? Record longer, turn irregularly, or say how near the clocks are"
         )
     moved = mocap.shifted(peak.offset_ns)
-    return Aligned(imu, mocap, peak, fit(imu, noise, moved, replace(options, within_s=0.0)))
+    found = fit(imu, noise, moved, replace(options, within_s=0.0))
+    check_fit(found)
+    return Aligned(imu, mocap, peak, found)
 
 
 def level(fits: Sequence[Fit]) -> F64:
     """R_mocap_world (3, 3) of all: their tilts' mean, each by the information that its fit has of it."""
-    tilts = np.array([se3.so3_log(fit.R_mocap_world)[:2] for fit in fits])
+    ups = np.array([fit.R_mocap_world[:, 2] for fit in fits])
+    turn = standing(ups.sum(0))
+    tilts = np.array([tilt_of(turn @ up) for up in ups])
     known = np.array([np.linalg.inv(fit.cov_shared[:2, :2]) for fit in fits])
     tilt = np.linalg.solve(known.sum(0), np.einsum("nij,nj->i", known, tilts))
-    return se3.so3_exp(np.append(tilt, 0.0))
+    return np.asarray(turn.T @ se3.so3_exp(np.append(tilt, 0.0)), np.float64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,6 +22,7 @@ CHECK = (
     "check units (m, rad/s, m/s^2), the order of quaternions (TUM: qx qy qz qw; .csv: qw qx qy qz), and that "
     "both are of one body"
 )
+TRUSTED = 0.2  # weight of a sample that counts as seen
 _CONVERGED = 1e-6  # of the cost: far below what one sigma of anything costs
 
 
@@ -36,6 +37,11 @@ class Solved:
     normal: Normal
     cov_shared: F64
 
+    @property
+    def trusted(self) -> np.ndarray:
+        """(K,) bool: samples that count as seen."""
+        return np.asarray(self.weight > TRUSTED, bool)
+
 
 @dataclass(frozen=True, eq=False)
 class Batch:
@@ -48,6 +54,18 @@ class Batch:
     breaks: np.ndarray
     guess: F64
     options: FitOptions
+
+    def settle(self, state: State) -> Solved:
+        """`minimise`, then again by the trusted samples alone: of those that are elsewhere each pulls but a
+        little, but seconds of them all pull one way. Weights are of all samples."""
+        solved = self.minimise(state)
+        trusted = solved.trusted
+        if trusted.all() or trusted.mean() < 0.5:
+            return solved
+        few = replace(self, mocap=Mocap(self.mocap.stamps_ns[trusted], self.mocap.T[trusted]))
+        solved = few.minimise(solved.state)
+        seen = self._seen(solved.state)
+        return replace(solved, seen=seen, weight=self._weight(seen))
 
     def minimise(self, state: State) -> Solved:
         """From `state` downhill until the cost stands still. Raises MisfitError if it never does."""
@@ -77,7 +95,7 @@ class Batch:
         return Solved(state, chain, seen, weight, normal, solve(normal, 0.0)[2])
 
     @property
-    def _share(self) -> float:
+    def share(self) -> float:
         """What one mocap sample counts for: samples denser than they err independently share."""
         return min(1.0, self.options.independent_hz * self.mocap.spacing_ns * 1e-9)
 
@@ -90,16 +108,18 @@ class Batch:
 
     def _measure(self, state: State) -> tuple[Chain, Sightings, float]:
         chain = imu_chain(state, self.imu, self.noise, self.options.gravity, self.breaks)
-        seen = sightings(
-            state, self.imu, self.options.gravity, self.mocap.stamps_ns, self.mocap.T, self._sigma()
-        )
-        robust = -6 * self.options.cauchy**2 * np.log(self._weight(seen)).sum() * self._share
+        seen = self._seen(state)
+        robust = -6 * self.options.cauchy**2 * np.log(self._weight(seen)).sum() * self.share
         first = np.concatenate([state.gyro_bias[0], state.accel_bias[0]]) / _BIAS_SIGMA
         prior = (self._prior() * self._strayed(state) ** 2).sum()
         return chain, seen, float((chain.residual**2).sum() + robust + (first**2).sum() + prior)
 
+    def _seen(self, state: State) -> Sightings:
+        t, T = self.mocap.stamps_ns, self.mocap.T
+        return sightings(state, self.imu, self.options.gravity, t, T, self._sigma())
+
     def _normal(self, state: State, chain: Chain, seen: Sightings) -> Normal:
-        weight = self._weight(seen) * self._share
+        weight = self._weight(seen) * self.share
         out = normal_equations(chain, seen, weight, self._prior(), self._strayed(state), len(state.p))
         out.diagonal[0, 9:, 9:] += np.diag(_BIAS_SIGMA**-2)
         out.b_nodes[0, 9:] += np.concatenate([state.gyro_bias[0], state.accel_bias[0]]) / _BIAS_SIGMA**2

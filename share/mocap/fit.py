@@ -20,14 +20,14 @@ from share.mocap.mocap import Mocap, check_imu, holes
 from share.mocap.offset import coarse_offset
 from share.mocap.options import FitOptions
 from share.mocap.residuals import Residuals, residuals
+from share.mocap.scale import axis_scales
 from share.mocap.solve import node_covariances
-from share.mocap.start import first_state, hand_eye
+from share.mocap.start import first_state, hand_eye, standing, up_in
 from share.types import F64, I64, ImuBatch
 
 _EDGE_NS = 50_000_000  # mocap this near to the ends is left out: the offset may yet carry it beyond
 _LEAST_S = 2.0
 _WORST_MM = 100.0  # a path farther than this from the mocap is not the same motion
-_TRUSTED = 0.2  # weight of a sample that counts as seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +37,15 @@ class Fit:
     stamps_ns (N,), IMU clock; T_world_body (N, 4, 4) of the IMU; velocity (N, 3) m/s, world;
     gyro_bias, accel_bias (N, 3). gaps (G, 2) ns, IMU clock: where the mocap says nothing for longer
     than is bridged. breaks (N - 1,) bool: nothing joins this node to the next.
-    R_mocap_world (3, 3): from the levelled world to the mocap's; tilt_deg is its angle.
+    R_mocap_world (3, 3): from the levelled world to the mocap's, which lies on its side where that has
+    another axis `up` than z.
     T_body_mocap (4, 4). offset_ns: IMU clock minus mocap clock, in the middle of the path; drift_ppm: by
     how much it grows, microseconds a second.
     cov_shared (10, 10): of tilt (2) rad, T_body_mocap (rotation rad, translation m; at the right), offset
     s, drift. cov_poses (N, 6, 6): of T_world_body, perturbed at the right.
+    too_long (3,): by how much the mocap's x, y, z are too long for the accelerometer (0.01: 1 %), which is
+    not taken off; too_long_sigma (3,). strayed: by how many of its sigmas T_body_mocap has left the guess
+    on its worst axis, 0 without one.
     """
 
     stamps_ns: I64
@@ -57,12 +61,23 @@ class Fit:
     drift_ppm: float
     cov_shared: F64
     cov_poses: F64
+    too_long: F64
+    too_long_sigma: F64
+    strayed: float
     residuals: Residuals
     gravity: float
 
     @property
+    def up(self) -> str:
+        """The axis of the mocap's world that is nearest to up, such as "z" or "-y"."""
+        up = self.R_mocap_world[:, 2]
+        k = int(np.abs(up).argmax())
+        return ("-" if up[k] < 0 else "") + "xyz"[k]
+
+    @property
     def tilt_deg(self) -> float:
-        return float(np.degrees(se3.angle(self.R_mocap_world)))
+        """How far that axis is from the vertical."""
+        return float(np.degrees(np.arccos(min(1.0, np.abs(self.R_mocap_world[:, 2]).max()))))
 
 
 def fit(imu: ImuBatch, noise: ImuNoise, mocap: Mocap, options: FitOptions | None = None) -> Fit:
@@ -75,11 +90,13 @@ def fit(imu: ImuBatch, noise: ImuNoise, mocap: Mocap, options: FitOptions | None
     check_imu(imu)
     inflated = _inflated(noise, options.imu_inflation)
     coarse_ns = 0 if options.within_s == 0 else coarse_offset(imu, mocap, options.within_s)
-    near = _overlap(imu, mocap.shifted(coarse_ns))
+    near = _overlap(imu, mocap.shifted(coarse_ns)).thinned(round(1e9 / options.most_hz))
     guess, bias = _mounting(imu, near, options)
+    turn = standing(up_in(near, imu, guess))
+    near = near.turned(turn)
     nodes, breaks = _nodes(near, options)
     batch = Batch(imu, inflated, _inner(near, nodes, breaks), breaks, guess, options)
-    return _report(batch, batch.minimise(first_state(nodes, imu, near, guess, bias)), coarse_ns)
+    return _report(batch, batch.settle(first_state(nodes, imu, near, guess, bias)), coarse_ns, turn)
 
 
 def _inflated(noise: ImuNoise, times: float) -> ImuNoise:
@@ -138,21 +155,21 @@ def _inner(mocap: Mocap, nodes: I64, breaks: np.ndarray) -> Mocap:
     return Mocap(t[keep], mocap.T[keep])
 
 
-def _report(batch: Batch, solved: Solved, coarse_ns: int) -> Fit:
+def _report(batch: Batch, solved: Solved, coarse_ns: int, turn: F64) -> Fit:
     state, options = solved.state, batch.options
-    trusted = solved.weight > _TRUSTED
+    trusted = solved.trusted
     if trusted.mean() < 0.5:
         raise MisfitError(_apart(f"{100 * (1 - trusted.mean()):.0f} % of the mocap's poses are elsewhere"))
     dt = np.diff(state.stamps_ns)[~batch.breaks] * 1e-9
     sigma = np.repeat([options.sigma_rotation, options.sigma_position], 3)
     off = np.linalg.norm((solved.seen.residual * sigma).reshape(-1, 2, 3), axis=2)
-    left = residuals(
-        solved.chain.without(batch.breaks), dt, options.imu_inflation, off[:, 1], off[:, 0], trusted
-    )
+    joined = solved.chain.without(batch.breaks)
+    left = residuals(joined, dt, options.imu_inflation, off[:, 1], off[:, 0], trusted, options.sigma_position)
     if not left.position_mm < _WORST_MM:
         raise MisfitError(_apart(f"{left.position_mm:.0f} mm rms are left"))
     offset_ns = coarse_ns + round(state.offset_s * 1e9)
     at = state.in_imu_clock(batch.mocap.stamps_ns[trusted])
+    scales, scales_cov = axis_scales(solved, batch.mocap, options.sigma_position, batch.share)
     covs = node_covariances(solved.normal, solved.cov_shared)
     return Fit(
         stamps_ns=state.stamps_ns,
@@ -162,15 +179,25 @@ def _report(batch: Batch, solved: Solved, coarse_ns: int) -> Fit:
         accel_bias=state.accel_bias,
         gaps=holes(_closed(at, state.stamps_ns), round(options.bridge_s * 1e9)),
         breaks=batch.breaks,
-        R_mocap_world=state.R_mocap_world,
+        R_mocap_world=turn.T @ state.R_mocap_world,
         T_body_mocap=state.T_body_mocap,
         offset_ns=offset_ns,
         drift_ppm=state.drift * 1e6,
         cov_shared=solved.cov_shared,
         cov_poses=_right(state.R, covs[:, :6, :6]),
+        too_long=np.abs(turn.T) @ scales,
+        too_long_sigma=np.abs(turn.T) @ np.sqrt(np.diag(scales_cov)),
+        strayed=_strayed(state.T_body_mocap, options),
         residuals=left,
         gravity=options.gravity,
     )
+
+
+def _strayed(T_body_mocap: F64, options: FitOptions) -> float:
+    if options.T_body_mocap is None:
+        return 0.0
+    error = se3.log(se3.inverse(options.T_body_mocap) @ T_body_mocap)
+    return float(np.abs(error / np.repeat(options.guess_sigma, 3)).max())
 
 
 def _apart(what: str) -> str:

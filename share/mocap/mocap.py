@@ -64,6 +64,16 @@ class Mocap:
         keep = (self.stamps_ns >= start_ns) & (self.stamps_ns <= end_ns)
         return Mocap(self.stamps_ns[keep], self.T[keep])
 
+    def thinned(self, least_ns: int) -> Mocap:
+        """At most one sample, the first, in every `least_ns`."""
+        slot = (self.stamps_ns - self.stamps_ns[0]) // least_ns
+        keep = np.diff(slot, prepend=-1) > 0
+        return self if keep.all() else Mocap(self.stamps_ns[keep], self.T[keep])
+
+    def turned(self, R: F64) -> Mocap:
+        """The same in a world that is turned by R (3, 3)."""
+        return Mocap(self.stamps_ns, se3.compose(R, np.zeros(3)) @ self.T)
+
     def shifted(self, offset_ns: int) -> Mocap:
         """The same with `offset_ns` added to every stamp."""
         return Mocap(self.stamps_ns + offset_ns, self.T)

@@ -14,7 +14,8 @@ class FitOptions:
     """How to fit.
 
     sigma_position m, sigma_rotation rad: noise of the mocap, for samples that err independently
-    independent_hz times a second; denser ones count for less each. cauchy: in sigmas, where a sample
+    independent_hz times a second; denser ones count for less each, and more than most_hz are not taken.
+    cauchy: in sigmas, where a sample
     begins to be doubted. imu_inflation: times the data sheet's noise.
     within_s: how far apart the clocks may be, None for any distance, 0 for one clock; offset_sigma s:
     how far the offset may still be from there; drift_sigma: how much one clock may run faster than
@@ -27,6 +28,7 @@ class FitOptions:
     sigma_position: float = 0.002
     sigma_rotation: float = np.radians(0.3)
     independent_hz: float = 20.0
+    most_hz: float = 250.0
     cauchy: float = 2.5
     imu_inflation: float = 2.0
     within_s: float | None = 0.5

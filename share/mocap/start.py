@@ -13,6 +13,7 @@ from share.mocap.preintegrate import preintegrate, sampled
 from share.mocap.state import State
 from share.types import F64, I64, ImuBatch
 
+_UP = np.array([0.0, 0.0, 1.0])
 _LEAST_TURN = 0.05  # rad/s rms about the second axis
 
 
@@ -46,7 +47,7 @@ def first_state(nodes_ns: I64, imu: ImuBatch, mocap: Mocap, T_body_mocap: F64, g
     T_world_body = mocap.at(nodes_ns) @ se3.inverse(T_body_mocap)
     bias = np.tile(gyro_bias, (n, 1))
     _turn_by_gyro(T_world_body, mocap.known(nodes_ns), imu, nodes_ns, bias)
-    tilt = _tilt(T_world_body[:, :3, :3], sampled(imu, nodes_ns, imu.accel))
+    tilt = tilt_of(_forces(T_world_body[:, :3, :3], imu, nodes_ns).mean(0))
     R_level = se3.so3_exp(np.append(tilt, 0.0)).T
     middle = int(nodes_ns[0] + (nodes_ns[-1] - nodes_ns[0]) // 2)
     p = T_world_body[:, :3, 3] @ R_level.T
@@ -55,10 +56,30 @@ def first_state(nodes_ns: I64, imu: ImuBatch, mocap: Mocap, T_body_mocap: F64, g
     return State(nodes_ns, R, p, v, bias, np.zeros((n, 3)), tilt, T_body_mocap, middle)
 
 
-def _tilt(R_world_body: F64, force: F64) -> F64:
-    """(2,) with Exp(tilt_x, tilt_y, 0) taking z to the mean specific force."""
-    up = (R_world_body @ force[..., None])[..., 0].mean(0)
-    up /= np.linalg.norm(up)
+def up_in(mocap: Mocap, imu: ImuBatch, T_body_mocap: F64) -> F64:
+    """(3,) in the mocap's world: the usual specific force, m/s^2, whatever outliers there are."""
+    R_world_body = mocap.T[:, :3, :3] @ T_body_mocap[:3, :3].T
+    return np.asarray(np.median(_forces(R_world_body, imu, mocap.stamps_ns), axis=0), np.float64)
+
+
+def _forces(R_world_body: F64, imu: ImuBatch, stamps_ns: I64) -> F64:
+    """Specific force (N, 3) in the world, m/s^2."""
+    force = sampled(imu, stamps_ns, imu.accel)
+    return np.asarray((R_world_body @ force[..., None])[..., 0], np.float64)
+
+
+def standing(up: F64) -> F64:
+    """(3, 3), the turn by a quarter or a half that makes of the axis nearest to `up` (3,) the z axis. Motion
+    captures with y up are usual, and so far from it a tilt is no small turn."""
+    k = int(np.abs(up).argmax())
+    axis = np.sign(up[k]) * np.eye(3)[k]
+    if k == 2:
+        return np.eye(3) if up[2] > 0 else se3.so3_exp(np.array([np.pi, 0.0, 0.0]))
+    return se3.so3_exp(np.cross(axis, _UP) * np.pi / 2)
+
+
+def tilt_of(up: F64) -> F64:
+    """(2,) with Exp(tilt_x, tilt_y, 0) taking z to `up` (3,), of any length."""
     axis = np.array([-up[1], up[0]])  # z x up
     sine = float(np.linalg.norm(axis))
     return axis / sine * np.arctan2(sine, up[2]) if sine > 1e-12 else np.zeros(2)

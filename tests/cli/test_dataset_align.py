@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from field_sim import Watched, export, offset_of, paths, reclocked, seen
+from field_sim import FIRST, Watched, export, export_motive, offset_of, paths, reclocked, seen
+from field_sim import RATE_HZ as MOCAP_HZ
 from small_session import RATE_HZ, small_profile, small_recipe
 
 from share.emulate.session import make_session
@@ -44,6 +45,7 @@ class Room:
             reclocked(self.session / name, folder / f"{name}.mcap", watched.clock_ns)
         T = {name: seen(self.paths[name], w, NOISE, k) for k, (name, w) in enumerate(WATCHED.items())}
         export(folder / "vicon.csv", {"Headset1": T["ann"], "BOB": T["bob"]})
+        export_motive(folder / "take.csv", {"Headset1": T["ann"], "BOB": T["bob"]})
 
     def truth(self, name: str, at: Trajectory) -> Trajectory:
         """What the emulator knows, at the stamps of a trajectory by the device's clock."""
@@ -140,6 +142,30 @@ def test_it_is_played_and_scored_as_with_the_real_truth(share, room, made, tmp_p
         poses = read_tum(run / name / "odom.tum")
         real_cm = 100 * ate(poses, room.truth(name, poses)).rmse
         assert one["odom_ate_cm"] == pytest.approx(real_cm, abs=0.2)
+
+
+def test_provenance_says_whence_everything_is(room, made):
+    whence = read_session(made).provenance
+    assert whence["settings"] == {"rotations": "helical", "within_s": None, "sigma_mm": 2.0, "bridge_s": 0.5}
+    ann = whence["devices"]["ann"]
+    assert ann["recording"] == str(room.folder / "ann.mcap")
+    assert ann["mocap"] == f"{room.folder / 'vicon.csv'} Headset1"
+    assert ann["drift_ppm"] == read_json(made / "align.json")["ann"]["drift_ppm"]
+
+
+@pytest.mark.slow
+def test_motives_export_with_y_up_gives_the_same(share, room, made, tmp_path):
+    """Another clock, which begins with its first frame; the same session."""
+    told = ("--mocap", room.folder / "take.csv", "--json", "--out", tmp_path / "made")
+    done = share("dataset", "align", room.recordings[1], *told)
+    assert done.code == 0 and "bob: the motion capture has y up; in the session z is" in done.err
+    found, was = json.loads(done.out)["bob"], read_json(made / "align.json")["bob"]
+    assert found["up"] == "y" and was["up"] == "z"
+    assert abs(found["offset_ns"] - was["offset_ns"] - round(FIRST * 1e9 / MOCAP_HZ)) < 50_000
+    assert found["tilt_deg"] == pytest.approx(was["tilt_deg"], abs=0.01)
+    own, other = (read_tum(folder / "truth" / "bob.tum") for folder in (tmp_path / "made", made))
+    up = [trajectory.T[:, 2, 3] for trajectory in (own, other)]
+    assert np.abs(np.interp(other.stamps_ns - 0.0, own.stamps_ns - 0.0, up[0]) - up[1]).max() < 0.005
 
 
 @pytest.mark.slow

@@ -77,12 +77,17 @@ def test_nothing_is_made_up_at_the_edges_of_a_hole_that_breaks_the_path() -> Non
     assert np.linalg.norm(off, axis=1).max() < 0.008
 
 
-def test_the_motion_captures_z_need_not_be_up() -> None:
+@pytest.mark.parametrize(
+    ("turn", "up"), [((-np.pi / 2, 0, 0), "y"), ((0, 0.5 * np.pi, 0), "x"), ((np.pi, 0, 0), "-z")]
+)
+def test_the_motion_captures_z_need_not_be_up(turn: tuple[float, ...], up: str) -> None:
     motion = Motion(3)
     mocap = record_mocap(motion, 12, AWAY_NS)
-    lying = Mocap(mocap.stamps_ns, se3.exp(np.array([-np.pi / 2, 0, 0, 0, 0, 0])) @ mocap.T)
+    lying = mocap.turned(se3.so3_exp(np.array(turn)))
     found = align(record_imu(motion, 12), NOISE, lying, ANYWHERE)
-    height = found.truth(found.fit.R_mocap_world)[:, 2, 3]
+    assert found.fit.up == up
+    assert found.fit.tilt_deg == pytest.approx(np.degrees(np.linalg.norm(TILT)), abs=0.05)
+    height = found.truth(level([found.fit]))[:, 2, 3]
     true = motion.pose((found.stamps_ns - START_NS) * 1e-9)[:, 2, 3]
     assert np.abs(height - true).max() < 0.01
 
@@ -155,6 +160,9 @@ def test_one_level_world_is_the_mean_by_what_each_fit_knows(done) -> None:
 
     a, b, c = tilted(0.010, 0.002, 1e-3), tilted(0.014, -0.002, 1e-3), tilted(0.5, 0.5, 1e3)
     np.testing.assert_allclose(se3.so3_log(level([a, b, c])), [0.012, 0.0, 0.0], atol=1e-6)
+    down = se3.so3_exp(np.array([np.pi, 0, 0]))  # turned over, the two lie on both sides of half a turn
+    over = [replace(fit, R_mocap_world=down @ fit.R_mocap_world) for fit in (a, b, c)]
+    np.testing.assert_allclose(level(over)[:, 2], down @ level([a, b, c])[:, 2], atol=1e-9)
     assert np.linalg.norm(se3.so3_log(level([found.fit]))[:2] - TILT) < np.radians(0.05)
 
 
