@@ -61,6 +61,7 @@ class RealSense:
         self._threads: list[threading.Thread] = []
         self.lit = 0
         self._dark = False  # whether an image without dots came
+        self._images = 0
         self._told = set[str]()
 
     @property
@@ -175,11 +176,12 @@ class RealSense:
         emitter = self._wanted.profile.device.emitter
         if sample.stream not in (CAM0, CAM1) or emitter not in ("interleaved", "off"):
             return sample
-        dots = has_dots(self._rs, frame)
         if emitter == "off":
-            if dots:
+            self._images += 1
+            if self._images % _MANY == 1 and has_dots(self._rs, frame):  # now and then: asking takes time
                 self._once(_DOTS)
             return sample
+        dots = has_dots(self._rs, frame)
         if dots is None:
             self._once(_UNKNOWN_DOTS)
         self.lit, self._dark = self.lit + bool(dots), self._dark or not dots
