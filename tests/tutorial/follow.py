@@ -6,6 +6,7 @@ PYTHONPATH=tests python tests/tutorial/follow.py --at DIR --write
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -25,6 +26,7 @@ from share.cli.progress import Stages  # noqa: E402
 PAGE = Path(__file__).parents[2] / "docs" / "tutorial.md"
 LIMIT_S = 1500.0  # of one command
 ADDRESS = ("192.168.1.10", "127.0.0.1")  # the laptop's, on the page and here
+PERSON_S = 3.0  # what comes after a server was started is not typed sooner
 FAILS_HERE = ("share doctor",)  # without USB, a camera on it, and clocks that somebody corrects
 
 Walked = list[tuple[Block, list[Step]]]
@@ -68,6 +70,8 @@ def _together(
 
 def _typed(step: Step, machine: Machine, say: Callable[[str], None], folder: Path) -> Step:
     code, shown = machine.run(step.command.replace(*ADDRESS), LIMIT_S)
+    if step.command.endswith("&"):
+        time.sleep(PERSON_S)
     went = replace(step, shown=tuple(_elsewhere(line, folder) for line in shown))
     say("\n".join(went.lines))
     if code and not step.command.startswith(FAILS_HERE):
