@@ -113,7 +113,7 @@ class FakeDevice:
             return process.wait(60)
 
     def agent(self, dist: Path | None, *words: object) -> Done:
-        return self.deploy("agent", "--name", "ann", "--edge", "tcp://10.0.0.1:5555", *words, dist=dist)
+        return self.deploy("agent", "--name", "ann", "--edge", "tcp://127.0.0.1:5555", *words, dist=dist)
 
     @property
     def current(self) -> str:

@@ -20,6 +20,7 @@ from share.cli.progress import progress
 from share.core.checkup import boot
 from share.errors import UsageError
 from share.io.keys import public_key
+from share.io.transport import parse_address
 
 DIST = Path(__file__).resolve().parents[1] / "dist" / "share"
 PROFILES = {"ar": "d435i-n100-headset", "robot": "d435i-turtlebot4", "": "laptop-edge"}  # by KIND
@@ -64,7 +65,7 @@ def cli() -> None:
     \b
     Example:  tools/deploy program pi@headset1
               tools/deploy edge me@laptop
-              tools/deploy agent pi@headset1 --name ann --edge tcp://192.168.1.10:5555
+              tools/deploy agent pi@headset1 --name ann --edge tcp://192.168.1.10:5555 --server-key e.public
     """
 
 
@@ -73,7 +74,11 @@ def cli() -> None:
 @click.option("--edge", metavar="tcp://H:P", help="Where the edge listens; needed the first time.")
 @click.option("--kind", type=click.Choice(["ar", "robot"]), help="Who is served; at first ar.")
 @click.option("--source", help="As of `share agent`; at first realsense.")
-@click.option("--server-key", metavar="FILE|KEY", help="Public key of the edge.")
+@click.option(
+    "--server-key",
+    metavar="FILE|KEY",
+    help="Public key of the edge; needed the first time, unless it is on the same machine.",
+)
 @common
 def agent(name: str, edge: str | None, kind: str | None, source: str | None, **others: Any) -> None:
     """An agent: the service share-agent@NAME.
@@ -164,10 +169,22 @@ def settings_files(service: Service, there: Facts) -> dict[str, str]:
     if not service.defaults:
         return {}
     text = merged(there.settings, service.given, service.defaults)
-    if "EDGE" in service.given and not re.search(r"^EDGE=\S", text, re.MULTILINE):
-        raise UsageError("--edge: where does the edge listen? tcp://HOST:5555; needed the first time")
+    if "EDGE" in service.given:
+        check_edge(dict(line.partition("=")[::2] for line in text.splitlines()))
     first = {} if there.settings else {f"{service.name}.yaml": NO_SETTINGS}
     return {f"{service.name}.env": text, **first, **service.more}
+
+
+def check_edge(settings: Mapping[str, str]) -> None:
+    """That an agent's settings name an edge, and say its key if it is another machine. Raises UsageError."""
+    if not settings.get("EDGE"):
+        raise UsageError("--edge: where does the edge listen? tcp://HOST:5555; needed the first time")
+    keys = f"{settings.get('KEYS', '')} {settings.get('OPTIONS', '')}"
+    if not parse_address(settings["EDGE"]).local and "--server-key" not in keys:
+        raise UsageError(
+            f"--server-key: {settings['EDGE']} is on another machine, which wants keys; its own is the last "
+            "line of `tools/deploy edge`, and `share edge` shows it when it starts"
+        )
 
 
 def profile(service: Service, files: Mapping[str, str]) -> str:

@@ -122,7 +122,8 @@ def test_an_upgrade_and_back_on_the_device_itself(running, deploy, tmp_path):
 
 
 def test_a_camera_that_is_not_there_is_said_and_stops_the_first_deployment(running, deploy):
-    done = deploy("agent", "--name", "bob", "--edge", EDGE, settle=10)
+    key = running.run("cat /etc/share/edge.public").out.split()[-1]
+    done = deploy("agent", "--name", "bob", "--edge", EDGE, "--server-key", key, settle=10)
     assert done.code == 1
     assert "share-agent@bob did not stay up for 10 s:\n" in done.err
     assert "share-edge did not" not in done.err

@@ -48,7 +48,7 @@ def test_a_first_agent_is_copied_set_up_and_started(device):
     assert (current / "library.so").readlink() == Path("library.so.1")
     assert os.access(current / "share", os.X_OK)
     settings = device.root / "etc/share/agent-ann.env"
-    assert settings.read_text() == "SOURCE=realsense\nKIND=ar\nKEYS=\nOPTIONS=\nEDGE=tcp://10.0.0.1:5555\n"
+    assert settings.read_text() == "SOURCE=realsense\nKIND=ar\nKEYS=\nOPTIONS=\nEDGE=tcp://127.0.0.1:5555\n"
     rules = (device.root / "etc/udev/rules.d/99-share-realsense.rules").read_text()
     assert rules.splitlines() == list(RULES)
     (secret,) = (device.root / "etc/share/keys").glob("*.secret")
@@ -126,8 +126,8 @@ def test_another_edge_is_taken_and_the_service_started_anew(device):
     program = device.program("1.0")
     device.agent(program)
     device.asked()
-    assert device.deploy("agent", "--name", "ann", "--edge", "tcp://10.0.0.2:5555", dist=program).code == 0
-    assert "EDGE=tcp://10.0.0.2:5555\n" in (device.root / "etc/share/agent-ann.env").read_text()
+    assert device.deploy("agent", "--name", "ann", "--edge", "tcp://127.0.0.2:5555", dist=program).code == 0
+    assert "EDGE=tcp://127.0.0.2:5555\n" in (device.root / "etc/share/agent-ann.env").read_text()
     assert "systemctl restart share-agent@ann" in device.asked()
 
 
@@ -136,7 +136,7 @@ def test_a_release_that_does_not_stay_up_is_taken_back_with_its_settings(device,
     device.agent(device.program("1.0"))
     kept = (device.root / "etc/share/agent-ann.env").read_text()
     bad = device.program("1.1", mark)
-    done = device.deploy("agent", "--name", "ann", "--edge", "tcp://10.0.0.9:1", dist=bad)
+    done = device.deploy("agent", "--name", "ann", "--edge", "tcp://127.0.0.9:1", dist=bad)
     assert done.code == 1
     assert "did not stay up for 0.1 s" in done.err
     assert done.err.splitlines()[-1].startswith("1.1-")
@@ -250,7 +250,7 @@ def test_only_the_newest_releases_stay(device):
 def test_a_dry_run_says_all_and_changes_nothing(device):
     done = device.agent(device.program("1.0"), "--dry-run")
     assert done.code == 0
-    for text in ("/opt/share/releases/1.0-", "EDGE=tcp://10.0.0.1:5555", "none -> 1.0-", "share-agent@ann"):
+    for text in ("/opt/share/releases/1.0-", "EDGE=tcp://127.0.0.1:5555", "none -> 1.0-", "share-agent@ann"):
         assert text in done.out
     assert list(device.root.iterdir()) == []
     assert device.asked() == []
@@ -285,6 +285,8 @@ def test_what_is_wrong_is_said_in_one_line(device, tmp_path):
         "--edge: where does the edge listen": device.deploy("agent", "--name", "ann", dist=program),
         "use 1 to 64 letters": device.deploy("agent", "--name", "a/b", dist=program),
         "neither a file nor a public key": device.agent(program, "--server-key", "x"),
+        "--server-key: tcp://10.0.0.1:5555 is on": device.agent(program, "--edge", "tcp://10.0.0.1:5555"),
+        "'10.0.0.1' is not an address": device.agent(program, "--edge", "10.0.0.1"),
         "cannot hold": device.agent(program, "--source", "a$b"),
     }
     for text, done in cases.items():
@@ -364,7 +366,7 @@ def test_libzmq_may_ask_for_the_interfaces_of_the_machine(unit):
 
 def test_over_a_real_ssh(device, tmp_path):
     program = device.program("1.0")
-    agent = ("agent", "--name", "ann", "--edge", "tcp://10.0.0.1:5555")
+    agent = ("agent", "--name", "ann", "--edge", "tcp://127.0.0.1:5555")
     with ssh_server(tmp_path / "ssh", device.path) as ssh:
         assert device.deploy(*agent, host=HOST, ssh=ssh, dist=program).code == 0
         assert device.deploy(*agent, host=HOST, ssh=ssh, dist=device.program("1.1", "broken")).code == 1
