@@ -33,7 +33,7 @@ from share.emulate.world.layout import Layout  # noqa: E402
 from share.emulate.world.rays import Scene  # noqa: E402
 from share.emulate.world.scenes import layout  # noqa: E402
 from share.geometry import se3  # noqa: E402
-from share.geometry.absolute_pose import absolute_pose  # noqa: E402
+from share.geometry.absolute_pose import Terms, absolute_pose  # noqa: E402
 from share.geometry.camera import Camera, rays  # noqa: E402
 from share.io.session import read_session  # noqa: E402
 from share.io.source import Source, open_source  # noqa: E402
@@ -163,7 +163,7 @@ def relative(before: U8, after: U8, camera: Camera, scene: Scene, T_world_cam: F
     if len(points) < LEAST:
         return None
     uv = camera.normalise(there[ok][hit].astype(float))
-    T, inliers = absolute_pose(points, uv, camera.focal, INLIER_PX, seed=0)
+    T, inliers = absolute_pose(points, uv, camera.focal, Terms(INLIER_PX, seed=0))
     return T if inliers.sum() >= LEAST else None
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.geometry import se3
-from share.geometry.absolute_pose import absolute_pose
+from share.geometry.absolute_pose import Terms, absolute_pose
 from share.types import F64
 
 
@@ -25,7 +25,7 @@ def consensus(points: F64, uv: F64, focal: float, threshold_px: float, seed: int
     """`absolute_pose` of points (N, 3) m, world, seen at uv (N, 2); None without a model."""
     if len(points) < 4:
         return None
-    T, inliers = absolute_pose(points, uv, focal, threshold_px, seed)
+    T, inliers = absolute_pose(points, uv, focal, Terms(threshold_px, seed))
     return PoseEstimate(T, np.eye(6), inliers) if inliers.sum() >= 4 else None
 
 

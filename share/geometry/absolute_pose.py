@@ -28,7 +28,9 @@ Found = tuple[F64, NDArray[np.bool_]]
 
 @dataclass(frozen=True)
 class Terms:
-    """Of a search, as `absolute_pose` has them. OpenCV knows no least number of iterations."""
+    """Of a search. best_first: the matches are in the order of trust, which finds a consensus sooner (PROSAC,
+    Chum and Matas, CVPR 2005). confidence: that some sample had no wrong match. OpenCV knows no least number
+    of iterations."""
 
     threshold_px: float
     seed: int
@@ -38,24 +40,11 @@ class Terms:
     confidence: float = 0.9999
 
 
-def absolute_pose(
-    points: F64,
-    uv: F64,
-    focal: float,
-    threshold_px: float,
-    seed: int,
-    min_iterations: int = 20,
-    max_iterations: int = 1000,
-    best_first: bool = False,
-    confidence: float = 0.9999,
-) -> Found:
-    """T_cam_world (4, 4), not finite where there is none, and the inliers (N,).
+def absolute_pose(points: F64, uv: F64, focal: float, terms: Terms) -> Found:
+    """T_cam_world (4, 4), not finite where there is none, and the inliers (N,). The same for the same seed.
 
     points: (N, 3) m, world. uv: (N, 2) normalised; focal turns them into px for the threshold.
-    best_first: the matches are in the order of trust, which finds a consensus sooner (PROSAC, Chum
-    and Matas, CVPR 2005). confidence: that some sample had no wrong match. The same for the same seed.
     """
-    terms = Terms(threshold_px, seed, min_iterations, max_iterations, best_first, confidence)
     return (by_opencv if poselib is None else by_poselib)(points, uv, focal, terms)
 
 

@@ -176,6 +176,8 @@ class Feed:
         self._do(self._watchdog.tick(time.monotonic_ns()))
 
     def _do(self, action: Action) -> None:
+        if action is Action.NOTHING:  # ten times a second
+            return
         told = {
             "silent": ", ".join(self._watchdog.silent),
             "health": self.health.value,

@@ -37,12 +37,11 @@ def read_imu(spec: str, told: Callable[[int, int], None] = lambda done, total: N
     """
     path = Path(spec)
     if path.suffix == ".mcap" and path.is_file():
-        return _table(path.stem, *_of_mcap(path, told), serial=_serial(path))
+        return _of_mcap(path.stem, path, told)
     if path.suffix == ".db3" and path.is_file():
         return _of_db3(path, told)
     if is_session(path.parent) and not path.exists():
-        recording = read_session(path.parent).recording(path.name)
-        return _table(path.name, *_of_mcap(recording, told), serial=_serial(recording))
+        return _of_mcap(path.name, read_session(path.parent).recording(path.name), told)
     for csv in imu_tables(path):
         if csv.is_file():
             return _table(path.stem, *tables.read_table(csv, 7))
@@ -58,18 +57,13 @@ def imu_tables(path: Path) -> list[Path]:
     return [path / "mav0" / "imu0" / "data.csv", path / "imu0" / "data.csv", path / "data.csv"]
 
 
-def _of_mcap(path: Path, told: Callable[[int, int], None]) -> tuple[I64, F64]:
+def _of_mcap(name: str, path: Path, told: Callable[[int, int], None]) -> ImuTable:
     from share.io.mcap.file import McapFile
     from share.io.mcap.imu import read_imu as read
-
-    return read(McapFile(path), told)
-
-
-def _serial(path: Path) -> str | None:
-    from share.io.mcap.file import McapFile
     from share.io.mcap.reader import own_serial
 
-    return own_serial(McapFile(path))
+    file = McapFile(path)
+    return _table(name, *read(file, told), serial=own_serial(file))
 
 
 def _of_db3(path: Path, told: Callable[[int, int], None]) -> ImuTable:
@@ -77,9 +71,10 @@ def _of_db3(path: Path, told: Callable[[int, int], None]) -> ImuTable:
     from share.io.realsense.recorded import recorded_imu  # rosbags only where it is needed
 
     told(0, 1)
-    stamps_ns, values = recorded_imu(path)
+    file = Db3(path)
+    table = _table(path.stem, *recorded_imu(file), serial=file.serial)
     told(1, 1)
-    return _table(path.stem, stamps_ns, values, serial=Db3(path).serial)
+    return table
 
 
 def _table(name: str, stamps_ns: I64, values: F64, serial: str | None = None) -> ImuTable:

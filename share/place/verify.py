@@ -14,7 +14,7 @@ import numpy as np
 
 from share.config import PlaceConfig
 from share.geometry import se3
-from share.geometry.absolute_pose import absolute_pose
+from share.geometry.absolute_pose import Terms, absolute_pose
 from share.geometry.camera import rays
 from share.place.guided import beside
 from share.place.matching import Pairs, hamming, mutual, near
@@ -216,9 +216,8 @@ def _absolute_pose(
     _need(int(known.sum()), config.min_consensus, f"matches with the {whose} depth")
     y = source[known]
     points, seen = rays(y[:, :2]) / y[:, 2:], target[known, :2]
-    T, inliers = absolute_pose(
-        points, seen, focal, config.ransac_px, seed, MIN_ITERATIONS, iterations, best_first, CONFIDENCE
-    )
+    terms = Terms(config.ransac_px, seed, MIN_ITERATIONS, iterations, best_first, CONFIDENCE)
+    T, inliers = absolute_pose(points, seen, focal, terms)
     _need(int(inliers.sum()), config.min_consensus, f"inliers of the {whose} points")
     if not np.isfinite(T).all():
         raise _RefusedError(f"no pose from the {whose} points")

@@ -70,5 +70,5 @@ def test_where_there_is_none_nothing_is_raised(search, n, rng):
 def test_without_poselib_it_is_opencv_s(monkeypatch, rng):
     points, uv, *_ = matches(rng, 60, 0.3)
     monkeypatch.setattr(searches, "poselib", None)
-    found, _ = absolute_pose(points, uv, FOCAL, 3.0, 5)
+    found, _ = absolute_pose(points, uv, FOCAL, Terms(3.0, 5))
     assert np.array_equal(found, by_opencv(points, uv, FOCAL, Terms(3.0, 5))[0])

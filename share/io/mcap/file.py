@@ -86,9 +86,13 @@ class McapFile:
 
     def metadata(self, name: str) -> dict[str, str]:
         """The metadata record `name`, or {}."""
+        return dict(self._metadata.get(name, {}))
+
+    @cached_property
+    def _metadata(self) -> dict[str, dict[str, str]]:
+        """By name; of several the last."""
         with open(self.path, "rb") as file:
-            records = [r for r in self._reader(file).iter_metadata() if r.name == name]
-        return dict(records[-1].metadata) if records else {}
+            return {r.name: r.metadata for r in self._reader(file).iter_metadata()}
 
     def messages(
         self, topics: Iterable[str], start_ns: int | None = None, end_ns: int | None = None

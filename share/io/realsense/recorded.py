@@ -102,14 +102,13 @@ def repaired(file: Db3, streams: Collection[str], images: bool) -> Iterator[Meas
     yield from intake.end()
 
 
-def recorded_imu(path: Path) -> tuple[I64, F64]:
+def recorded_imu(file: Db3) -> tuple[I64, F64]:
     """Stamps (N,) ns and (N, 6) wx wy wz ax ay az, rad/s and m/s^2. Raises DataError."""
-    file = Db3(path)
     if missing := [name for name in (ACCEL, GYRO) if name not in file.streams]:
-        raise DataError(f"{path}: has no {' and no '.join(missing)}; record both")
+        raise DataError(f"{file.path}: has no {' and no '.join(missing)}; record both")
     samples = [(m.stamp_ns, m.payload) for m in repaired(file, (ACCEL, GYRO), images=False)]
     if not samples:
-        raise DataError(f"{path}: has no IMU samples")
+        raise DataError(f"{file.path}: has no IMU samples")
     stamps, values = zip(*samples, strict=True)
     return np.array(stamps, np.int64), np.array(values)
 
