@@ -173,15 +173,15 @@ def _summary(outcome: Outcome, files: tuple[Path, ...]) -> str:
 
 def _of_cameras(outcome: Outcome) -> str:
     """What of the sigmas comes from the cameras' own."""
-    import numpy as np
+    from share.calibration.camera_imu.verdict import largest
 
     fit, doubt = outcome.fit, outcome.doubt
     if fit.by_rig is None:
         return f"cameras: taken as exact, the sigmas leave their errors out ({doubt.where})"
-    sigmas = fit.sigmas_of(fit.by_rig)
+    deg, mm, ms = largest(fit.sigmas_of(fit.by_rig))
     return (
         f"cameras: as well known as {doubt.where} says; of the sigmas that is up to "
-        f"{np.degrees(sigmas[:3].max()):.3f} deg, {1e3 * sigmas[3:6].max():.2f} mm, {1e3 * sigmas[6]:.3f} ms"
+        f"{deg:.3f} deg, {mm:.2f} mm, {ms:.3f} ms"
     )
 
 

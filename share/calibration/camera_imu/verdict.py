@@ -126,8 +126,8 @@ def _imu_reasons(gyro: float, accel: float, gravity: F64, limits: Limits) -> lis
 
 
 def _sigma_reasons(fit: Fit, limits: Limits) -> list[str]:
-    whole = _three(fit.sigmas_of(fit.covariance))
-    noise = _three(fit.sigmas_of(fit.by_noise))
+    whole = largest(fit.sigmas_of(fit.covariance))
+    noise = largest(fit.sigmas_of(fit.by_noise))
     names = (
         ("rotation", limits.rotation_deg, "deg"),
         ("position", limits.position_mm, "mm"),
@@ -141,7 +141,7 @@ def _sigma_reasons(fit: Fit, limits: Limits) -> list[str]:
     ]
 
 
-def _three(sigmas: F64) -> tuple[float, float, float]:
+def largest(sigmas: F64) -> tuple[float, float, float]:
     """The largest of seven sigmas: deg, mm, ms."""
     return float(np.degrees(sigmas[:3]).max()), 1e3 * float(sigmas[3:6].max()), 1e3 * float(sigmas[6])
 
