@@ -184,7 +184,7 @@ class EdgeRun:
         for _ in range(_AT_ONCE):
             if message is None:
                 break
-            self._handle(Received(*message))
+            self._handle(Received(message.peer, message.frames))
             message = self._link.receive(0)
         for line in self._link.refusals():
             self._refuse(line)
