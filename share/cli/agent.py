@@ -201,7 +201,7 @@ class _LiveLine(LiveLine):
         self._feed, self._total = getattr(source, "feed", None), source.images_count
 
     def show(self, status: Status) -> None:
-        if not self.seen or (status.frames % 5 and status.frames != self._total):
+        if not self.seen or (status.frames % 5 and status.frames != self._total and not status.idle):
             return
         r = status.report()
         rtt = "  –  " if r["rtt_ms"] is None else f"{r['rtt_ms']:.1f} ms"

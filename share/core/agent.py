@@ -18,6 +18,7 @@ from share.core.clock_claim import ClockClaim
 from share.core.drift import Drift
 from share.core.ledger import Entry, Ledger
 from share.core.map_frame import MapFrame
+from share.core.own_status import OwnStatus
 from share.core.rate import Every, TokenBucket, seconds
 from share.core.streaming import Streaming
 from share.core.worth import Worth
@@ -56,6 +57,8 @@ class Agent:
         self._clock = ClockFilter(config.clock)
         self._hello_timer, self._ping_timer = Every(link.hello_s), Every(link.ping_s)
         self._T_odom_body: F64 | None = None
+        self._status = OwnStatus(link.ping_s, hello.streams)
+        self._stamp_ns: int | None = None  # of the newest tracked frame
         self._stretch = 0  # of odometry, in the order in which they began
         self._processing_ms: float | None = None  # from a frame's arrival to its keyframe, of late
         self._connected = False
@@ -79,12 +82,14 @@ class Agent:
         self._effects = []
         if self._heard_ns is None:
             self._heard_ns = now_ns
+        self._status.begin(now_ns)
         match event:
             case ev.FrameTracked():
                 self._frame_tracked(event, now_ns)
             case ev.KeyframeMade():
                 self._offer(event, now_ns)
             case ev.FrameArrived() if self._streaming:
+                self._status.image_came(event.arrived_ns)
                 self._streaming.arrived(event, self._connected)
             case ev.NotTaken() if self._streaming:
                 self._streaming.not_taken(event.sent.index)
@@ -96,7 +101,7 @@ class Agent:
             case ev.Connected():  # whether it knows us, its welcome says sooner than a ping's answer
                 self._send_hello(now_ns)
             case ev.Tick():
-                pass
+                self._status.ticked(event)
         if not self._ended:
             self._keep_up(now_ns)
         return self._effects
@@ -122,6 +127,10 @@ class Agent:
             **self._clock.report(),
         }
 
+    def status(self, now_ns: int) -> m.Status:
+        """What it knows of its own state at `now_ns`."""
+        return self._status.at(now_ns)
+
     def clock(self, now_ns: int) -> ClockClaim:
         """What may be said of the edge's clock at `now_ns`."""
         return ClockClaim.of(self._clock, now_ns, self._config.clock.claim_ms)
@@ -129,6 +138,8 @@ class Agent:
     # ------------------------------------------------------------ frames
 
     def _frame_tracked(self, frame: ev.FrameTracked, now_ns: int) -> None:
+        self._status.tracked(frame, now_ns)
+        self._stamp_ns = frame.stamp_ns
         if frame.new_stretch:
             self._chain.break_off()
             self._map.forget()
@@ -315,6 +326,7 @@ class Agent:
 
     def _keep_up(self, now_ns: int) -> None:
         self._watch_silence(now_ns)
+        self._say_status(now_ns)
         if self._connected:
             self._ping(now_ns)
             self._send_keyframes(now_ns)
@@ -343,6 +355,13 @@ class Agent:
             gone = "the edge is silent" if self._session is not None else "no edge answers yet"
             self._say(f"{gone}; {self._alone}")
 
+    def _say_status(self, now_ns: int) -> None:
+        if (status := self._status.due(now_ns)) is None:
+            return
+        self._effects.append(ev.StatusSaid(status, self._stamp_ns, self._status.is_idle(now_ns)))
+        if self._connected:
+            self._send(status)
+
     def _ping(self, now_ns: int) -> None:
         if self._ping_timer.due(now_ns):
             self._counts["pings"] += 1
@@ -362,6 +381,7 @@ class Agent:
             self._effects.append(ev.SendFrame(frame.index, frames))
 
     def _finished(self, now_ns: int) -> None:
+        self._status.over()
         self._finish_by_ns = now_ns + seconds(self._config.agent.finish_s)
 
     def _end(self) -> None:

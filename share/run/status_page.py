@@ -1,4 +1,4 @@
-"""The page for people: asks for /snapshot.json each second and shows it. Needs nothing from elsewhere."""
+"""The page for people: asks for /snapshot.json thrice a second and shows it. Needs nothing from elsewhere."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums }
 th, td { padding: .25rem .75rem .25rem 0; text-align: right; white-space: nowrap }
 th { color: var(--dim); font-weight: 500; border-bottom: 1px solid var(--line) }
 td { border-bottom: 1px solid var(--line) }
-.words th:nth-child(-n+3), .words td:nth-child(-n+3), th:first-child, td:first-child { text-align: left }
+.words th:nth-child(-n+5), .words td:nth-child(-n+5), th:first-child, td:first-child { text-align: left }
 td:first-child { max-width: 14rem; overflow: hidden; text-overflow: ellipsis }
 #maps th:last-child, #maps td:last-child { text-align: left; white-space: normal }
 tr.gone { color: var(--dim) }
+#agents td:nth-child(4) { white-space: normal; min-width: 9rem; max-width: 18rem; overflow-wrap: anywhere }
 .stale { opacity: .45 }
 @media (max-width: 40rem) {
   body { font-size: 13px; padding: .7rem }
@@ -74,12 +75,21 @@ function lasted(s) {
   return h ? `${h} h ${m} min` : m ? `${m} min ${Math.floor(s) % 60} s` : `${Math.floor(s)} s`;
 }
 
-let before = null;
+const unwell = ["LOST", "SILENT"];
+const aged = ms => typeof ms === "number" ? `${fixed(ms / 1000, 1)} s` : "–";
+
+let before = null, rates = {};
 function rate(name, agent, now) {
   const old = before?.agents[name];
-  if (!old || old.run_id !== agent.run_id || before.session !== now.session) return "–";
+  if (!old || old.run_id !== agent.run_id || before.session !== now.session) return NaN;
   const bytes = agent.bytes_up + agent.bytes_down - old.bytes_up - old.bytes_down;
-  return fixed(bytes / (now.uptime_s - before.uptime_s) / 1000, 1);
+  return bytes / (now.uptime_s - before.uptime_s) / 1000;
+}
+
+function measure(now) {
+  if (before?.session === now.session && now.uptime_s - before.uptime_s < 1) return;
+  rates = Object.fromEntries(entries(now.agents).map(([name, a]) => [name, rate(name, a, now)]));
+  before = now;
 }
 
 function mark(text, bad) {
@@ -88,6 +98,7 @@ function mark(text, bad) {
 }
 
 function show(now) {
+  measure(now);
   const trouble = now.trouble ?? [];
   mark(trouble.length ? "trouble" : "ok", trouble.length);
   at("trouble").replaceChildren(...trouble.map(t => node("li", t)));
@@ -97,10 +108,12 @@ function show(now) {
   if (now.failed_jobs) about.push(`failed jobs ${now.failed_jobs}`);
   at("about").textContent = [...about, now.policy, now.version].filter(Boolean).join(" · ");
   const agents = entries(now.agents).sort(([a, x], [b, y]) => x.gone - y.gone || (a < b ? -1 : 1));
-  table("agents", ["name", "kind", "state", "keyframes", "corrections", "map", "kB/s", "loops"],
+  const head = ["name", "state", "pose", "why", "kind", "keyframes", "corrections", "map", "kB/s", "loops"];
+  table("agents", head,
     agents.map(([name, a]) => ({kind: a.gone ? "gone" : "", cells: [
-      name, a.kind, node("td", a.gone ? "gone" : shown(a.state), !a.gone && a.state === "LOST" ? "bad" : ""),
-      a.keyframes, a.corrections, a.map_id, a.gone ? "–" : rate(name, a, now),
+      name, node("td", a.gone ? "gone" : shown(a.state), !a.gone && unwell.includes(a.state) ? "bad" : ""),
+      node("td", a.gone ? "–" : aged(a.pose_age_ms), !a.gone && a.pose_age_ms > 1000 ? "bad" : ""),
+      a.reason, a.kind, a.keyframes, a.corrections, a.map_id, a.gone ? "–" : fixed(rates[name], 1),
       `${shown(a.loops?.accepted)} of ${shown(a.loops?.tried)}`]})));
   table("maps", ["map", "keyframes", "agents"], entries(now.maps).map(([id, count]) => ({cells: [
     id, typeof count === "object" ? count?.keyframes : count,
@@ -111,7 +124,6 @@ function show(now) {
   table("times", ["step", "p50", "p95", "max", "times"],
     entries(now).filter(([k, t]) => k.endsWith("_ms") && t && "p50" in t).map(([k, t]) => ({cells: [
       k.slice(0, -3), fixed(t.p50, 1), fixed(t.p95, 1), fixed(t.max, 1), t.n]})));
-  before = now;
 }
 
 async function refresh() {
@@ -124,7 +136,7 @@ async function refresh() {
     mark(error instanceof TypeError || error.name === "TimeoutError" ? "no answer" : error.message, true);
     document.querySelector("main").className = "stale";
   }
-  setTimeout(refresh, 1000);
+  setTimeout(refresh, 300);
 }
 refresh();
 </script>

@@ -38,7 +38,7 @@ from share.types import (
 )
 from share.wire import messages as m
 
-VERSION = 4
+VERSION = 5
 MAX_HEADER_BYTES = 4096
 MAX_ARRAYS = 8
 MAX_FRAME_BYTES = MAX_KEYPOINTS * DESCRIPTOR_BYTES  # the largest array of any message but Frame
@@ -48,6 +48,7 @@ Bytes = bytes | memoryview
 Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Ids = Annotated[tuple[Int64, ...], Meta(max_length=m.MAX_HELD)]
 Text = Annotated[str, Meta(max_length=m.MAX_TEXT)]
+Reason = Annotated[str, Meta(max_length=m.MAX_REASON)]
 Name = Annotated[str, Meta(max_length=64)]
 
 _DTYPES = {code: np.dtype(code) for code in ("<f8", "<f4", "<i8", "|u1")}
@@ -248,6 +249,7 @@ _LAYOUTS: dict[type, _Layout] = {
             _samples("imu.accel", "<f8", 3),
         ),
     ),
+    m.Status: _Layout(8, m.Status, _Scalars.of(state=TrackState, pose_age_ms=float, reason=Reason)),
     m.Welcome: _Layout(16, m.Welcome, _Scalars.of(session=Int64, next_keyframe=Int64)),
     m.Refused: _Layout(17, m.Refused, _Scalars.of(reason=Text)),
     m.Ack: _Layout(18, m.Ack, _Scalars.of(next_keyframe=Int64, held=Ids)),

@@ -71,7 +71,7 @@ def test_says_hello_until_welcomed() -> None:
     effects = tell(agent, m.Welcome(SESSION, 0), 1100 * MS)
     assert said(effects) == ["connected to the edge"]
     later = [x for t in range(12, 30) for x in sent(handle(agent, ev.Tick(), t * 100 * MS))]
-    assert {type(x) for x in later} == {m.Ping}
+    assert {type(x) for x in later} == {m.Ping, m.Status}
 
 
 def test_an_edge_that_never_answers_is_said_once() -> None:

@@ -86,6 +86,12 @@ messages = st.one_of(
     st.builds(m.PoseUpdate, int64, st.sampled_from(TrackState), int64, poses()),
     keyframes(),
     st.builds(m.Evaluation, int64, amount, st.none() | amount),
+    st.builds(
+        m.Status,
+        st.sampled_from(TrackState),
+        st.floats(0, m.MAX_AGE_MS),
+        st.text(st.characters(categories=["L", "N"]), max_size=m.MAX_REASON),
+    ),
     st.builds(m.Ping, int64, int64),
     st.just(m.Bye()),
     st.builds(m.Welcome, int64, ids),
