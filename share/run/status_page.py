@@ -10,7 +10,7 @@ PAGE = """<!doctype html>
 <title>SHARE edge</title>
 <style>
 :root { color-scheme: light dark; --line: #8884; --dim: #888; --bad: #d22; --good: #293 }
-body { font: 15px/1.45 system-ui, sans-serif; margin: 0 auto; max-width: 62rem; padding: 1rem }
+body { font: 15px/1.45 system-ui, sans-serif; margin: 0 auto; max-width: 72rem; padding: 1rem }
 header { display: flex; flex-wrap: wrap; align-items: baseline; gap: .2rem 1rem }
 h1 { font-size: 1.25rem; margin: 0 }
 h2 { font-size: 1rem; margin: 1.4rem 0 .3rem }
@@ -75,7 +75,8 @@ function lasted(s) {
   return h ? `${h} h ${m} min` : m ? `${m} min ${Math.floor(s) % 60} s` : `${Math.floor(s)} s`;
 }
 
-const unwell = ["LOST", "SILENT"];
+const lost = a => !a.gone && ["LOST", "SILENT"].includes(a.state);
+const late = a => !a.gone && a.state !== "INITIALISING" && a.pose_age_ms > 1000;
 const aged = ms => typeof ms === "number" ? `${fixed(ms / 1000, 1)} s` : "–";
 
 let before = null, rates = {};
@@ -100,7 +101,9 @@ function mark(text, bad) {
 function show(now) {
   measure(now);
   const trouble = now.trouble ?? [];
-  mark(trouble.length ? "trouble" : "ok", trouble.length);
+  const unwell = entries(now.agents).filter(([, a]) => lost(a) || late(a)).length;
+  const agents_are = unwell === 1 ? "1 agent without a pose of now" : `${unwell} agents without a pose of now`;
+  mark(trouble.length ? "trouble" : unwell ? agents_are : "ok", trouble.length || unwell);
   at("trouble").replaceChildren(...trouble.map(t => node("li", t)));
   const about = [`up ${lasted(now.uptime_s)}`];
   if (now.waiting !== undefined) about.push(`waiting ${shown(now.waiting)}`);
@@ -108,11 +111,11 @@ function show(now) {
   if (now.failed_jobs) about.push(`failed jobs ${now.failed_jobs}`);
   at("about").textContent = [...about, now.policy, now.version].filter(Boolean).join(" · ");
   const agents = entries(now.agents).sort(([a, x], [b, y]) => x.gone - y.gone || (a < b ? -1 : 1));
-  const head = ["name", "state", "pose", "why", "kind", "keyframes", "corrections", "map", "kB/s", "loops"];
+  const head = ["name", "state", "pose age", "why", "kind", "keyframes", "corrections", "map", "kB/s", "loops"];
   table("agents", head,
     agents.map(([name, a]) => ({kind: a.gone ? "gone" : "", cells: [
-      name, node("td", a.gone ? "gone" : shown(a.state), !a.gone && unwell.includes(a.state) ? "bad" : ""),
-      node("td", a.gone ? "–" : aged(a.pose_age_ms), !a.gone && a.pose_age_ms > 1000 ? "bad" : ""),
+      name, node("td", a.gone ? "gone" : shown(a.state), lost(a) ? "bad" : ""),
+      node("td", a.gone ? "–" : aged(a.pose_age_ms), late(a) ? "bad" : ""),
       a.reason, a.kind, a.keyframes, a.corrections, a.map_id, a.gone ? "–" : fixed(rates[name], 1),
       `${shown(a.loops?.accepted)} of ${shown(a.loops?.tried)}`]})));
   table("maps", ["map", "keyframes", "agents"], entries(now.maps).map(([id, count]) => ({cells: [
