@@ -102,8 +102,8 @@ function show(now) {
   measure(now);
   const trouble = now.trouble ?? [];
   const unwell = entries(now.agents).filter(([, a]) => lost(a) || late(a)).length;
-  const agents_are = unwell === 1 ? "1 agent without a pose of now" : `${unwell} agents without a pose of now`;
-  mark(trouble.length ? "trouble" : unwell ? agents_are : "ok", trouble.length || unwell);
+  const without = `${unwell} agent${unwell === 1 ? "" : "s"} without a current pose`;
+  mark(trouble.length ? "trouble" : unwell ? without : "ok", trouble.length || unwell);
   at("trouble").replaceChildren(...trouble.map(t => node("li", t)));
   const about = [`up ${lasted(now.uptime_s)}`];
   if (now.waiting !== undefined) about.push(`waiting ${shown(now.waiting)}`);
@@ -111,8 +111,8 @@ function show(now) {
   if (now.failed_jobs) about.push(`failed jobs ${now.failed_jobs}`);
   at("about").textContent = [...about, now.policy, now.version].filter(Boolean).join(" · ");
   const agents = entries(now.agents).sort(([a, x], [b, y]) => x.gone - y.gone || (a < b ? -1 : 1));
-  const head = ["name", "state", "pose age", "why", "kind", "keyframes", "corrections", "map", "kB/s", "loops"];
-  table("agents", head,
+  table("agents",
+    ["name", "state", "pose age", "why", "kind", "keyframes", "corrections", "map", "kB/s", "loops"],
     agents.map(([name, a]) => ({kind: a.gone ? "gone" : "", cells: [
       name, node("td", a.gone ? "gone" : shown(a.state), lost(a) ? "bad" : ""),
       node("td", a.gone ? "–" : aged(a.pose_age_ms), late(a) ? "bad" : ""),
