@@ -117,6 +117,8 @@ def agent(
     line.end()
     click.echo(json.dumps(run.report) if as_json else _summary(run))
     if not run.report["protocol"]["edge_sessions"]:
+        if (refusal := run.report["protocol"]["refusal"]) is not None:
+            raise ShareError(f"the edge at {address} refuses '{hello.name}': {refusal}")
         raise ShareError(f"no edge ever answered at {address}; {run.trouble or _NOBODY}")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from share.core.clock import smoothed
-from share.core.events import FrameTracked, Tick
+from share.core.events import FrameTracked, StatusSaid, Tick
 from share.core.rate import SECOND_NS, Every, seconds
 from share.types import TrackState, Wait
 from share.wire.messages import MAX_AGE_MS, MAX_REASON, Status
@@ -35,6 +35,7 @@ class OwnStatus:
         self._image_ns: int | None = None  # arrival of the newest image, tracked or not
         self._posed_ns: int | None = None  # arrival of the newest frame with a pose
         self._tracked_ns: int | None = None  # when the newest frame was done
+        self._stamp_ns: int | None = None  # of the newest frame
         self._step_ns: float | None = None  # between frames
         self._late_ns = 0
         self._trouble = ""  # with the sensors
@@ -62,7 +63,7 @@ class OwnStatus:
             self._step_ns = smoothed(self._step_ns, min(now_ns - self._tracked_ns, SECOND_NS))
         if frame.state is not self._state:
             self._state, self._since_ns = frame.state, now_ns
-        self._waits, self._tracked_ns = frame.waits, now_ns
+        self._waits, self._tracked_ns, self._stamp_ns = frame.waits, now_ns, frame.stamp_ns
         self._late_ns = frame.done_ns - frame.arrived_ns
         self.image_came(frame.arrived_ns)
         if frame.state.has_pose:
@@ -71,6 +72,10 @@ class OwnStatus:
     def over(self) -> None:
         """No frame will follow."""
         self._over = True
+
+    def has_just_begun(self, now_ns: int, within_ns: int) -> bool:
+        """Whether little is lost where the run ends now: no frame, or it began so lately."""
+        return self._stamp_ns is None or now_ns - (self._began_ns or 0) <= within_ns
 
     def is_idle(self, now_ns: int) -> bool:
         """Whether no frame was tracked for so long that the last pose says nothing of now."""
@@ -84,7 +89,7 @@ class OwnStatus:
         reason = "".join(c if c.isprintable() else "?" for c in "; ".join(filter(None, reasons)))
         return Status(state, self._age_ms(now_ns), reason[:MAX_REASON])
 
-    def due(self, now_ns: int) -> Status | None:
+    def due(self, now_ns: int) -> StatusSaid | None:
         """The status, where it is to be said now."""
         status = self.at(now_ns)
         kind = status.state, bool(status.reason)
@@ -93,7 +98,7 @@ class OwnStatus:
         if not self._every.due(now_ns):
             return None
         self._said, self._said_ns = kind, now_ns
-        return status
+        return StatusSaid(status, self._stamp_ns, self.is_idle(now_ns))
 
     def _age_ms(self, now_ns: int) -> float:
         since_ns = self._posed_ns if self._posed_ns is not None else self._began_ns

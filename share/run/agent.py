@@ -258,7 +258,7 @@ class AgentRun:
             effects = self._machine.handle(event, time.monotonic_ns())
         except Exception as error:
             self._guard.note(f"handling {type(event).__name__}", error)
-            return
+            effects = self._machine.unfinished()
         for effect in effects:
             with self._guard.step(f"carrying out {type(effect).__name__}"):
                 self._carry_out(effect)
