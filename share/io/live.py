@@ -70,6 +70,16 @@ class LiveSource(Source):
         """When cam0's image of that stamp came, on the host's monotonic clock."""
         return self.feed.arrived_ns(stamp_ns)
 
+    @property
+    def image_ns(self) -> int | None:
+        """When cam0's newest image came, tracked or not, on the same clock."""
+        return self.feed.image_ns
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the camera now, for a person; empty: nothing."""
+        return self.feed.trouble
+
     def report(self) -> dict[str, Any]:
         return {"camera": self.feed.report()}
 

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
+from share.core.events import Tick
 from share.io.live import LiveSource
 from share.run.late import Late
 from share.types import Frame
@@ -25,6 +26,10 @@ class Arrivals(Protocol):
 
     def stop(self) -> None: ...
 
+    def tick(self) -> Tick:
+        """What is known now of images that are not tracked yet, and of the sensors."""
+        ...
+
 
 class Played:
     """A recording at its own pace, decoded ahead in a thread of its own, which waits for room (`block`).
@@ -37,6 +42,10 @@ class Played:
         self._queue: queue.Queue[Frame | None] = queue.Queue(READ_AHEAD)
         self._stop = threading.Event()
         self._error: BaseException | None = None
+        self._in_hand = False  # a frame that was given is worked on
+
+    def tick(self) -> Tick:
+        return Tick(time.monotonic_ns() if self._in_hand else None)
 
     def stop(self) -> None:
         self._stop.set()
@@ -68,7 +77,9 @@ class Played:
                 return
             behind_ns, another = time.monotonic_ns() - due, not self._queue.empty()
             if (taken := self._late.take(frame, behind_ns, another)) is not None:
+                self._in_hand = True
                 yield taken, due
+                self._in_hand = False
 
     def _read(self) -> None:
         try:
@@ -97,6 +108,9 @@ class Seen:
 
     def __init__(self, frames: Frames, camera: LiveSource) -> None:
         self._frames, self._camera = frames, camera
+
+    def tick(self) -> Tick:
+        return Tick(self._camera.image_ns, self._camera.trouble)
 
     def stop(self) -> None:
         self._camera.stop()
