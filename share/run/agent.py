@@ -149,7 +149,7 @@ class AgentRun:
 
     def _decoded(self) -> Iterator[Frame]:
         return frames_of(
-            self._source, self._settings, self._counters, self._skip_damaged, self._log.add_decode
+            self._source, self._settings, self._counters, self._skip_damaged, self._log.add_decode, self._say
         )
 
     def _skip_damaged(self, error: DataError) -> None:
