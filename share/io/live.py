@@ -84,6 +84,11 @@ class LiveSource(Source):
         return self.feed.image_ns
 
     @property
+    def images_dropped(self) -> int:
+        """Of cam0, for newer ones, as the tracker was slower."""
+        return self.feed.queue.dropped.get(CAM0, 0)
+
+    @property
     def trouble(self) -> str:
         """What is wrong with the camera now, for a person; empty: nothing."""
         return self.feed.trouble
