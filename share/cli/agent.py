@@ -232,6 +232,8 @@ def _summary(run: AgentRun) -> str:
         lines += [f"{keyframes}, {traffic}"]
     if r["drop_late"]:
         lines.append(f"{r['drop_late']} more frames came too late and were left out")
+    if r["frames_late"]:
+        lines.append(f"{r['frames_late']} poses were late, by up to {r['latest_s']:.1f} s")
     if p95 is not None:
         lines.append(f"pose after {r['track_ms']['p50']:.1f} ms (95 %: {p95:.1f} ms)")
     if r["clock"]["uncertainty_ms"] is not None:

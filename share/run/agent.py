@@ -39,6 +39,7 @@ from share.run.arrivals import Arrivals, Played, Seen
 from share.run.errors import Errors, Unknown
 from share.run.guard import Guard
 from share.run.late import Late
+from share.run.lateness import Lateness
 from share.run.pipeline import frames_of, tracker_for
 from share.strict import to_mapping
 from share.types import Frame, TrackState
@@ -99,6 +100,7 @@ class AgentRun:
         self._files, self._log = AgentFiles(out, say), RunLog()
         self._errors, self._poses = Unknown() if errors is None else errors, poses
         self._late = Late(settings.agent.late_ms)
+        self._lateness = Lateness(say, "the edge" if hello.streams else "this machine")
         self._counters = SequencerCounters()
         self._link = connect()  # last: whatever is wrong with the above has been said by now
         self._shared = _Shared()
@@ -149,7 +151,7 @@ class AgentRun:
 
     def _decoded(self) -> Iterator[Frame]:
         return frames_of(
-            self._source, self._settings, self._counters, self._skip_damaged, self._log.add_decode
+            self._source, self._settings, self._counters, self._skip_damaged, self._log.add_decode, self._say
         )
 
     def _skip_damaged(self, error: DataError) -> None:
@@ -272,6 +274,7 @@ class AgentRun:
             case ev.FrameDone():
                 if self._poses is not None and not effect.state.has_pose:
                     self._poses.tell(effect.stamp_ns, effect.state)
+                self._lateness.done(effect.track_ms)
                 self._log.add(effect.stamp_ns, effect.track_ms, effect.state, effect.keyframe, effect.sent)
                 self._show_status(self._machine.status(time.monotonic_ns()))
             case ev.StatusSaid() if effect.idle:
@@ -319,6 +322,7 @@ class AgentRun:
             "damaged_images": self._damaged,
             "failed_steps": self._guard.failed,
             "drop_late": self._late.dropped,
+            **self._lateness.report(),
             **self._source.report(),
             **self._errors.report(),
             "sequencer": dataclasses.asdict(self._counters),

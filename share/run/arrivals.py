@@ -15,6 +15,8 @@ from share.types import Frame
 
 READ_AHEAD = 30  # frames decoded before they are due
 _WAIT_S = 0.1
+_DROPS_S = 2.0  # so long images that were left out are spoken of
+_TOO_SLOW = "too slow for the camera: images are left out"
 
 Frames = Callable[[], Iterator[Frame]]  # begins to decode
 
@@ -108,9 +110,15 @@ class Seen:
 
     def __init__(self, frames: Frames, camera: LiveSource) -> None:
         self._frames, self._camera = frames, camera
+        self._dropped = 0
+        self._dropped_at = -_DROPS_S  # when it last grew
 
     def tick(self) -> Tick:
-        return Tick(self._camera.image_ns, self._camera.trouble)
+        now, dropped = time.monotonic(), self._camera.images_dropped
+        if dropped > self._dropped:
+            self._dropped, self._dropped_at = dropped, now
+        slow = _TOO_SLOW if now - self._dropped_at < _DROPS_S else ""
+        return Tick(self._camera.image_ns, "; ".join(filter(None, (self._camera.trouble, slow))))
 
     def stop(self) -> None:
         self._camera.stop()
