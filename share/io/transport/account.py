@@ -13,8 +13,10 @@ PART_BYTES = 64  # that libzmq holds for a part, however small it is
 _EMPTY_PART_BYTES = 2  # on the wire
 _SEALED_PART_BYTES = 35  # with CURVE
 _MEMORY_BYTES = 100_000_000  # that may wait in all
-_ARRAYS = 3  # of the largest size in one message: no message has more
-_QUEUE, _IMAGES_QUEUE = 16, 4  # messages of a peer that wait in the edge
+_WAITING, _IMAGES_WAITING = (
+    16,
+    4,
+)  # largest messages: the keyframes that an agent has under way, or its frames
 _IMAGE_BYTES = 1_000_000  # from this on frames are images
 
 
@@ -22,7 +24,6 @@ _IMAGE_BYTES = 1_000_000  # from this on frames are images
 class Bounds:
     """Bytes on the wire."""
 
-    queue: int  # whole messages that may wait of one peer; libzmq then reads no further
     message: int  # the largest message
     peer: int  # all that may wait of one peer
     total: int  # and of all together
@@ -30,11 +31,11 @@ class Bounds:
     @classmethod
     def of(cls, max_frame_bytes: int, sealed: bool) -> Bounds:
         """sealed: with keys, by which even an empty part takes its place on the wire."""
-        queue = _IMAGES_QUEUE if max_frame_bytes >= _IMAGE_BYTES else _QUEUE
-        message = _ARRAYS * max_frame_bytes
-        peer = (queue + 1) * message
+        most = _IMAGES_WAITING if max_frame_bytes >= _IMAGE_BYTES else _WAITING
+        message = 2 * max_frame_bytes + max_frame_bytes // 8  # two images; the rest of any is less
+        peer = most * message
         part = _SEALED_PART_BYTES if sealed else _EMPTY_PART_BYTES
-        return cls(queue, message, peer, max(peer, _MEMORY_BYTES * part // PART_BYTES))
+        return cls(message, peer, max(peer, _MEMORY_BYTES * part // PART_BYTES))
 
 
 def wire_bytes(size: int, sealed: bool) -> int:
@@ -64,18 +65,18 @@ class Account:
         """What waited when it was marked and still does."""
         return self._mark[0] - self.handed - self._commands
 
-    def sample(self, read: int) -> None:
-        """libzmq has read so many bytes so far."""
+    def sample(self, read: int, exact: bool) -> None:
+        """libzmq has read so many bytes so far, or at least so many."""
         self.read = max(self.read, read)
-        self._commands = min(self._commands, self.read - self.handed)
+        if exact:
+            self._commands = max(0, min(self._commands, self.read - self.handed))
 
     def took(self, size: int, messages: int, now_s: float) -> None:
-        """So many bytes and messages more were handed over."""
+        """So many bytes and messages more were handed over. To be followed by a `sample`."""
         self.handed += size
         self.messages += messages
         self.since_s = now_s
         self._news = True
-        self._commands = min(self._commands, self.read - self.handed)
 
     def mark(self) -> None:
         self._mark = self.read, self.messages

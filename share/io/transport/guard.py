@@ -32,6 +32,7 @@ MUTE_S = 60.0  # without a message; agents ping every half second
 _STRANGE_S = 10.0  # to the first message
 _TICK_MS, _ALERT_MS = 20, 5
 _ROUND = 2 * CONNECTIONS  # messages; those of connections that are closed by now wait beside the others
+_PAUSE_S = 0.5  # without newcomers from where somebody offended of whom no more is known than that
 _EVENTS_AT_ONCE = 256
 _HOMES = 4096
 _EVENTS = (
@@ -82,6 +83,8 @@ class Guard:
         # The thread's own:
         self._open: dict[int, _Connection] = {}  # by descriptor
         self._ended: dict[int, float] = {}  # when a descriptor was last given back
+        self._paused: dict[str, float] = {}  # addresses of which nobody new is let in, until when
+        self._to_fail = 0  # handshakes that were cut off
         self._orphaned = 0  # bytes that waited of connections that ended, since nothing waited
         self._homes: set[str] = set()  # addresses from which a key has sent a message
         self._marked_s = 0.0
@@ -103,6 +106,9 @@ class Guard:
 
     def charge(self, descriptor: int, reason: str) -> None:
         """What that connection sent no agent sends."""
+        connection = self._open.get(descriptor)
+        if connection is not None and connection.sure:  # at once; whose it is will be seen later
+            tcp.cut(descriptor, connection.inode)
         self._charges.append((descriptor, reason))
 
     def admits(self, key: str, address: str) -> bool:
@@ -154,6 +160,8 @@ class Guard:
                 self._accept(value)
             elif event == zmq.EVENT_DISCONNECTED:
                 self._forget(value)
+            elif self._to_fail:
+                self._to_fail -= 1
             else:
                 with self._lock:
                     self._failed += 1
@@ -167,10 +175,13 @@ class Guard:
         sure = self._ended.get(descriptor, -1.0) < self._empty_s
         connection = _Connection(descriptor, number, ends[0], Account(time.monotonic()), sure)
         self._open[descriptor] = connection
-        full = self._orphaned > self._bounds.total
-        if full or self._kept_out.holds(connection.address, time.monotonic()):
+        if self._closed_to(connection.address, time.monotonic()):
             self._cut(connection)
         self._make_room()
+
+    def _closed_to(self, address: str, now_s: float) -> bool:
+        full = self._orphaned > self._bounds.total
+        return full or now_s < self._paused.get(address, now_s) or self._kept_out.holds(address, now_s)
 
     def _make_room(self) -> None:
         """Where there are too many, one that has said nothing goes, by chance among those of the address that
@@ -244,7 +255,7 @@ class Guard:
             if read is None:
                 self._forget(connection.descriptor)
             else:
-                connection.account.sample(read)
+                connection.account.sample(*read)
 
     def _judge(self, empty_s: float, now_s: float) -> None:
         """No whole message waits of who was quiet since the mark; of nobody if it was empty since."""
@@ -270,7 +281,7 @@ class Guard:
                 self._offend(connection, "more than may wait", now_s)
         present = self._present()
         present.sort(key=lambda c: c.account.waiting * (now_s - c.account.since_s + 0.1))
-        total = self._orphaned + sum(connection.account.waiting for connection in present)
+        total = sum(connection.account.waiting for connection in present)
         while present and total > self._bounds.total:
             worst = present.pop()
             total -= worst.account.waiting
@@ -290,6 +301,8 @@ class Guard:
         self._lines.append(f"{name}: {reason}; cut off{' and kept out' if who else ''}")
         if who is not None:
             self._kept_out.offend(who, now_s)
+        elif connection.address in self._paused or len(self._paused) < _HOMES:
+            self._paused[connection.address] = now_s + _PAUSE_S
 
     def _culprit(self, connection: _Connection) -> str | None:
         """Whom to keep out: the key, if it is known; the address, unless agents live there as well."""
@@ -300,4 +313,6 @@ class Guard:
 
     def _cut(self, connection: _Connection) -> None:
         connection.is_cut = True
-        tcp.cut(connection.descriptor, connection.inode)
+        there = tcp.cut(connection.descriptor, connection.inode)
+        if there and connection.strange and self._to_fail < CONNECTIONS:
+            self._to_fail += 1
