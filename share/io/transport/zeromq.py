@@ -62,6 +62,9 @@ _ROUTER: dict[int, int] = {
     # An agent that comes back over another network takes over from its own half-open connection;
     # without this, libzmq would never route to it again. Ids are 64 random bits.
     zmq.ROUTER_HANDOVER: 1,
+    # The heartbeat's timer of a connection that another took over ends the process where its peer then resets
+    # it (libzmq 4.3.5, as with RCVHWM below). Agents' own heartbeats say by HEARTBEAT_TTL when they are gone.
+    zmq.HEARTBEAT_IVL: 0,
 }
 
 
