@@ -7,11 +7,11 @@ import queue
 import signal
 import threading
 from collections.abc import Callable
-from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import Any
 
 from share import process
+from share.spawning import SPAWN
 
 Inbox = queue.SimpleQueue[Any]
 Work = Callable[..., None]  # (inbox, answer, *arguments); ends when it takes END from the inbox
@@ -38,9 +38,8 @@ class Companion:
         self._heard, self._lost = heard, lost
         self._closing = False
         self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        context = get_context("spawn")
-        self._ours, theirs = context.Pipe()
-        self._process = context.Process(target=_begin, args=(theirs, work, arguments), name=name)
+        self._ours, theirs = SPAWN.Pipe()
+        self._process = SPAWN.Process(target=_begin, args=(theirs, work, arguments), name=name)
         self._process.start()
         theirs.close()
         self._threads = [threading.Thread(target=run, daemon=True) for run in (self._give, self._take)]
@@ -95,7 +94,7 @@ def _how(code: int | None) -> str:
 def _begin(line: Connection, work: Work, arguments: tuple[Any, ...]) -> None:
     """The first thing that the process does."""
     process.prepare()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd sends it to all: the parent ends us in order
     inbox: Inbox = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(line, inbox), daemon=True).start()
     with contextlib.suppress(BrokenPipeError):  # the parent is gone
