@@ -14,7 +14,6 @@ _GROUP = {signal.SIGINT, signal.SIGHUP}  # a terminal sends them to all: the par
 _WAITING = {*_GROUP, signal.SIGTERM}  # until the child can handle them
 
 
-
 def _begin(parent: int, kernel: bool) -> None:
     """Called while a spawned process is told what it is to do, before that imports anything."""
     children.follow(parent, kernel)

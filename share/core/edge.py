@@ -40,6 +40,8 @@ from share.types import Keyframe
 from share.wire import messages as wire
 from share.wire.codec import decode, encode
 
+_MOST_UNSAFE = 256  # keyframes of a run that wait for the disk; an agent has link.window (16) under way
+
 
 class Edge:
     """All agents of one room. `session` names this life of the edge, so that agents notice a new one.
@@ -67,6 +69,7 @@ class Edge:
         self._strangers: Counter[str] = Counter()
         self._ticket = 0
         self._unsafe: deque[tuple[int, Peer, int]] = deque()  # ticket, and what is safe once it is kept
+        self._kept_to = 0  # the newest ticket that is kept
         self._effects: list[Effect] = []
         for run in known:
             self._recall(run)
@@ -219,13 +222,17 @@ class Edge:
     # ------------------------------------------------------------------ keyframes
 
     def _keyframe(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> None:
+        if peer.unsafe >= _MOST_UNSAFE:
+            peer.counts["unsafe_refused"] += 1
+            self._acknowledge(peer)
+            return
         applicable = peer.inorder.push(keyframe)
         for ready in applicable:
             peer.counts["keyframes"] += 1
             self._apply(peer, ready, now_ns)
             self._unsafe.append((self._ticket, peer, ready.id + 1))
-        if not self._keeps:
-            self._kept(self._ticket)
+            peer.unsafe += 1
+        self._kept(self._kept_to if self._keeps else self._ticket)
         if not applicable:  # the others are acknowledged once they are safe
             self._acknowledge(peer)
 
@@ -248,10 +255,12 @@ class Edge:
 
     def _kept(self, ticket: int) -> None:
         """Acknowledge what is safe now."""
+        self._kept_to = max(self._kept_to, ticket)
         told = {}
         while self._unsafe and self._unsafe[0][0] <= ticket:
             _, peer, next_keyframe = self._unsafe.popleft()
             peer.safe = next_keyframe
+            peer.unsafe -= 1
             told[peer.key] = peer
         for peer in told.values():
             self._acknowledge(peer)

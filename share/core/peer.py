@@ -64,6 +64,7 @@ class Peer:
     gone: bool = False
     newest: Finding | None = None  # the newest correction; who has been away may not have got it
     greeted: bool = True  # in this life of the edge
+    unsafe: int = 0  # keyframes that are applied and not safe yet
 
     def place(self, keyframe: Keyframe) -> tuple[Keyframe, str | None]:
         """The next keyframe in order as the map may have it, and what was wrong with it.
