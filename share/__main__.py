@@ -6,7 +6,7 @@ from types import FrameType
 
 
 def run() -> None:
-    """The command line; until a command has begun, Ctrl-C ends the program with one line and nothing to undo."""
+    """The command line. Until a command has begun, Ctrl-C ends the program with one line."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where a script has it ignored
         signal.signal(signal.SIGINT, interrupted)
     from share.cli.main import main

@@ -3,9 +3,10 @@
 Every process that SHARE starts is started through here: one of its own commands with `environment()`, a
 worker of multiprocessing by `share.spawning.SPAWN`, a fork that calls `follow` itself. The first thing that
 the child does, before it imports anything heavy, is to ask the kernel to be killed when its parent dies
-(PR_SET_PDEATHSIG), and then to look whether the parent has died meanwhile. The kernel takes the *thread* that started the child
-for its parent. So a child that was started by another than the main thread, which may end long before its
-process, and one on a system without that request, looks at its parent's number every 0.2 s instead.
+(PR_SET_PDEATHSIG), and then to look whether the parent has died meanwhile. The kernel takes the *thread*
+that started the child for its parent. So a child that was started by another than the main thread, which
+may end long before its process, and one on a system without that request, looks at its parent's number
+every 0.2 s instead.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ def environment() -> dict[str, str]:
 
 
 def follow_starter() -> None:
-    """The first thing that a SHARE command does: it ends with the SHARE process that started it, if one did."""
+    """The first thing that a SHARE command does: it ends with the SHARE process that started it, if any."""
     parent, _, kernel = os.environ.pop(_MARK, "").partition(":")
     if parent.isdecimal():
         follow(int(parent), kernel == "1")
@@ -53,7 +54,7 @@ def _ask_kernel() -> bool:
         return False
     import ctypes
 
-    return ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) == 0
+    return bool(ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) == 0)
 
 
 def _watch(parent: int) -> None:

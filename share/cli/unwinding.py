@@ -28,8 +28,8 @@ def unwinding() -> Iterator[None]:
 
 
 def _unwind(number: int, frame: FrameType | None) -> None:
-    """Not while a module is imported: some libraries make another error of it there (poselib, "cannot import the
-    C++ backend"), and some places swallow it. Then a moment later."""
+    """Not while a module is imported, but a moment later: there some libraries make another error of it
+    (poselib: "cannot import the C++ backend"), and some places swallow it."""
     if _is_importing(frame):
         signal.signal(signal.SIGALRM, lambda _, later: _unwind(number, later))
         signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)

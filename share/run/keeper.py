@@ -23,9 +23,10 @@ _NOT_ACKNOWLEDGED = "keyframes are not acknowledged"
 class Keeper:
     """`keep` what is to be safe; `done` is told once it is, `said` what goes wrong, from the thread.
 
-    Only what is in the file is `Kept`. While it cannot be written, that is said, changes are held in memory and
-    tried again. They are few: an agent sends no more than its window without an acknowledgement, the edge takes
-    in no more (`share.core.edge`), loops come of keyframes alone, and of solutions the newest is held.
+    Only what is in the file is `Kept`. While it cannot be written, that is said, changes are held in memory
+    and tried again. They are few: an agent sends no more than its window without an acknowledgement, the edge
+    takes in a bounded number (`share.core.edge`), loops come of keyframes alone, and of solutions only the
+    newest is held.
     """
 
     def __init__(self, store: MapStore, done: Callable[[Kept], None], said: Callable[[str], None]) -> None:

@@ -1,4 +1,4 @@
-"""What is not in the map's file is not acknowledged, however the disk fails; and it is never much that waits."""
+"""What is not in the map's file is not acknowledged, however the disk fails; what waits is bounded."""
 
 import threading
 import time

@@ -13,6 +13,7 @@ from share.errors import StoreError, UsageError
 from share.io.map_store import changes, lock, reading, schema
 from share.io.map_store.connect import log_of
 from share.io.map_store.opening import examine, look, make
+from share.io.map_store.salvage import set_aside
 from share.io.map_store.scan import whole_rows
 
 
@@ -28,6 +29,7 @@ class MapStore:
         self._db: sqlite3.Connection | None = None
         self._files: dict[Path, tuple[int, int]] = {}  # those of the map, and which they are
         self._lock: int | None = None
+        self._power_cut = False
 
     @property
     def writable(self) -> bool:
@@ -55,7 +57,7 @@ class MapStore:
         try:
             store = MapStore(path, examine(path), schema.SCHEMA, "")
             store._db, store._lock = make(path, power_cut), held
-            store._files = _which(path)
+            store._files, store._power_cut = _which(path), power_cut
             return store
         except BaseException:
             os.close(held)
@@ -100,6 +102,19 @@ class MapStore:
             return look(self.path)[0]
         return reading.kept(whole_rows(self._db))
 
+    def set_aside(self) -> Path:
+        """A fresh map in place of this one, which is kept beside; its new name.
+
+        Raises ShareError where that cannot be: then the map is as it was.
+        """
+        self._writer().close()
+        try:
+            return set_aside(self.path)
+        finally:
+            self._kept = None
+            self._db = make(self.path, self._power_cut)
+            self._files = _which(self.path)
+
     def close(self) -> None:
         """Moves the log into the file and gives it free."""
         if self._db is not None:
@@ -122,8 +137,8 @@ class MapStore:
             if now.get(path) != which:
                 what = "removed" if path not in now else "replaced"
                 raise StoreError(
-                    f"{self.path}: the map cannot be written: {path.name} was {what} while the edge ran; put it "
-                    "back, or start the edge again"
+                    f"{self.path}: the map cannot be written: {path.name} was {what} while the edge ran; "
+                    "put it back, or start the edge again"
                 )
 
     def _writer(self) -> sqlite3.Connection:
