@@ -52,7 +52,7 @@ from share.run.companion import Companion
 from share.run.keeper import Keeper
 from share.run.mapping import Mapped, Restore, Restored, SolverLost, map_all
 from share.run.restarts import Restarts
-from share.run.tracking import Trackers
+from share.run.tracking import Trackers, room
 
 TICK_MS = 50
 _REPORT_S = 1.0
@@ -160,7 +160,9 @@ class EdgeRun:
         self._trackers = Trackers(self._settings, self._answered)
         self._machine: Edge
         if POLICIES[self._settings.edge.policy].raw:
-            self._machine = TrackingEdge(self._settings, secrets.randbits(63), began_ns=self._began_ns)
+            self._machine = TrackingEdge(
+                self._settings, secrets.randbits(63), began_ns=self._began_ns, room=room()
+            )
         else:
             self._begin_mapping(after_s)
 
