@@ -76,6 +76,7 @@ class Edge:
         self._internal_errors = 0
         self._ticket = 0
         self._unsafe: deque[tuple[int, Peer, int]] = deque()  # ticket, and what is safe once it is kept
+        self._kept_to = 0  # the newest ticket that is kept
         self._effects: list[Effect] = []
         self._now_ns = 0  # of the newest event
         for run in known:
@@ -195,7 +196,7 @@ class Edge:
     def _greet(self, event: Received, hello: wire.Hello, now_ns: int) -> None:
         """Welcome a new run or a known one; refuse a name that somebody else is using."""
         peer_id = event.peer
-        if (reason := self._admission.objection(event, hello, self._peers, now_ns)) is not None:
+        if (reason := self._objection(event, hello, now_ns)) is not None:
             self._send(peer_id, wire.Refused(reason))
             self._refusals(self._peers.get(peer_id)).add(reason, now_ns)
             self._record_seldom(now_ns, "refused", None, reason)
@@ -207,6 +208,9 @@ class Edge:
             joined = f"{hello.kind} '{hello.name}'"
             self._record_seldom(now_ns, "joined the edge", self._peers[peer_id], joined)
         self._welcome(peer_id, self._peers[peer_id], now_ns)
+
+    def _objection(self, event: Received, hello: wire.Hello, now_ns: int) -> str | None:
+        return self._admission.objection(event, hello, self._peers, now_ns)
 
     def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
         """Who says hello has lost the edge: whatever was on its way to him may be gone, or was not taken."""
@@ -252,15 +256,14 @@ class Edge:
             peer.unsafe += 1
             self._apply(peer, ready, now_ns)
             self._unsafe.append((self._ticket, peer, ready.id + 1))
-        if not self._keeps:
-            self._kept(self._ticket)
+        self._kept(self._kept_to if self._keeps else self._ticket)
         if not applicable:  # the others are acknowledged once they are safe
             self._acknowledge(peer)
 
     def _in_order(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> list[Keyframe]:
         """What can be applied now; nothing of an agent that sends more than is taken in."""
-        if not peer.takes(now_ns):
-            peer.refusals.add("keyframes come faster than they can be taken in", now_ns)
+        if (reason := peer.too_many(now_ns)) is not None:
+            peer.refusals.add(reason, now_ns)
             return []
         try:
             return peer.inorder.push(keyframe)
@@ -287,6 +290,7 @@ class Edge:
 
     def _kept(self, ticket: int) -> None:
         """Acknowledge what is safe now."""
+        self._kept_to = max(self._kept_to, ticket)
         told = {}
         while self._unsafe and self._unsafe[0][0] <= ticket:
             _, peer, next_keyframe = self._unsafe.popleft()
