@@ -82,7 +82,7 @@ const aged = ms => typeof ms === "number" ? `${fixed(ms / 1000, 1)} s` : "–";
 let before = null, rates = {};
 function rate(name, agent, now) {
   const old = before?.agents[name];
-  if (!old || old.run_id !== agent.run_id || before.session !== now.session) return NaN;
+  if (!old || old.run !== agent.run || before.session !== now.session) return NaN;
   const bytes = agent.bytes_up + agent.bytes_down - old.bytes_up - old.bytes_down;
   return bytes / (now.uptime_s - before.uptime_s) / 1000;
 }
