@@ -95,7 +95,8 @@ class Agent:
             case ev.Received():
                 self._received(event, now_ns)
             case ev.Finished():
-                self._finished(now_ns)
+                self._status.over()
+                self._finish_by_ns = now_ns + seconds(self._config.agent.finish_s)
             case ev.Connected():  # whether it knows us, its welcome says sooner than a ping's answer
                 self._send_hello(now_ns)
             case ev.Tick():
@@ -373,10 +374,6 @@ class Agent:
             frames = encode(frame)
             self._counts["bytes_up"] += size(frames)
             self._effects.append(ev.SendFrame(frame.index, frames))
-
-    def _finished(self, now_ns: int) -> None:
-        self._status.over()
-        self._finish_by_ns = now_ns + seconds(self._config.agent.finish_s)
 
     def _end(self) -> None:
         if self._connected:

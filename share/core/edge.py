@@ -175,7 +175,6 @@ class Edge:
 
     def _heard(self, peer: Peer, now_ns: int) -> None:
         peer.heard_ns = now_ns
-        peer.status.heard()
         if peer.gone:
             peer.gone = False
             self._effects.append(Present(peer.key, True))
@@ -384,9 +383,7 @@ class Edge:
 
     def report(self, mapped: dict[str, Any]) -> dict[str, Any]:
         """edge.json: per agent and in all, but for `series`. mapped: the mapper's report, whose `agents` are
-        by run.
-
-        An agent's earlier runs stand under their run's own key.
+        by run. An agent's earlier runs stand under their run's own key.
         """
         of_agents, now_ns = mapped.get("agents", {}), self._now_ns
         return {

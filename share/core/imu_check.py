@@ -40,7 +40,7 @@ class ImuCheck:
 
     def believed(self, stamps: I64, values: F64) -> NDArray[np.bool_]:
         """Of samples (N,) ns, (N, 6) gyro and accel: which (N,) are measurements."""
-        good: NDArray[np.bool_] = (np.abs(values) <= self._most).all(axis=1)  # NaN is not
+        good = np.asarray((np.abs(values) <= self._most).all(axis=1), np.bool_)  # NaN is not
         self.out_of_range += len(good) - int(good.sum())
         before = len(self._stamps)
         at, all_ = np.concatenate([self._stamps, stamps[good]]), np.concatenate([self._values, values[good]])
@@ -59,7 +59,7 @@ def _spikes(stamps: I64, values: F64) -> NDArray[np.bool_]:
     # cheap first: whoever does not leap from the one before it does not stand out
     leaps = np.zeros(count, np.bool_)
     leaps[1:] = (np.abs(np.diff(values, axis=0)) > _BETWEEN[1]).any(axis=1)
-    for k in np.flatnonzero(leaps):
+    for k in np.flatnonzero(leaps).tolist():
         first, last = max(0, k - _AROUND), min(count - 1, k + _AROUND)
         steps = np.diff(stamps[first : last + 1])
         if last - first >= _AROUND + (last > k) and steps.max() <= _APART_NS:

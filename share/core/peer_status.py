@@ -23,20 +23,16 @@ class PeerStatus:
         self._has_left = False
 
     def told(self, status: Status, now_ns: int) -> None:
-        self.state, self._reason = status.state, status.reason
+        self.state, self._reason, self._has_left = status.state, status.reason, False
         self._age_ms, self._at_ns = status.pose_age_ms, now_ns
 
     def posed(self, state: TrackState, now_ns: int) -> None:
         """A pose has come. It is about as old as the newest was when the agent last said how old that was."""
         if state is not self.state:
             self._reason = ""
-        self.state = state
+        self.state, self._has_left = state, False
         if state.has_pose:
             self._at_ns = now_ns
-
-    def heard(self) -> None:
-        """It is here."""
-        self._has_left = False
 
     def left(self) -> None:
         """It said bye: its silence is no news."""

@@ -30,7 +30,7 @@ from share.wire.messages import peer_id
 
 AGENT = {
     "kind": "ar",
-    "run": "ann-1f2e",
+    "run": "ann-1234",
     "state": "OK",
     "gone": False,
     "keyframes": 12,
