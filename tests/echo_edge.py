@@ -1,4 +1,4 @@
-"""A front that does nothing but answer, as a process of its own: `python -m tests.echo_edge [KEYS]`.
+"""A front that does nothing but answer, as a process of its own: `python echo_edge.py [KEYS]`.
 
 Says its endpoint, then sends back whatever an agent sends; SIGINT ends it as it ends `share edge`. At its end
 one line of JSON: messages, strangers, and what it said of whom it did not let in.

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 import zmq
+from raw_zmtp import MORE, RawPeer, frame, greeting, metadata
 from zmq.utils import z85
 
 from share.io.keys import AgentKeys
-from tests.raw_zmtp import MORE, RawPeer, frame, greeting, metadata
 
 _KEY, _MAC = 32, 16
 

@@ -22,12 +22,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from raw_curve import CurvePeer
+from raw_zmtp import RawPeer, frame, greeting, message, parts, ready
 
 from share.io.keys import AgentKeys, authorize, generate
 from share.io.transport import connect
 from share.wire.messages import peer_id
-from tests.raw_curve import CurvePeer
-from tests.raw_zmtp import RawPeer, frame, greeting, message, parts, ready
 
 GROWTH_BYTES = 100_000_000
 ROUND_TRIP_S = 2.0  # at most, on a busy machine; without the guard it is as long as the attack
@@ -37,7 +37,7 @@ PING = frame(b"\x04PING\0\0abc", command=True)
 
 @dataclass
 class Front:
-    """`tests.echo_edge` as a child. agent, rogue: keys that it lets in; None without keys."""
+    """`echo_edge.py` as a child. agent, rogue: keys that it lets in; None without keys."""
 
     process: subprocess.Popen[str]
     endpoint: str
@@ -100,8 +100,8 @@ def front(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Front]:
         for keys in (agent, rogue):
             authorize(tmp_path / "edge", keys.own.name, keys.own.public)
     where = [] if agent is None else [str(tmp_path / "edge")]
-    command = [sys.executable, "-m", "tests.echo_edge", *where]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]) as child:
+    command = [sys.executable, str(Path(__file__).parents[1] / "echo_edge.py"), *where]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
         assert child.stdout is not None
         front = Front(child, child.stdout.readline().strip(), agent, rogue)
         try:
@@ -111,8 +111,8 @@ def front(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Front]:
 
 
 class Agent:
-    """An honest one in a thread of its own. trips: of each message, when it was sent and how long until it came
-    back, s."""
+    """An honest one in a thread of its own. trips: of each message when it was sent, and how long until it
+    came back, s."""
 
     def __init__(self, front: Front) -> None:
         self.trips: list[tuple[float, float]] = []
