@@ -12,11 +12,8 @@ from dataclasses import dataclass, field
 PART_BYTES = 64  # that libzmq holds for a part, however small it is
 _EMPTY_PART_BYTES = 2  # on the wire
 _SEALED_PART_BYTES = 35  # with CURVE
-_MEMORY_BYTES = 100_000_000  # that may wait in all
-_WAITING, _IMAGES_WAITING = (
-    16,
-    4,
-)  # largest messages: the keyframes that an agent has under way, or its frames
+_MEMORY_BYTES = 200_000_000  # that may wait in all, were it all of the smallest parts
+_WAITING, _IMAGES_WAITING = 64, 4  # largest messages: an agent has 16 keyframes under way, or 3 frames
 _IMAGE_BYTES = 1_000_000  # from this on frames are images
 
 
@@ -35,7 +32,8 @@ class Bounds:
         message = 2 * max_frame_bytes + max_frame_bytes // 8  # two images; the rest of any is less
         peer = most * message
         part = _SEALED_PART_BYTES if sealed else _EMPTY_PART_BYTES
-        return cls(message, peer, max(peer, _MEMORY_BYTES * part // PART_BYTES))
+        total = max(2 * message, _MEMORY_BYTES * part // PART_BYTES)
+        return cls(message, min(peer, total), total)
 
 
 def wire_bytes(size: int, sealed: bool) -> int:

@@ -32,7 +32,8 @@ MUTE_S = 60.0  # without a message; agents ping every half second
 _STRANGE_S = 10.0  # to the first message
 _TICK_MS, _ALERT_MS = 20, 5
 _ROUND = 2 * CONNECTIONS  # messages; those of connections that are closed by now wait beside the others
-_PAUSE_S = 0.5  # without newcomers from where somebody offended of whom no more is known than that
+GROWTH_BYTES = 16_000_000  # of memory, beyond the bytes that wait: small parts take much more than they have
+_PAUSE_S = 2.0  # without newcomers from where somebody offended of whom no more is known than that
 _EVENTS_AT_ONCE = 256
 _HOMES = 4096
 _EVENTS = (
@@ -76,7 +77,7 @@ class Guard:
         self._lock = Lock()  # of what several threads use, the next two
         self._taken: dict[int, tuple[int, int, str]] = {}  # bytes, messages and key by descriptor
         self._failed = 0
-        self._charges: deque[tuple[int, str]] = deque(maxlen=CONNECTIONS)
+        self._charges: deque[tuple[_Connection | int, str]] = deque(maxlen=CONNECTIONS)
         self._admitted: deque[tuple[str, str]] = deque(maxlen=CONNECTIONS)  # key and address
         self._lines: deque[str] = deque(maxlen=128)
         self._empty_s = 0.0
@@ -87,6 +88,7 @@ class Guard:
         self._to_fail = 0  # handshakes that were cut off
         self._orphaned = 0  # bytes that waited of connections that ended, since nothing waited
         self._homes: set[str] = set()  # addresses from which a key has sent a message
+        self._resident = tcp.resident_bytes()  # memory of this process when last little waited
         self._marked_s = 0.0
         self._since_mark = 0  # messages handed over
         self._thread = Thread(target=self._watch, name="guard", daemon=True)
@@ -107,9 +109,11 @@ class Guard:
     def charge(self, descriptor: int, reason: str) -> None:
         """What that connection sent no agent sends."""
         connection = self._open.get(descriptor)
-        if connection is not None and connection.sure:  # at once; whose it is will be seen later
+        if connection is not None and connection.sure:  # at once; who it is will be looked at later
             tcp.cut(descriptor, connection.inode)
-        self._charges.append((descriptor, reason))
+            self._charges.append((connection, reason))
+        else:
+            self._charges.append((descriptor, reason))
 
     def admits(self, key: str, address: str) -> bool:
         """Whether that key, which is authorized, may come in now."""
@@ -216,8 +220,12 @@ class Guard:
         self._bound(now_s)
         if not self._open:
             return -1
-        if all(connection.account.waiting <= self._bounds.message for connection in self._open.values()):
+        much = sum(max(0, connection.account.waiting) for connection in self._present())
+        if much <= self._bounds.message:
+            self._resident = tcp.resident_bytes()
             return _TICK_MS
+        if tcp.resident_bytes() - self._resident - much > GROWTH_BYTES:
+            self._offend(self._worst(now_s), "many small parts", now_s)
         self._poke()
         return _ALERT_MS
 
@@ -279,16 +287,15 @@ class Guard:
         for connection in self._present():
             if connection.account.waiting > self._bounds.peer:
                 self._offend(connection, "more than may wait", now_s)
-        present = self._present()
-        present.sort(key=lambda c: c.account.waiting * (now_s - c.account.since_s + 0.1))
-        total = sum(connection.account.waiting for connection in present)
-        while present and total > self._bounds.total:
-            worst = present.pop()
-            total -= worst.account.waiting
-            self._offend(worst, "more than may wait of all together", now_s)
+        while sum(connection.account.waiting for connection in self._present()) > self._bounds.total:
+            self._offend(self._worst(now_s), "more than may wait of all together", now_s)
 
-    def _convict(self, descriptor: int, reason: str) -> None:
-        connection = self._open.get(descriptor)
+    def _worst(self, now_s: float) -> _Connection:
+        """Who has the most waiting, for the longest."""
+        return max(self._present(), key=lambda c: c.account.waiting * (now_s - c.account.since_s + 0.1))
+
+    def _convict(self, whom: _Connection | int, reason: str) -> None:
+        connection = self._open.get(whom) if isinstance(whom, int) else whom
         if connection is not None and connection.sure:
             self._offend(connection, reason, time.monotonic())
 

@@ -1,4 +1,4 @@
-"""What the kernel knows of a TCP connection that libzmq owns (Linux).
+"""What the kernel knows of a TCP connection that libzmq owns, and of this process (Linux).
 
 The descriptor is libzmq's: it may close it, and the number may come to mean another connection, at any time.
 So each is known by its inode as well, and is never closed here.
@@ -19,6 +19,7 @@ from contextlib import closing
 _INFO_BYTES = 136
 _RECEIVED_AT = 128  # tcpi_bytes_received in struct tcp_info, linux/tcp.h
 _TRIES = 4
+_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 _NOWHERE = bytes(16)  # a sockaddr of AF_UNSPEC: connect(2) to it ends a TCP connection with a reset
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -67,6 +68,12 @@ def _received(descriptor: int) -> int | None:
     if _libc.getsockopt(descriptor, socket.IPPROTO_TCP, socket.TCP_INFO, info, ctypes.byref(size)) != 0:
         return None
     return int(struct.unpack_from("=Q", info, _RECEIVED_AT)[0])
+
+
+def resident_bytes() -> int:
+    """Memory of this process that is really there."""
+    with open("/proc/self/statm", "rb") as file:
+        return int(file.read().split()[1]) * _PAGE_BYTES
 
 
 def cut(descriptor: int, number: int) -> bool:

@@ -63,8 +63,14 @@ _ROUTER: dict[int, int] = {
     # without this, libzmq would never route to it again. Ids are 64 random bits.
     zmq.ROUTER_HANDOVER: 1,
     # The heartbeat's timer of a connection that another took over ends the process where its peer then resets
-    # it (libzmq 4.3.5, as with RCVHWM below). Agents' own heartbeats say by HEARTBEAT_TTL when they are gone.
+    # it (libzmq 4.3.5, as with RCVHWM below). The kernel notices in 2 to 3 s that a network is gone: by what is
+    # not acknowledged, or where nothing is under way, by its own probes.
     zmq.HEARTBEAT_IVL: 0,
+    zmq.TCP_MAXRT: 2000,
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 1,
+    zmq.TCP_KEEPALIVE_INTVL: 1,
+    zmq.TCP_KEEPALIVE_CNT: 2,
 }
 
 
