@@ -1,4 +1,4 @@
-"""Nothing that runs live asks what time of day it is: a clock that is set an hour back or ahead changes nothing."""
+"""Nothing that runs live asks the wall clock: one that is set an hour back or ahead changes nothing."""
 
 import ast
 from pathlib import Path
