@@ -63,7 +63,7 @@ def test_an_agent_is_stopped(tmp_path, plain_session):
     report = json.loads((tmp_path / "ann" / "report.json").read_text())
     told = json.loads((tmp_path / "edge" / "edge.json").read_text())["agents"]["ann"]
     assert (report["protocol"]["open"], report["frames"]) == (0, 45)
-    assert told["keyframes"] == report["keyframes"]
+    assert told["keyframes"] == report["protocol"]["acknowledged"]
 
 
 def test_agents_are_killed_again_and_again(tmp_path, plain_session):
