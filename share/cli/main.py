@@ -40,6 +40,9 @@ COMMANDS = {
 }
 
 
+_LONGEST = 1500  # characters of an error
+
+
 class _Lazy(click.Group):
     """A group whose commands are modules that are not imported until one is called."""
 
@@ -92,6 +95,12 @@ class _InterruptedError(ShareError):
     exit_code = 130
 
 
+def one_line(text: str) -> str:
+    """A message that quotes what stands in somebody's file: without control characters, of a bearable length."""
+    clean = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return clean if len(clean) <= _LONGEST else f"{clean[: _LONGEST // 2]} … {clean[-_LONGEST // 2 :]}"
+
+
 def _nearest(name: str) -> str:
     near = difflib.get_close_matches(name, COMMANDS, n=1)
     return f"did you mean '{near[0]}'?" if near else f"there are {', '.join(COMMANDS)}"
@@ -124,7 +133,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _fail(text: str, code: int) -> None:
     with contextlib.suppress(OSError):  # its terminal may be gone
-        click.echo(f"share: {text}", err=True)
+        click.echo(f"share: {one_line(text)}", err=True)
     sys.exit(code)
 
 

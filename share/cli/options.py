@@ -82,11 +82,12 @@ frames = click.option(
 def load_config(path: str | None) -> Config:
     """The settings of a YAML file, or the defaults. Raises ConfigError or UsageError."""
     from share import config as settings
+    from share.io.regular_file import SETTINGS, read_text
 
     if path is None:
         return settings.Config()
     try:
-        text = Path(path).read_text()
+        text = read_text(Path(path), SETTINGS)
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise UsageError(f"{path}: cannot read the configuration: {reason}") from None

@@ -14,17 +14,19 @@ import numpy as np
 from share.core.measurement import CAM0, IMU, LazyImage, Measurement
 from share.errors import DataError, UsageError
 from share.geometry.camera import Rig
+from share.io.losses import Losses
 from share.io.trajectory import Trajectory
 from share.types import F64, I64
 
 
 class Source(ABC):
     """One agent's recording, or its camera. `rig` decides which streams there are; `notes` are for people;
-    `serial` is the number of the device, None where nobody knows."""
+    `losses` what could not be read so far; `serial` is the number of the device, None where nobody knows."""
 
     name: str
     rig: Rig
     notes: tuple[str, ...]
+    losses: Losses
     serial: str | None = None
 
     @abstractmethod
@@ -105,6 +107,7 @@ class FolderSource(Source):
     imu: tuple[I64, F64] | None = None
     read_truth: Callable[[], Trajectory | None] = lambda: None
     notes: tuple[str, ...] = field(default=())
+    losses: Losses = field(default_factory=Losses)
 
     def stamps(self) -> dict[str, I64]:
         out = {
@@ -132,7 +135,7 @@ class FolderSource(Source):
         if imu is not None:
             keep = (imu[0] > span.imu_from) & (imu[0] <= span.imu_to)
             imu = (imu[0][keep], imu[1][keep])
-        return FolderSource(self.name, self.rig, images, imu, self.read_truth, self.notes)
+        return FolderSource(self.name, self.rig, images, imu, self.read_truth, self.notes, self.losses)
 
     def _streams(self) -> Iterator[Iterator[Measurement]]:
         if self.imu is not None:  # first, so that samples precede an image of the same stamp

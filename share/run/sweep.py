@@ -87,13 +87,11 @@ def drawn(axes: Sequence[Axis], count: int, seed: int) -> list[Point]:
 
 def at(config: Config, axes: Sequence[Axis], point: Point) -> Config:
     """`config` but for the settings of `point`. Raises ConfigError naming the one that is wrong."""
-    import yaml
-
     mapping: dict[str, Any] = to_mapping(config)
     for axis, value in zip(axes, point, strict=True):
         for name in axis.names:
             section, key = name.split(".")
-            mapping.setdefault(section, {})[key] = yaml.safe_load(value)
+            mapping.setdefault(section, {})[key] = load_yaml(value, "--set")
     return from_mapping(Config, mapping, "--set")
 
 

@@ -1,0 +1,53 @@
+"""What a JPEG or PNG says it is, before a decoder sees it. Pure: bytes in, numbers out."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_SOF = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # frames; the others are tables (ITU T.81, B.1.1.3)
+_BARE = frozenset((0x01, *range(0xD0, 0xD9)))  # markers without a length
+_END = (0xD9, 0xDA)  # of the image, and where pixels begin: no size was said before
+_SCAN = b"\xff\xda"
+_GRAY_16 = (16, 0)  # bits, colour type (PNG 11.2.2)
+
+
+class ImageHeader(NamedTuple):
+    """width, height in pixels; is_depth: a PNG with one channel of 16 bits; scans: passes over a JPEG's
+    image that decoding takes, at most."""
+
+    width: int
+    height: int
+    is_depth: bool
+    scans: int = 1
+
+
+def image_header(data: bytes) -> ImageHeader | None:
+    """None where it does not say, or is neither."""
+    return _png(data) if data[:8] == _PNG else _jpeg(data) if data[:2] == b"\xff\xd8" else None
+
+
+def _png(data: bytes) -> ImageHeader | None:
+    if len(data) < 33 or data[8:16] != b"\x00\x00\x00\rIHDR":
+        return None
+    width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
+    return ImageHeader(width, height, (data[24], data[25]) == _GRAY_16)
+
+
+def _jpeg(data: bytes) -> ImageHeader | None:
+    """From its first frame header, over segments of any kind; a decoder refuses a second one."""
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:  # padding
+            at += 1
+        elif marker in _BARE:
+            at += 2
+        elif marker in _SOF:
+            height, width = (int.from_bytes(data[k : k + 2], "big") for k in (at + 5, at + 7))
+            return ImageHeader(width, height, False, data.count(_SCAN))
+        elif marker in _END:
+            return None
+        else:
+            at += 2 + max(2, int.from_bytes(data[at + 2 : at + 4], "big"))
+    return None
