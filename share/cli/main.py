@@ -16,7 +16,7 @@ from typing import Any  # noqa: E402
 import click  # noqa: E402
 
 from share import __version__  # noqa: E402
-from share.errors import ShareError, UsageError  # noqa: E402
+from share.errors import ShareError, UsageError, one_line  # noqa: E402
 
 # name: (module, attribute, one line of help). Literal, so that a freezer sees every module.
 COMMANDS = {
@@ -38,9 +38,6 @@ COMMANDS = {
     ),
     "keys": ("share.cli.keys", "keys", "Who may connect to an edge from another machine."),
 }
-
-
-_LONGEST = 1500  # characters of an error
 
 
 class _Lazy(click.Group):
@@ -93,12 +90,6 @@ class _InterruptedError(ShareError):
     """By Ctrl-C. The exit code is what shells give for SIGINT."""
 
     exit_code = 130
-
-
-def one_line(text: str) -> str:
-    """A message that quotes what stands in somebody's file: without control characters, of a bearable length."""
-    clean = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-    return clean if len(clean) <= _LONGEST else f"{clean[: _LONGEST // 2]} … {clean[-_LONGEST // 2 :]}"
 
 
 def _nearest(name: str) -> str:

@@ -53,6 +53,12 @@ class EncodedImage:
         check_complete(data, self.where)
         return data
 
+    def check(self) -> None:
+        """Raises DataError unless it is whole and of the calibration's size, as far as that is known without
+        its pixels."""
+        header = _header(self.read(), self.where)
+        check_said(header.width, header.height, self.width, self.height, self.where)
+
     def load(self) -> NDArray[Any]:
         data = self.read()
         header = _header(data, self.where)

@@ -21,12 +21,11 @@ from share.types import F64, I64
 
 class Source(ABC):
     """One agent's recording, or its camera. `rig` decides which streams there are; `notes` are for people;
-    `losses` what could not be read so far; `serial` is the number of the device, None where nobody knows."""
+    `serial` is the number of the device, None where nobody knows."""
 
     name: str
     rig: Rig
     notes: tuple[str, ...]
-    losses: Losses
     serial: str | None = None
 
     @abstractmethod
@@ -43,6 +42,11 @@ class Source(ABC):
 
     def stop(self) -> None:  # noqa: B027 -- a recording ends by itself
         """Ask a live camera to end, from any thread or signal handler."""
+
+    @cached_property
+    def losses(self) -> Losses:
+        """What could not be read so far and was left out."""
+        return Losses()
 
     def report(self) -> dict[str, Any]:
         """What a live camera met, for report.json."""

@@ -251,6 +251,7 @@ class AgentRun:
             "bytes_up": protocol["bytes_up"],
             "bytes_down": protocol["bytes_down"],
             "damaged_images": self._damaged,
+            "left_out": self._source.losses.counts,
             "drop_late": self._late.dropped,
             **self._source.report(),
             **self._errors.report(),

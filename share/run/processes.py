@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
+from share.io.files import fresh
+
 
 def command(*arguments: str) -> list[str]:
     """The command line that runs `share ARGUMENTS` with this very program."""
@@ -21,7 +23,7 @@ def command(*arguments: str) -> list[str]:
 @contextlib.contextmanager
 def child(log: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
     """`share ARGUMENTS` with its output in `log`; asked to end, then made to, when the block is left."""
-    with log.open("wb") as sink:
+    with fresh(log) as sink:
         process = _start(sink, arguments)
         try:
             yield process

@@ -69,7 +69,7 @@ def test_messages_are_read_as_rosbags_writes_them(frame):
         linear_acceleration=other,
         linear_acceleration_covariance=covariances[2],
     )
-    stamps, values = fast._unpacked([ros.encode(message)] * 2, "here")
+    stamps, values = fast._unpacked([ros.encode(message)] * 2)
     assert stamps.tolist() == [12_000_000_345] * 2
     assert values[1].tolist() == [getattr(v, k) for v in (vector, other) for k in "xyz"]
     with pytest.raises(DataError, match="here: a message is no sensor_msgs/Imu"):
