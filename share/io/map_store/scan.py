@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from share.io.map_store.connect import BROKEN
 from share.io.map_store.rows import COLUMNS, Row, is_whole
+from share.io.map_store.schema import own_tables
 
 PROBES = 100_000  # numbers looked up one by one between two parts of a damaged table
 
@@ -29,13 +30,13 @@ class Found:
 
 
 def whole_rows(connection: sqlite3.Connection) -> Found:
-    """Every row of every table that can be read and whose CRC is right."""
-    found = Found()
+    """Every row of every table of our making that can be read and whose CRC is right."""
+    found, own = Found(), _own(connection)
     for table in COLUMNS:
-        everything, all_read = _everything(connection, table)
+        everything, all_read = _everything(connection, table) if table in own else ({}, False)
         good = {n: row for n, row in everything.items() if is_whole(table, n, row)}
         found.tables[table] = [(n, row[:-1]) for n, row in sorted(good.items())]
-        count = _count(connection, table)
+        count = _count(connection, table) if table in own else None
         found.lost[table] = max(count or 0, len(everything)) - len(good)
         if count is None and not all_read:
             found.uncounted.add(table)
@@ -52,6 +53,13 @@ def with_copies(found: Found) -> Found:
     one = {"run", "run_copy"} <= found.uncounted
     uncounted = found.uncounted - {"run_copy"} - (set() if one else {"run"})
     return Found(found.tables | {"run": both, "run_copy": both}, lost, uncounted)
+
+
+def _own(connection: sqlite3.Connection) -> set[str]:
+    try:
+        return own_tables(connection)
+    except BROKEN:
+        return set()
 
 
 def _everything(connection: sqlite3.Connection, table: str) -> tuple[dict[int, Row], bool]:
