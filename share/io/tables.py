@@ -96,7 +96,7 @@ def parsed(
             _lose(losses, path, number, str(error).removeprefix(f"{path}, line {number}: "))
     stamps = np.array([row[0] for row in found], np.int64)
     good = in_order(path, stamps, lines, losses)
-    _check(path, losses, len(good))
+    _check(path, losses, int(good.sum()))
     return stamps[good], [found[i] for i in np.flatnonzero(good)]
 
 

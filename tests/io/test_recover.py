@@ -179,9 +179,9 @@ def test_sigkill_leaves_a_file_that_can_be_recovered(tmp_path):
 
 def test_an_error_while_converting_leaves_nothing(tmp_path):
     folder = make_tum(tmp_path / "walk")
-    image = folder / "rgb" / "3.jpg"
-    image.write_bytes(image.read_bytes()[:-100])
+    for image in (folder / "rgb" / "2.jpg", folder / "rgb" / "3.jpg"):
+        image.write_bytes(image.read_bytes()[:-100])
     out = tmp_path / "out"
-    with pytest.raises(DataError, match=r"3\.jpg: the image is cut short"):
+    with pytest.raises(DataError, match=r"2\.jpg: the image is cut short.*2 of 5 images of cam0 are damaged"):
         to_mcap(open_source(str(folder)), out / "x.mcap", None, nothing)
     assert os.listdir(out) == []
