@@ -52,9 +52,11 @@ def open_regular(path: Path, most: int | None = None) -> BinaryIO:
 def read_bytes(path: Path, most: int) -> bytes:
     """All of a file of at most so many bytes. Raises OSError."""
     with open_regular(path, most) as file:
-        data = file.read(most + 1)
-    if len(data) > most:  # it grows
-        raise _too_large(path, len(data), most)
+        data = file.read(os.fstat(file.fileno()).st_size + 1)  # Python reserves what is asked for
+        while more := file.read(MB):  # it grows, or is one of /proc, which have no size
+            data += more
+            if len(data) > most:
+                raise _too_large(path, len(data), most)
     return data
 
 

@@ -15,13 +15,15 @@ import cv2
 import numpy as np
 import pytest
 from live import RIG, frames, live
-from map_changes import filled
+from map_changes import ANN, pose, small_map
 from recordings import HEIGHT, STEP_NS, WIDTH, depth_mm, make_euroc, make_tum, picture
 
 from share.config import Config
+from share.core.keeping import KeepLink, Kept
 from share.core.measurement import Measurement
 from share.core.sequencer import SequencerCounters
 from share.errors import ConfigError, DataError, MisfitError, ShareError, UsageError, one_line
+from share.geometry import se3
 from share.io.calibration import read_calibration
 from share.io.files import atomic_write, fresh
 from share.io.image_header import image_header
@@ -38,10 +40,11 @@ from share.io.section import read_yaml
 from share.io.session import read_session
 from share.io.source import open_source
 from share.io.tables import longest_rising, read_table
+from share.merge.join import Key
 from share.run.pipeline import frames_of
 from share.strict import load_yaml
 
-SOON_S = 5.0  # generous: a few milliseconds on an idle machine
+SOON_S = 20.0  # of CPU time, generous: most take milliseconds
 
 
 @pytest.fixture(autouse=True)
@@ -72,7 +75,7 @@ MERGES = "a: &a {x: 1}\n" + "".join(
         (MERGES, "more than 200,000 values, aliases counted in full"),
         ("a: &a [*a]", "alias 'a' stands within what it stands for"),
         ("a: " + "9" * 100_000, "a number of 100000 characters"),
-        ("a: 0x" + "f" * 100_000, "a number of 100005 characters"),
+        ("a: 0x" + "f" * 100_000, "a number of 100002 characters"),
         ("a: " + ":".join(["59"] * 100_000), "a number of 299999 characters"),
         ("a: 2026-99-99", "is not what its tag says"),
         ("a: !!bool maybe", "is not what its tag says"),
@@ -139,7 +142,7 @@ def test_json_that_is_nested_without_end(tmp_path):
 def test_calibrations_of_no_camera(tmp_path, key, value, says):
     room = make_euroc(tmp_path / "room")
     sheet = room / "mav0/cam0/sensor.yaml"
-    kept = [line for line in sheet.read_text().splitlines() if not line.startswith((key, "  "))]
+    kept = [line for line in sheet.read_text().splitlines() if not line.startswith((key, "  ", "T_BS"))]
     if key != "T_BS":
         kept.append("T_BS: [1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1]")
     sheet.write_text("\n".join([*kept, f"{key}: {value}", ""]))
@@ -314,7 +317,7 @@ def test_paths_in_files_stay_in_their_folder(tmp_path, name):
     assert inside(tmp_path, "rgb/1.png", "") == tmp_path / "rgb/1.png"
 
 
-@pytest.mark.parametrize("name", ["../x", "/etc/x", "a\\0b", "x" * 10_000, ".hidden", "a b", ""])
+@pytest.mark.parametrize("name", ["../x", "/etc/x", "a\\0b", "x" * 1_000, ".hidden", "a b", ""])
 def test_names_of_agents_in_a_session(tmp_path, name):
     agent = "{kind: ar, sensors: stereo, rate_hz: 20}"
     (tmp_path / "session.yaml").write_text(f'schema: 1\nagents: {{"{name}": {agent}}}\n')
@@ -396,23 +399,21 @@ def _recorded(path: Path, images: int = 40) -> Path:
     return path
 
 
-def test_one_message_that_cannot_be_read_costs_itself(tmp_path, monkeypatch):
+def test_a_message_that_cannot_be_read_costs_itself(tmp_path):
     path = tmp_path / "a.mcap"
     with Recorder(path, RIG) as recorder:
-        for k, m in enumerate(live(40)):
+        for k, m in enumerate(live(100)):
             recorder.write(m)
             if k == 100:
-                broken = [len(recorder._channels), b"", b"\0\1\0\0", b"\xff" * 40, bytes(8) + b"\xff" * 300]
-                for data in broken[1:]:
-                    for channel in list(recorder._channels.values()):
-                        recorder._writer.add_message(channel, recorder._log_ns, data, recorder._log_ns, 0)
+                broken = (b"", b"\0\1\0\0", b"\xff" * 40, bytes(8) + b"\xff" * 300)
+                for number, data in enumerate(broken):
+                    for channel in recorder._channels.values():
+                        recorder._writer.add_message(channel, recorder._log_ns + number, data, 0, 0)
     source = open_source(str(path))
     out = frames(source)
-    assert len(out) == 40
-    assert [f.stamp_ns for f in out] == [10**9 + k * STEP_NS for k in range(40)]
-    assert source.losses.counts == {f"messages of /{t}": 4 for t in ("imu0",)} | {
-        f"messages of /{t}/image_raw": 4 for t in ("cam0", "depth")
-    } or sum(source.losses.counts.values()) >= 10
+    assert [f.stamp_ns for f in out] == [10**9 + k * STEP_NS for k in range(100)]
+    topics = ("/imu0", "/cam0/image_raw", "/depth/image_raw")
+    assert source.losses.counts == {f"messages of {topic}": 4 for topic in topics}
 
 
 def test_an_image_message_of_an_absurd_size_and_a_sample_that_is_not_finite(tmp_path):
@@ -467,6 +468,15 @@ def test_an_index_that_leads_astray(tmp_path, attack):
 
 
 # ------------------------------------------------------------------ map files
+
+
+
+def filled(path: Path) -> Kept:
+    T, cov = se3.inverse(pose(0)) @ pose(2), np.eye(6) * 1e-4
+    with MapStore.open(path) as store:
+        store.write([*small_map(), KeepLink(Key(ANN, 2), 0, T, cov)])
+    return MapStore.read(path).load()
+
 
 FOREVER = "WITH RECURSIVE r(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM r) SELECT x AS number"
 EVIL = {
