@@ -64,7 +64,7 @@ def not_installed(packages: str, extra: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """A message that quotes what stands in somebody's file: without control characters, of a bearable length."""
+    """A message that quotes somebody's file: without control characters, of a bearable length."""
     clean = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
     return clean if len(clean) <= _LONGEST else f"{clean[: _LONGEST // 2]} … {clean[-_LONGEST // 2 :]}"
 

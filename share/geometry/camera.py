@@ -158,7 +158,9 @@ class ImuNoise:
         if not all(0 <= value < np.inf for value in told):
             raise ValueError("IMU: has noise or a rate that is negative or not finite")
         if max(told[:4]) > _MOST_NOISE or self.rate_hz > _MOST_RATE_HZ:
-            raise ValueError(f"IMU: noise beyond {_MOST_NOISE:g} or a rate beyond {_MOST_RATE_HZ:g} Hz is none")
+            raise ValueError(
+                f"IMU: noise beyond {_MOST_NOISE:g} or a rate beyond {_MOST_RATE_HZ:g} Hz is none"
+            )
 
 
 @dataclass(frozen=True, eq=False)

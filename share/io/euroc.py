@@ -41,7 +41,9 @@ def open_euroc(path: Path, calibration: Calibration | None, frames: slice | None
         images[CAM1] = _images(root / CAM1, rig.cam1, losses)
     imu = tables.read_table(root / "imu0" / "data.csv", 7, losses=losses) if rig.imu else None
     name = (path if path.name != "mav0" else path.parent).resolve().name
-    source = FolderSource(name, rig, images, imu, lambda: _truth(root, rig, losses), _notes(root, rig), losses)
+    source = FolderSource(
+        name, rig, images, imu, lambda: _truth(root, rig, losses), _notes(root, rig), losses
+    )
     return source.part(frames)
 
 

@@ -163,7 +163,7 @@ def check_size(image: NDArray[Any], width: int, height: int, where: str) -> NDAr
 
 
 def check_said(found_width: int, found_height: int, width: int, height: int, where: str) -> None:
-    """Raises MisfitError for an image of another size than the calibration's, before its pixels are touched."""
+    """Raises MisfitError for an image of another size than the calibration's; its pixels are not touched."""
     if (found_width, found_height) != (width, height):
         raise MisfitError(
             f"{where}: is {found_width}x{found_height}, but the calibration is for {width}x{height}; "

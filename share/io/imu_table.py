@@ -83,7 +83,7 @@ def _of_db3(path: Path, told: Callable[[int, int], None]) -> ImuTable:
 
 def _table(name: str, stamps_ns: I64, values: F64, serial: str | None = None, lost: int = 0) -> ImuTable:
     """lost: samples that could not even be read. Raises DataError where more than 5 % are damaged."""
-    finite = np.isfinite(values).all(axis=1)
+    finite = np.asarray(np.isfinite(values).all(axis=1))
     losses = Losses()
     for k in np.flatnonzero(~finite):
         losses.add("IMU samples", str(k), f"{name}: IMU sample {k + 1} is not finite")

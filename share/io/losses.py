@@ -33,10 +33,12 @@ class Losses:
                 kind.places.add(where)
 
     def check(self, what: str, total: int) -> None:
-        """Raises DataError if more than 5 % of all `total`, and more than one, are lost."""
+        """Raises DataError if all of `total` are lost, or more than 5 % and more than one."""
         kind = self._kinds.get(what)
-        if kind is not None and kind.count > max(_FEW, FORGIVEN * total):
-            raise DataError(f"{kind.first} ({kind.count} of {total} {what} are damaged: too many to leave out)")
+        if kind is not None and kind.count > min(max(_FEW, FORGIVEN * total), total - 1):
+            raise DataError(
+                f"{kind.first} ({kind.count} of {total} {what} are damaged: too many to leave out)"
+            )
 
     @property
     def counts(self) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""CSV and TXT tables of a dataset: read by numpy, and when that fails, line by line: one that is damaged costs
+"""CSV and TXT tables of a dataset: read by numpy, and when that fails, line by line. A damaged line costs
 itself, or is said to be to blame."""
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def in_order(path: Path, stamps: I64, lines: Sequence[int], losses: Losses | Non
     good = longest_rising(stamps)
     for i in [int(back[0]) + 1] if losses is None else np.flatnonzero(~good):
         why = f"stamp {stamps[i]} ns is earlier than the line before or later than those after; sort the file"
-        _lose(losses, path, lines[i], f"{why} by its first column")
+        _lose(losses, path, lines[int(i)], f"{why} by its first column")
     return good
 
 
@@ -140,8 +140,8 @@ def _check(path: Path, losses: Losses | None, good: int) -> None:
 def read_table(path: Path, columns: int, nan: bool = False, losses: Losses | None = None) -> tuple[I64, F64]:
     """A CSV of integer nanoseconds and numbers: stamps (N,) and the next columns - 1 as (N, columns - 1).
 
-    nan: values may be NaN, or empty. A short line, a stamp or value that is no finite number, and a stamp that
-    goes back cost their line and go to `losses`. Raises DataError naming file and line where that is not
+    nan: values may be NaN, or empty. A short line, a stamp or value that is no finite number, and a stamp
+    that goes back cost their line and go to `losses`. Raises DataError naming file and line where that is not
     given, or more than 5 % are lost.
     """
     dtype = [("stamp", np.int64), *((f"c{i}", np.float64) for i in range(1, columns))]

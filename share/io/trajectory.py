@@ -53,8 +53,8 @@ def format_tum(trajectory: Trajectory) -> str:
 
 
 def read_tum(path: Path, losses: Losses | None = None) -> Trajectory:
-    """losses: takes the lines that are damaged. Raises DataError naming file and line, where that is not given
-    or more than 5 % are."""
+    """losses: takes the lines that are damaged. Raises DataError naming file and line, where that is not
+    given or more than 5 % are."""
     stamps_ns, numbers = read_tum_table(path, losses=losses)
     return trajectory_of(stamps_ns, numbers[:, :3], numbers[:, 3:], path, losses)
 

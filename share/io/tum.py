@@ -53,7 +53,9 @@ def open_tum(path: Path, calibration: Calibration | None, frames: slice | None) 
         CAM0: [(stamp, file_image(path / colour, rig.cam0)) for stamp, colour, _ in pairs],
         DEPTH: [(stamp, file_image(path / file, depth, scale)) for stamp, _, file in pairs],
     }
-    source = FolderSource(path.resolve().name, rig, images, None, lambda: _truth(path, rig, losses), note, losses)
+    source = FolderSource(
+        path.resolve().name, rig, images, None, lambda: _truth(path, rig, losses), note, losses
+    )
     return source.part(frames)
 
 

@@ -29,9 +29,9 @@ def frames_of(
     on_bad: Callable[[DataError], None] | None = None,
     spent: Callable[[float], None] = lambda cpu_s: None,
 ) -> Iterator[Frame]:
-    """Decoded frames in order. One with a damaged image is left out: the next one has its IMU samples too, and
-    `on_bad` is told, or the source's losses are. Raises MisfitError where the first ten images, or all of them,
-    are of another size than the calibration's.
+    """Decoded frames in order. One with a damaged image is left out: the next one has its IMU samples too,
+    and `on_bad` is told, or the source's losses are. Raises MisfitError where the first ten images, or all of
+    them, are of another size than the calibration's.
 
     `spent` is told the CPU time of each frame's decoding on this thread.
     """

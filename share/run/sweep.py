@@ -20,7 +20,7 @@ from share.metrics.comparison import MEASURES
 from share.metrics.figures import RunFigures
 from share.run.campaign import Planned, check_names
 from share.run.play import Terms
-from share.strict import from_mapping, to_mapping
+from share.strict import from_mapping, load_yaml, to_mapping
 
 _SEED = 20261123
 Point = tuple[str, ...]  # a value of each axis, as YAML has it

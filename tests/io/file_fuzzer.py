@@ -24,25 +24,25 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from live import RIG, live  # noqa: E402
-from map_changes import small_map  # noqa: E402
-from recordings import make_euroc, make_tum  # noqa: E402
+from live import RIG, live
+from map_changes import small_map
+from recordings import make_euroc, make_tum
 
-from share import config  # noqa: E402
-from share.core.sequencer import SequencerCounters  # noqa: E402
-from share.errors import ShareError  # noqa: E402
-from share.io.calibration import read_calibration  # noqa: E402
-from share.io.describe import describe  # noqa: E402
-from share.io.imu_table import read_imu  # noqa: E402
-from share.io.kalibr import kalibr_texts  # noqa: E402
-from share.io.map_describe import describe_map  # noqa: E402
-from share.io.map_store import MapStore  # noqa: E402
-from share.io.mcap.recorder import Recorder  # noqa: E402
-from share.io.mcap.recover import recover  # noqa: E402
-from share.io.mocap_file import read_bodies  # noqa: E402
-from share.io.session import read_session  # noqa: E402
-from share.io.source import open_source  # noqa: E402
-from share.run.pipeline import frames_of, tracker_for  # noqa: E402
+from share import config
+from share.core.sequencer import SequencerCounters
+from share.errors import ShareError
+from share.io.calibration import read_calibration
+from share.io.describe import describe
+from share.io.imu_table import read_imu
+from share.io.kalibr import kalibr_texts
+from share.io.map_describe import describe_map
+from share.io.map_store import MapStore
+from share.io.mcap.recorder import Recorder
+from share.io.mcap.recover import recover
+from share.io.mocap_file import read_bodies
+from share.io.session import read_session
+from share.io.source import open_source
+from share.run.pipeline import frames_of, tracker_for
 
 MEMORY = 3 * 2**30  # of addresses: Python, OpenCV and NumPy take 1.5 of them
 SECONDS = 30  # of CPU time, for one case
@@ -94,7 +94,7 @@ def read_map(path: Path) -> None:
 
 
 def read_settings(path: Path) -> None:
-    config.load(path.read_text(errors="replace"), str(path))
+    load_config(str(path))
 
 
 Seed = tuple[Callable[[Path], None], Path]
@@ -295,7 +295,9 @@ def _bound() -> None:
     signal.alarm(2 * SECONDS)  # it waits for something
 
 
-def fuzz(seconds: float, seed: int, keep: Path | None = None, only: str = "") -> tuple[Counter[str], list[str]]:
+def fuzz(
+    seconds: float, seed: int, keep: Path | None = None, only: str = ""
+) -> tuple[Counter[str], list[str]]:
     """Cases for so long (CPU time of children): how many ended how, and what failed."""
     counts: Counter[str] = Counter()
     failures: list[str] = []
@@ -346,6 +348,11 @@ def _copied(path: Path, folder: Path) -> Path:
 
 
 if __name__ == "__main__":
-    told, failed = fuzz(float(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 1, Path(tempfile.mkdtemp(prefix="fuzz-kept-")), "".join(sys.argv[3:4]))
+    told, failed = fuzz(
+        float(sys.argv[1]),
+        int(sys.argv[2]) if len(sys.argv) > 2 else 1,
+        Path(tempfile.mkdtemp(prefix="fuzz-kept-")),
+        "".join(sys.argv[3:4]),
+    )
     print(dict(sorted(told.items())))
     sys.exit(bool(failed))

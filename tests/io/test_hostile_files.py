@@ -262,7 +262,13 @@ def test_headers_agree_with_the_decoder():
             assert header is not None and header[:3] == (WIDTH, HEIGHT, depth)
     progressive = cv2.imencode(".jpg", picture(1), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
     assert image_header(progressive)[:2] == (WIDTH, HEIGHT)
-    for nothing in (b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"\xff\xd8\xff\xe0\0\0" * 50, b"\xff\xd8" + b"\xff" * 99):
+    for nothing in (
+        b"",
+        b"\x89PNG\r\n\x1a\n",
+        b"\xff\xd8",
+        b"\xff\xd8\xff\xe0\0\0" * 50,
+        b"\xff\xd8" + b"\xff" * 99,
+    ):
         assert image_header(nothing) is None
 
 
@@ -430,13 +436,17 @@ def test_an_image_message_of_an_absurd_size_and_a_sample_that_is_not_finite(tmp_
     with Recorder(other, RIG) as recorder:
         for m in live(40):
             wrong = m.stream == "cam0" and m.stamp_ns == 10**9 + 20 * STEP_NS
-            recorder.write(Measurement("cam0", m.stamp_ns, ArrayImage(np.zeros((3, 5000), np.uint8))) if wrong else m)
+            recorder.write(
+                Measurement("cam0", m.stamp_ns, ArrayImage(np.zeros((3, 5000), np.uint8))) if wrong else m
+            )
     source = open_source(str(other))
     assert len(list(frames_of(source, Config(), SequencerCounters()))) == 39
     assert "is 5000x3, but the calibration is for 64x48" in source.losses.lines()[0]
 
 
-@pytest.mark.parametrize("attack", ["twice", "outside", "elsewhere", "summary at the front", "no such channel"])
+@pytest.mark.parametrize(
+    "attack", ["twice", "outside", "elsewhere", "summary at the front", "no such channel"]
+)
 def test_an_index_that_leads_astray(tmp_path, attack):
     from mcap.reader import SeekingReader
 
@@ -461,14 +471,11 @@ def test_an_index_that_leads_astray(tmp_path, attack):
             old, new = data[start : start + 8], struct.pack("<Q", 8)
     assert old in data
     (tmp_path / "b.mcap").write_bytes(new.join(data.rsplit(old, 1)))
-    try:
-        assert len(frames(open_source(str(tmp_path / "b.mcap")))) <= 40
-    except DataError as error:
-        assert "share dataset recover" in str(error)
+    with pytest.raises(DataError, match="share dataset recover"):
+        frames(open_source(str(tmp_path / "b.mcap")))
 
 
 # ------------------------------------------------------------------ map files
-
 
 
 def filled(path: Path) -> Kept:
@@ -534,10 +541,15 @@ def test_rows_that_say_what_cannot_be_cost_themselves(tmp_path):
     with sqlite3.connect(path) as db:
         for table, change in changes.items():
             names = ("number", *COLUMNS[table])
-            number, *row = db.execute(f"SELECT {', '.join(names)} FROM {table} ORDER BY number LIMIT 1").fetchone()
+            number, *row = db.execute(
+                f"SELECT {', '.join(names)} FROM {table} ORDER BY number LIMIT 1"
+            ).fetchone()
             row = [change.get(name, value) for name, value in zip(COLUMNS[table], row, strict=True)]
             sets = ", ".join(f"{name} = ?" for name in (*COLUMNS[table], "crc"))
-            db.execute(f"UPDATE {table} SET {sets} WHERE number = ?", (*row, check(table, number, tuple(row)), number))
+            db.execute(
+                f"UPDATE {table} SET {sets} WHERE number = ?",
+                (*row, check(table, number, tuple(row)), number),
+            )
         db.execute("UPDATE run SET next = 1")
     db.close()
     found = MapStore.read(path).load()
@@ -545,7 +557,11 @@ def test_rows_that_say_what_cannot_be_cost_themselves(tmp_path):
     assert len(found.loops) == len(kept.loops) - 1
     assert found.poses is None
     said = " ".join(found.complaints)
-    for what in ("odometry edges could not be read", "loops could not be read", "solutions could not be read"):
+    for what in (
+        "odometry edges could not be read",
+        "loops could not be read",
+        "solutions could not be read",
+    ):
         assert what in said
 
 

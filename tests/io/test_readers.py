@@ -164,12 +164,20 @@ def _names_lead_out(root):
 
 
 DAMAGE = {
-    "unsorted": (_unsorted, DataError, r"cam1/data\.csv, line .* earlier than the line before.*; sort.*5 of 6"),
+    "unsorted": (
+        _unsorted,
+        DataError,
+        r"cam1/data\.csv, line .* earlier than the line before.*; sort.*5 of 6",
+    ),
     "NaN stamps": (_nan_stamps, DataError, r"line 2: stamp 'nan'.*2 of 6 lines of .* too many to leave out"),
     "names lead out": (_names_lead_out, DataError, r"line 2: '\.\./\.\./x\.png' is no name of a file below"),
     "no list": (lambda r: (r / "mav0/cam0/data.csv").unlink(), DataError, r"data\.csv: no such file"),
     "empty list": (lambda r: (r / "mav0/cam0/data.csv").write_text(""), DataError, "has no data"),
-    "no images": (lambda r: shutil.rmtree(r / "mav0/cam0/data"), DataError, "is missing from .*6 of 6 images"),
+    "no images": (
+        lambda r: shutil.rmtree(r / "mav0/cam0/data"),
+        DataError,
+        "is missing from .*6 of 6 images",
+    ),
     "no sensor.yaml": (lambda r: (r / "mav0/cam0/sensor.yaml").unlink(), ConfigError, "give .* --calib"),
     "no extrinsics": (_edit("cam1/sensor.yaml", "T_BS", "T"), ConfigError, "cam1.*: key 'T_BS' is missing"),
     "no cameras": (lambda r: shutil.rmtree(r / "mav0/cam0"), ConfigError, "cam0/sensor.yaml: no such file"),
@@ -186,10 +194,10 @@ def _gone(root):
 
 
 ONE = {
-    "line of IMU cut": (_cut_csv, 6, 70, r"1 lines of .*imu0/data\.csv, line 72: 6 of 7 columns; the line is cut short"),
-    "NaN in the IMU": (_edit("imu0/data.csv", ",0", ",nan"), 6, 70, r"1 lines of .*line \d+: 'nan.*' is not "),
-    "NaN stamp": (_edit("cam0/data.csv", str(START_NS), "nan"), 5, 71, r"1 lines of .*cam0/data.csv, line 2: stamp 'nan'"),
-    "stamp far ahead": (_edit("imu0/data.csv", "14037152", "24037152"), 6, 70, "line 2: stamp .* later than those after"),
+    "line of IMU cut": (_cut_csv, 6, 70, r"1 lines of .*imu0/data\.csv, line 72: 6 of 7 columns; the line is cut short"),  # noqa: E501
+    "NaN in the IMU": (_edit("imu0/data.csv", ",0", ",nan"), 6, 70, r"1 lines of .*line \d+: 'nan.*' is not "),  # noqa: E501
+    "NaN stamp": (_edit("cam0/data.csv", str(START_NS), "nan"), 5, 71, r"1 lines of .*cam0/data.csv, line 2: stamp 'nan'"),  # noqa: E501
+    "stamp far ahead": (_edit("imu0/data.csv", "14037152", "24037152"), 6, 70, "line 2: stamp .* later than those after"),  # noqa: E501
     "one image gone": (_gone, 5, 71, rf"1 images of .*cam1/data.csv.*: {START_NS}\.png is missing"),
 }  # fmt: skip
 
@@ -221,7 +229,9 @@ def test_one_damaged_line_of_a_truth_costs_itself(request, file):
 
 def test_files_that_a_list_names_stay_in_its_folder(tum):
     (tum / "rgb.txt").write_text("10.0 ../../../etc/passwd\n10.033333 /etc/passwd\n10.066667 rgb/2.jpg\n")
-    with pytest.raises(DataError, match=r"rgb\.txt, line 1: '\.\./\.\./\.\./etc/passwd' is no name of a file below"):
+    with pytest.raises(
+        DataError, match=r"rgb\.txt, line 1: '\.\./\.\./\.\./etc/passwd' is no name of a file below"
+    ):
         open_source(str(tum))
 
 

@@ -20,7 +20,7 @@ MAGIC = b"SQLite format 3\0"
 _HEADER_BYTES = 100
 _FIXED = (*range(18), *range(20, 24), *range(44, 48), *range(52, 60))  # sqlite.org/fileformat.html, 1.3
 _MOST_BYTES = 256 * 1024**2  # of a row: poses of a million keyframes are 128 MB
-_PATIENCE_S, _BYTES_A_SECOND = 20.0, 1e6
+_PATIENCE_S, _BYTES_A_SECOND = 10.0, 1e6
 _STEPS = 10_000  # of SQLite's machine between two looks at the clock: some 0.1 ms
 _OURS = b"CREATE TABLE keyframe(", b"CREATE TABLE run_copy("  # one survives a flipped byte
 

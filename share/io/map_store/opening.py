@@ -100,9 +100,9 @@ def _bring_up_to_date(path: Path, found: int) -> None:
     """In place, after a copy was made."""
     with complaints(path, "opened"), contextlib.closing(connect.for_writing(path, True)) as connection:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    with writing(path):
-        with open_regular(path) as old, fresh(path.with_name(f"{path.name}.schema-{found}")) as copy:
-            shutil.copyfileobj(old, copy)
+    copy = path.with_name(f"{path.name}.schema-{found}")
+    with writing(path), open_regular(path) as old, fresh(copy) as new:
+        shutil.copyfileobj(old, new)
     _migrate(path, found)
 
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 
 from share.io.map_store.connect import BROKEN
 from share.io.map_store.rows import COLUMNS, Row, is_whole
-from share.io.map_store.schema import own_tables
+from share.io.map_store.schema import PAGE_BYTES, own_tables
 
-PROBES = 100_000  # numbers looked up one by one between two parts of a damaged table
+PROBES = 100_000  # numbers looked up one by one between two parts of a damaged table, and no more than
+_ROW_BYTES = 32  # rows of so many bytes that the file has room for
 
 
 @dataclass
@@ -74,9 +75,19 @@ def _everything(connection: sqlite3.Connection, table: str) -> tuple[dict[int, R
     low = next(reversed(rows), 0)
     _read(connection, f"{select} WHERE number > ? ORDER BY number DESC", (low,), rows)
     high = next(reversed(rows), 0)
-    for number in range(low + 1, min(high if high > low else low + PROBES, low + PROBES)):
+    probes = min(PROBES, _room(connection))
+    for number in range(low + 1, min(high if high > low else low + probes, low + probes)):
         _read(connection, f"{select} WHERE number = ?", (number,), rows)
     return rows, False
+
+
+def _room(connection: sqlite3.Connection) -> int:
+    """For how many rows a file has room."""
+    try:
+        (pages,) = connection.execute("PRAGMA page_count").fetchone()
+    except BROKEN:
+        return PROBES
+    return int(pages) * PAGE_BYTES // _ROW_BYTES
 
 
 def _read(connection: sqlite3.Connection, query: str, values: tuple[int, ...], rows: dict[int, Row]) -> bool:

@@ -39,7 +39,8 @@ def records_of(chunk: Any) -> list[Any]:
     data = _unpacked(chunk)
     if chunk.uncompressed_crc and (found := zlib.crc32(data)) != chunk.uncompressed_crc:
         raise CRCValidationError(chunk.uncompressed_crc, found, chunk)
-    return breakup_chunk(Chunk("", data, chunk.message_end_time, chunk.message_start_time, 0, len(data)))
+    plain = Chunk("", data, chunk.message_end_time, chunk.message_start_time, 0, len(data))
+    return list(breakup_chunk(plain))
 
 
 def _unpacked(chunk: Any) -> bytes:
@@ -53,7 +54,7 @@ def _unpacked(chunk: Any) -> bytes:
         case "zstd":
             data = _zstd(chunk.data, said)
         case "lz4":
-            import lz4.frame
+            import lz4.frame  # type: ignore[import-untyped]
 
             data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=said + 1)
         case "":
@@ -100,7 +101,7 @@ def _records(file: IO[bytes]) -> Any:
     """From where `file` is, chunks as they are."""
     from mcap.stream_reader import StreamReader
 
-    return StreamReader(Within(file), skip_magic=True, emit_chunks=True, record_size_limit=2**30).records  # type: ignore[arg-type]
+    return StreamReader(Within(file), skip_magic=True, emit_chunks=True, record_size_limit=2**30).records
 
 
 def _collected(records: Any) -> Any:
@@ -134,6 +135,9 @@ def _check_places(summary: Any, size: int) -> None:
         offsets = chunk.message_index_offsets
         if chunk.chunk_start_offset < end or after > size or chunk.chunk_length < _RECORD:
             raise McapError("its index leads out of the file, or to one chunk twice")
-        if any(not index <= offset < after for offset in offsets.values()) or offsets.keys() - summary.channels:
+        if (
+            any(not index <= offset < after for offset in offsets.values())
+            or offsets.keys() - summary.channels
+        ):
             raise McapError("its index leads to no messages of its chunks")
         end = after

@@ -38,8 +38,8 @@ def damage() -> tuple[type[Exception], ...]:
     from mcap.exceptions import McapError
     from mcap.stream_reader import CRCValidationError
 
-    return (McapError, CRCValidationError, zstandard.ZstdError, ValueError, IndexError, zlib.error, struct.error, UnicodeDecodeError,
-            EOFError, RuntimeError, KeyError, OverflowError, OSError, MemoryError)  # fmt: skip
+    return (McapError, CRCValidationError, zstandard.ZstdError, ValueError, IndexError, zlib.error,
+            struct.error, UnicodeDecodeError, EOFError, RuntimeError, KeyError, OverflowError, OSError, MemoryError)  # fmt: skip
 
 
 def check_magic(path: Path) -> None:
@@ -103,7 +103,7 @@ class McapFile:
         with open_regular(self.path) as file:
             for name, offset in places.items():
                 file.seek(offset + _RECORD_HEADER.size)
-                found[name] = Metadata.read(ReadDataStream(Within(file))).metadata  # type: ignore[arg-type]
+                found[name] = Metadata.read(ReadDataStream(Within(file))).metadata
         return found
 
     def messages(
@@ -147,7 +147,7 @@ class McapFile:
 
         try:
             file.seek(index.chunk_start_offset + _RECORD_HEADER.size)
-            records = records_of(Chunk.read(ReadDataStream(Within(file))))  # type: ignore[arg-type]
+            records = records_of(Chunk.read(ReadDataStream(Within(file))))
         except damage() as error:
             broken = self._broken(str(error) or type(error).__name__)
             if losses is None:

@@ -58,7 +58,11 @@ def _batches(messages: Iterator[bytes]) -> Iterator[list[bytes]]:
 def _readable(batch: list[bytes], where: str, losses: Losses) -> list[bytes]:
     """Those that are sensor_msgs/Imu in little-endian CDR: stamp first, then the frame's name, of any length,
     then doubles to the end."""
-    good = [data for data in batch if len(data) >= 16 and data[1] & 1 == _LITTLE_ENDIAN and len(data) == _size(data)]
+    good = [
+        data
+        for data in batch
+        if len(data) >= 16 and data[1] & 1 == _LITTLE_ENDIAN and len(data) == _size(data)
+    ]
     for _ in range(len(batch) - len(good)):
         why = f"{where}: a message is no sensor_msgs/Imu in little-endian CDR; record it anew"
         losses.add(_LOST, f"{losses.counts.get(_LOST)}", why)

@@ -59,7 +59,7 @@ def _copy_records(file: BinaryIO, copier: _Copier, progress: Callable[[int], Non
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
 
-    records = StreamReader(Within(file), emit_chunks=True, record_size_limit=2**30).records  # type: ignore[arg-type]
+    records = StreamReader(Within(file), emit_chunks=True, record_size_limit=2**30).records
     lost, reason, good = 0, "", 0
     while True:
         try:
