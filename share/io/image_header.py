@@ -7,7 +7,8 @@ from typing import NamedTuple
 _PNG = b"\x89PNG\r\n\x1a\n"
 _SOF = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # frames; the others are tables (ITU T.81, B.1.1.3)
 _BARE = frozenset((0x01, *range(0xD0, 0xD9)))  # markers without a length
-_END = (0xD9, 0xDA)  # of the image, and where pixels begin: no size was said before
+_SEQUENTIAL = frozenset((0xC0, 0xC1))
+_END = 0xD9
 _SCAN = b"\xff\xda"
 _GRAY_16 = (16, 0)  # bits, colour type (PNG 11.2.2)
 
@@ -35,19 +36,28 @@ def _png(data: bytes) -> ImageHeader | None:
 
 
 def _jpeg(data: bytes) -> ImageHeader | None:
-    """From its first frame header, over segments of any kind; a decoder refuses a second one."""
-    at = 2
-    while at + 9 <= len(data) and data[at] == 0xFF:
+    """From its segments up to the first scan, among which there is one frame header."""
+    at, frame = 2, 0
+    while at + 10 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]
         if marker == 0xFF:  # padding
             at += 1
-        elif marker in _BARE:
+            continue
+        if marker in _BARE:
             at += 2
-        elif marker in _SOF:
-            height, width = (int.from_bytes(data[k : k + 2], "big") for k in (at + 5, at + 7))
-            return ImageHeader(width, height, False, data.count(_SCAN))
-        elif marker in _END:
+            continue
+        if marker == _SCAN[1]:
+            return _of_frame(data, frame, at) if frame else None
+        if marker == _END or (frame and marker in _SOF):
             return None
-        else:
-            at += 2 + max(2, int.from_bytes(data[at + 2 : at + 4], "big"))
+        frame = at if marker in _SOF else frame
+        at += 2 + max(2, int.from_bytes(data[at + 2 : at + 4], "big"))
     return None
+
+
+def _of_frame(data: bytes, frame: int, scan: int) -> ImageHeader:
+    """One scan is all there is where it has all components of a frame that is not progressive: a decoder looks
+    no further. Else scans are counted, which takes a moment."""
+    height, width = (int.from_bytes(data[k : k + 2], "big") for k in (frame + 5, frame + 7))
+    whole = data[frame + 1] in _SEQUENTIAL and data[frame + 9] == data[scan + 4]
+    return ImageHeader(width, height, False, 1 if whole else data.count(_SCAN))
