@@ -61,3 +61,12 @@ def not_installed(packages: str, extra: str) -> str:
     if getattr(sys, "frozen", False):
         return f"this frozen program has no {packages}; use a computer with Python: {how}"
     return f"{packages} is not installed: {how}"
+
+
+def one_line(text: str) -> str:
+    """A message that quotes somebody's file: without control characters, of a bearable length."""
+    clean = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return clean if len(clean) <= _LONGEST else f"{clean[: _LONGEST // 2]} … {clean[-_LONGEST // 2 :]}"
+
+
+_LONGEST = 1500  # characters

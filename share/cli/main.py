@@ -16,7 +16,7 @@ import click  # noqa: E402
 
 from share import __version__  # noqa: E402
 from share.cli.unwinding import unwinding  # noqa: E402
-from share.errors import ShareError, UsageError  # noqa: E402
+from share.errors import ShareError, UsageError, one_line  # noqa: E402
 
 # name: (module, attribute, one line of help). Literal, so that a freezer sees every module.
 COMMANDS = {
@@ -122,7 +122,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _fail(text: str, code: int) -> None:
     with contextlib.suppress(OSError):  # its terminal may be gone
-        click.echo(f"share: {text}", err=True)
+        click.echo(f"share: {one_line(text)}", err=True)
     sys.exit(code)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import IO
 
 from share import children
+from share.io.files import fresh
 
 
 def command(*arguments: str) -> list[str]:
@@ -25,7 +26,7 @@ def child(log: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
     """`share ARGUMENTS` with its output in `log`; asked to end, then made to, when the block is left.
 
     It ends with this process, however this one ends."""
-    with log.open("wb") as sink:
+    with fresh(log) as sink:
         process = _start(sink, arguments)
         try:
             yield process

@@ -104,7 +104,8 @@ def _free_name(path: Path) -> Path:
 
 
 def _found(copy: Path) -> Found:
-    with contextlib.closing(sqlite3.connect(copy, isolation_level=None)) as connection:
+    bare = sqlite3.connect(copy, isolation_level=None)
+    with contextlib.closing(connect.for_so_long(bare, copy)) as connection:
         with contextlib.suppress(*BROKEN):  # moves the log into the file, as far as that is whole
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         return whole_rows(connection)
