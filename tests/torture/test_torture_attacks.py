@@ -1,0 +1,77 @@
+"""Attacks that are no fuzz (`attacks.py`), each against an edge with two honest agents."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import siege
+from attacks import ATTACKS
+from harness import EdgeProgram, Program, Result, Setup
+
+SEED = 20261126
+
+
+@dataclass(frozen=True)
+class Case:
+    """An attack; `valid`: what it sends is what an agent might send, but more, so that latency may suffer."""
+
+    setup: Setup = Setup()
+    said_bytes: int = siege.SAID_BYTES
+    keys_of: str = "eve"
+
+
+MAP, KEYS = Setup(map=True), Setup(map=True, keys=True)
+CASES = {name: Case() for name in ATTACKS} | {
+    "leaps": Case(MAP),
+    "far": Case(MAP),
+    "burst": Case(MAP),
+    "replay": Case(MAP),
+    "flood-keyframe": Case(MAP),
+    "strangers": Case(KEYS, keys_of="mallory"),
+}
+ALSO = [
+    ("reset-while-full", Case(KEYS)),
+    ("leaps", Case()),
+    ("hello-storm", Case(KEYS)),
+    ("replay", Case(KEYS)),
+]
+
+
+def run(name: str, case: Case, seconds: float, traffic: Path, tmp_path: Path, results: Path) -> siege.Stay:
+    result = Result(name, str(case.setup), SEED)
+
+    def attack(edge: EdgeProgram) -> Program:
+        more = ["--http", edge.http] if edge.http else []
+        more += ["--keys", *edge.keys.of(case.keys_of)] if edge.keys else []
+        how = ("--corpus", traffic, "--seconds", seconds, "--seed", SEED)
+        return siege.python("attacks.py", tmp_path / "attack.log", name, edge.address, *how, *more)
+
+    stay = siege.stay(tmp_path / "edge", case.setup, attack, most_s=3 * seconds + 90)
+    siege.judge(result, stay, said_bytes=case.said_bytes)
+    if name == "burst":
+        result.expect(
+            stay.attack.get("acknowledged") == 800,
+            f"of 800 at once {stay.attack.get('acknowledged')} acknowledged",
+        )
+    if name == "hijack":
+        result.expect(not stay.attack.get("run_id_shown"), "/snapshot.json shows what a run is known by")
+    result.write(results).check()
+    return stay
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "case"), [*CASES.items(), *ALSO], ids=lambda v: v if isinstance(v, str) else str(v.setup)
+)
+def test_attack_short(name: str, case: Case, traffic: Path, tmp_path: Path, results: Path) -> None:
+    run(name, case, 8.0, traffic, tmp_path, results)
+
+
+@pytest.mark.torture
+@pytest.mark.parametrize(
+    ("name", "case"), [*CASES.items(), *ALSO], ids=lambda v: v if isinstance(v, str) else str(v.setup)
+)
+def test_attack_long(name: str, case: Case, traffic: Path, tmp_path: Path, results: Path) -> None:
+    run(name, case, 60.0, traffic, tmp_path, results)
