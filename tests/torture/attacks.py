@@ -91,16 +91,24 @@ def leaps(c: Ctx) -> None:
 
 
 def far(c: Ctx) -> None:
-    """Finite, rigid poses beyond all measure."""
-    for power in (6, 9, 12, 30, 77, 153, 154, 200, 300, 307, 308):
-        peer = c.peer()
-        c.send(
-            peer,
-            [c.keyframe(0, -1, 1.7 * 10.0**power if power < 308 else 1.7e308), c.keyframe(1, 0, 1.7e307)],
-        )
-        c.send(peer, [c.keyframe(2, 1)])
-        time.sleep(0.5)
-        peer.close()
+    """Finite, rigid poses beyond all measure: of a stretch's first keyframe, of a step, and of odometry
+    alone while all steps are short; each place is seen twice, so that loops are found there."""
+    for power in (4, 5, 6, 9, 12, 30, 77, 153, 154, 200, 300, 307, 308):
+        away = 10.0**power if power < 308 else 1.7e308
+        for step_m in (None, 0.05, away):
+            peer = c.peer()
+            chain = [c.keyframe(k, k - 1, away, points=True) for k in range(4)]
+            c.send(peer, chain if step_m is None else [chain[0], *(_step(m, step_m) for m in chain[1:])])
+            time.sleep(0.15)
+            peer.close()
+
+
+def _step(message: Message, step_m: float) -> Message:
+    """That keyframe, but so far from the one before."""
+    header, T_ref_body, *others = message
+    rows = list(struct.unpack("<16d", T_ref_body))
+    rows[3] = step_m
+    return [header, struct.pack("<16d", *rows), *others]
 
 
 def names(c: Ctx) -> None:
@@ -270,6 +278,22 @@ def hello_storm(c: Ctx) -> None:
         time.sleep(0.001)
 
 
+def streamed_hellos(c: Ctx) -> None:
+    """Thirty agents that want to be tracked, and stay."""
+    peers = []
+    for k in range(30):
+        identity = c.draw.randbytes(8)
+        hello = c.corpus.hello(f"streamer{k}", identity)
+        fields: Any = unpack(hello[0])
+        fields[2][3] = True
+        peers.append(c.peer(hello=False, identity=identity))
+        c.send(peers[-1], [[pack(fields), *hello[1:]]])
+    while c.going:
+        for peer in peers:
+            c.send(peer, c.corpus.by_kind["ping"][:1])
+        time.sleep(0.5)
+
+
 def refused_hellos(c: Ctx) -> None:
     """One connection that asks again and again for a name that is taken."""
     peer = c.peer("hope")
@@ -310,19 +334,25 @@ def hijack(c: Ctx) -> None:
 
 
 def burst(c: Ctx) -> None:
-    """800 keyframes of one agent at once: all are to be acknowledged, in the end."""
-    n, peer, identity = c.args.count, None, c.draw.randbytes(8)
-    peer = c.peer("burst", identity)
+    """So many keyframes of one agent at once: all are to be acknowledged. What is not, is sent again, but as
+    slowly as an agent would."""
+    n = c.args.count
+    peer = c.peer("burst")
     time.sleep(1.0)
     for first in range(0, n, 100):
         peer.send([c.keyframe(k, k - 1) for k in range(first, min(n, first + 100))])
-    c.counts["sent"], best = n, 0
+    c.counts |= {"sent": n, "resent": 0}
+    best, progress_s = 0, time.monotonic()
     while c.going and best < n:
-        for parts in peer.hear():
+        for parts in peer.hear(1.0):
             fields: Any = unpack(parts[0])
-            if fields[1] == 18:
-                best = max(best, fields[2][0])
-    c.counts["acknowledged"] = best
+            if fields[1] == 18 and fields[2][0] > best:
+                best, progress_s = fields[2][0], time.monotonic()
+        c.counts["acknowledged"] = best
+        if time.monotonic() > progress_s + 2.0:  # as an agent does, so many at a time
+            peer.send([c.keyframe(k, k - 1) for k in range(best, min(n, best + 16))])
+            c.counts["resent"] += 16
+            progress_s = time.monotonic()
     peer.close()
 
 
@@ -409,7 +439,7 @@ ATTACKS: dict[str, Callable[[Ctx], None]] = {
     f.__name__.replace("_", "-"): f
     for f in (
         leaps, far, names, never_ending, many_parts, huge_frame, zmtp_garbage, half_open, reset_while_full,
-        hello_storm, refused_hellos, replay, hijack, burst, strangers, slow_loris, http_garbage,
+        hello_storm, streamed_hellos, refused_hellos, replay, hijack, burst, strangers, slow_loris, http_garbage,
     )
 }  # fmt: skip
 ATTACKS |= {f"flood-{kind}": flood(kind) for kind in ("ping", "pose", "evaluation", "keyframe")}

@@ -26,6 +26,7 @@ SHARE = [PYTHON, "-m", "share"]
 ENV = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
 PAGE = os.sysconf("SC_PAGE_SIZE")
 SAMPLE_S = 0.25
+ALL_KEPT = "edge:\n  max_keyframes: 100000\n"  # none is taken out for want of room
 
 
 def say(text: str) -> None:
@@ -264,18 +265,22 @@ class EdgeProgram(Program):
         bind: str | None = None,
         keys: Keys | None = None,
         env: dict[str, str] | None = None,
+        policy: str = "share",
+        map_folder: Path | None = None,
+        settings: str = ALL_KEPT,
     ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.folder, self.setup, self.keys = folder, setup, keys
-        self.map = folder / "room.sqlite" if setup.map else None
+        self.map = (map_folder or folder) / "room.sqlite" if setup.map else None
         life = len(list(folder.glob("edge*.log")))
         self.out = folder / f"edge{life}"
-        settings = folder / "share.yaml"
-        settings.write_text("edge:\n  max_keyframes: 100000\n")  # none is taken out for want of room
+        config = folder / "share.yaml"
+        config.write_text(settings)
         host = "0.0.0.0" if setup.keys else "127.0.0.1"
-        arguments = ["--bind", bind or f"tcp://{host}:0", "--config", str(settings), "--out", str(self.out)]
+        arguments = ["--bind", bind or f"tcp://{host}:0", "--config", str(config), "--out", str(self.out)]
         arguments += ["--map", str(self.map)] if self.map else []
         arguments += ["--http", "127.0.0.1:0"] if setup.http else []
+        arguments += ["--policy", policy]
         arguments += ["--keys", str(keys.edge)] if keys else []
         super().__init__(folder / f"edge{life}.log", [*SHARE, "edge", *arguments], env)
         port = self.wait_for(r"listening on tcp://\S+?:(\d+),")[1]
@@ -308,14 +313,23 @@ def _workers(pid: int) -> list[int]:
     return out
 
 
-def kept_ids(path: Path, name: str) -> list[int]:
-    """Ids of the keyframes of an agent of that name in a map file, by plain SQL."""
+def kept_by_run(path: Path) -> dict[str, set[int]]:
+    """Ids of the keyframes in a map file by their runs' keys, by plain SQL."""
     with contextlib.closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as db:
-        rows = db.execute(
-            "select k.id from keyframe k join run r on r.number = k.run or r.key = k.run where r.key like ?",
-            (f"{name}-%",),
-        )
-        return sorted(row[0] for row in rows)
+        out: dict[str, set[int]] = {}
+        for key, number in db.execute("select run, id from keyframe"):
+            out.setdefault(key, set()).add(number)
+    return out
+
+
+def kept_ids(path: Path, name: str) -> list[int]:
+    """Of an agent of that name."""
+    return sorted(i for key, ids in kept_by_run(path).items() if key.rpartition("-")[0] == name for i in ids)
+
+
+def is_run(key: str, name: str, run_id: int) -> bool:
+    """Whether a key names that run: `NAME-` and the last digits of its number."""
+    return key.rpartition("-")[0] == name and f"{run_id:016x}".endswith(key.rpartition("-")[2])
 
 
 # ------------------------------------------------------------------ honest agents
@@ -324,11 +338,24 @@ def kept_ids(path: Path, name: str) -> list[int]:
 class HonestAgents(Program):
     """`honest.py`, until `finish`."""
 
-    def __init__(self, edge_address: str, log: Path, keys: Keys | None = None, frames: int = 10**7) -> None:
-        arguments = [PYTHON, str(HERE / "honest.py"), edge_address, str(frames)]
+    def __init__(
+        self,
+        edge_address: str,
+        log: Path,
+        keys: Keys | None = None,
+        frames: int = 10**7,
+        env: dict[str, str] | None = None,
+    ) -> None:
+        arguments = [
+            PYTHON,
+            str(HERE / "honest.py"),
+            edge_address,
+            str(frames),
+            str(log.with_suffix(".acks")),
+        ]
         if keys is not None:
             arguments += [str(keys.folder / "hope"), keys.server]
-        super().__init__(log, arguments, stdin=subprocess.PIPE)
+        super().__init__(log, arguments, env, stdin=subprocess.PIPE)
 
     def finish(self, seconds: float = 40) -> list[dict[str, Any]]:
         """What they met with."""

@@ -1,8 +1,8 @@
 """Two honest agents in a process of their own: the product's agent, with keyframes from a room of points.
 
-    python honest.py ADDRESS FRAMES [AGENT_KEYS SERVER_KEY] < (a line when to finish)
+    python honest.py ADDRESS FRAMES ACKS [AGENT_KEYS SERVER_KEY] < (a line when to finish)
 
-Prints JSON: of each agent when each keyframe was sent, acknowledged and corrected (CLOCK_MONOTONIC, s).
+A line of ACKS is an acknowledgement as it came: name, run id, keyframe. Prints JSON: of each agent when each keyframe was sent, acknowledged and corrected (CLOCK_MONOTONIC, s).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,8 +67,8 @@ class _Views(dict[int, Any]):
 class Watched:
     """A link that notes when keyframes go and their acknowledgements and corrections come."""
 
-    def __init__(self, link: AgentLink) -> None:
-        self._link = link
+    def __init__(self, link: AgentLink, note: Callable[[int], None]) -> None:
+        self._link, self._note = link, note
         self.sent: dict[int, float] = {}
         self.acked: dict[int, float] = {}
         self.corrected: dict[int, float] = {}
@@ -97,6 +97,7 @@ class Watched:
         if code == 18:
             for k in range(self._below, min(scalars[0], len(self.sent) + self._below + 1000)):
                 self.acked.setdefault(k, now)
+                self._note(k)
             self._below = max(self._below, min(scalars[0], 10**7))
         elif code == 19:
             self.corrected.setdefault(scalars[3], now)
@@ -127,10 +128,11 @@ class Honest(crowd.Walker):
 def main() -> None:
     address, frames = sys.argv[1], int(sys.argv[2])
     keys = None
-    if len(sys.argv) > 3:
+    if len(sys.argv) > 4:
         from share.io.keys import agent_keys
 
-        keys = agent_keys(Path(sys.argv[3]), sys.argv[4])
+        keys = agent_keys(Path(sys.argv[4]), sys.argv[5])
+    acks = open(sys.argv[3], "a", buffering=1)  # noqa: SIM115 (as long as the process)
     place = walls(1)
     agents = []
     for i, name in enumerate(NAMES):
@@ -139,7 +141,8 @@ def main() -> None:
 
     def watched(to: str, run_id: int) -> Watched:
         (agent,) = [a for a in agents if a._run_id == run_id]
-        agent.link = Watched(connect(to, run_id, keys))  # type: ignore[attr-defined]
+        line = f"{agent.name} {run_id} "
+        agent.link = Watched(connect(to, run_id, keys), lambda k: acks.write(f"{line}{k}\n"))  # type: ignore[attr-defined]
         return agent.link  # type: ignore[attr-defined, no-any-return]
 
     crowd.connect = watched  # type: ignore[assignment]

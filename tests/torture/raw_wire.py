@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import socket
 import struct
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from urllib.parse import urlsplit
@@ -207,7 +208,8 @@ class RawPeer:
         self.socket.settimeout(timeout_s)
         out: list[Message] = []
         parts: Message = []
-        while True:
+        end = time.monotonic() + timeout_s
+        while time.monotonic() < end or parts:
             try:
                 flags, body = self._frame()
             except TimeoutError:
@@ -221,6 +223,7 @@ class RawPeer:
                 out.append(parts)
                 parts = []
                 self.socket.settimeout(0.05)
+        return out
 
     def _frame(self) -> tuple[int, bytes]:
         """The next frame; what is not whole yet stays. Raises TimeoutError."""

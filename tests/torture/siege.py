@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from harness import EdgeProgram, HonestAgents, Keys, Program, Result, Setup, Wat
 
 SETTLED_S = 3.0  # of the honest agents alone, before anything begins
 RSS_MB = 400.0  # by which all processes of the edge together may grow in an attack
+BAD_WORDS = ("Traceback", "Warning:", "Assertion failed", "mapper lost", "job failed", "not written")
 SAID_BYTES = 2_000_000  # log and events together; honest agents of some minutes write a tenth of it
 
 
@@ -33,7 +33,7 @@ class Stay:
     health_ms: list[float]
     health_failed: list[str]
     unwell: list[str]
-    log_end: str
+    log: str
     strays: list[int]
     attack: dict[str, Any]
     map: Path | None
@@ -67,25 +67,17 @@ def stay(folder: Path, setup: Setup, attack: Attack, most_s: float = 600.0) -> S
         died = died or (None if edge.running else round(until - since, 2))
         unwell = _trouble(edge) if edge.running and edge.http else []
         agents = honest.finish()
-        counts = edge.snapshot() if edge.running and edge.http and not _mute(edge) else {}
         edge.family = harness.family(edge.process.pid) or edge.family
         watch.stop()
         strays_of = edge.family
         code = edge.interrupt() if died is None else edge.process.returncode
         time.sleep(0.5)
+    counts = json.loads(report.read_text()) if (report := edge.out / "edge.json").exists() else {}
     return Stay(
         died, code, agents, since, until, watch.rss_mb(), watch.processes(), edge.bytes_said(), watch.health_ms,
-        watch.health_failed, unwell, edge.said[-1500:], [p for p in strays_of if harness.alive(p)],
+        watch.health_failed, unwell, edge.said, [p for p in strays_of if harness.alive(p)],
         _last_json(attacker), edge.map, counts,
     )  # fmt: skip
-
-
-def _mute(edge: EdgeProgram) -> bool:
-    try:
-        edge.snapshot()
-    except (OSError, ValueError):
-        return True
-    return False
 
 
 def _trouble(edge: EdgeProgram) -> list[str]:
@@ -121,17 +113,19 @@ def judge(result: Result, stay: Stay, rss_mb: float = RSS_MB, said_bytes: int = 
     died = (
         "" if stay.alive_s is None else f"the edge ended after {stay.alive_s} s, exit code {stay.exit_code}"
     )
-    result.expect(stay.alive_s is None, f"{died}: {_last_line(stay.log_end)}")
+    result.expect(stay.alive_s is None, f"{died}: {_last_line(stay.log)}")
     result.expect("said" not in stay.attack, f"the attacker itself failed: {stay.attack}")
     if stay.alive_s is None:
         code = "it did not end" if stay.exit_code is None else f"exit code {stay.exit_code}"
-        result.expect(stay.exit_code == 0, f"after SIGINT: {code}")
+        result.expect(stay.exit_code == 0, f"in the end, or before: {code}: {_last_line(stay.log)}")
         result.expect(not stay.unwell, f"/health: {stay.unwell}")
         result.expect(
             not stay.health_failed,
             f"/health failed {len(stay.health_failed)} times: {stay.health_failed[:1]}",
         )
-    result.expect("Traceback" not in stay.log_end, f"a traceback in the log: {_last_line(stay.log_end)}")
+    for word in BAD_WORDS:
+        (*_, line) = ["", *(line for line in stay.log.splitlines() if word in line)]
+        result.expect(not line, f"in the log: {line.strip()[:200]}")
     grown = stay.rss_mb[1] - stay.rss_mb[0]
     result.expect(grown < rss_mb, f"the edge's processes grew by {grown:.0f} MB")
     result.expect(stay.said_bytes < said_bytes, f"log and events grew to {stay.said_bytes / 1e6:.1f} MB")
@@ -172,8 +166,3 @@ def judge_latency(result: Result, attacked: Stay, control: Stay, ratio: float, s
             result.expect(
                 mine <= bound, f"{what} p95 {mine:.0f} ms beside the attack, {theirs:.0f} beside the control"
             )
-
-
-def run_json(arguments: Sequence[str], seconds: float) -> Any:
-    done = subprocess.run(arguments, capture_output=True, text=True, timeout=seconds, env=harness.ENV)
-    return json.loads(done.stdout.splitlines()[-1])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
+import harness
 import pytest
 import siege
 from attacks import ATTACKS
@@ -23,7 +25,7 @@ class Case:
 
 
 MAP, KEYS = Setup(map=True), Setup(map=True, keys=True)
-CASES = {name: Case() for name in ATTACKS} | {
+CASES = {name: Case() for name in ATTACKS if name != "streamed-hellos"} | {
     "leaps": Case(MAP),
     "far": Case(MAP),
     "burst": Case(MAP),
@@ -75,3 +77,24 @@ def test_attack_short(name: str, case: Case, traffic: Path, tmp_path: Path, resu
 )
 def test_attack_long(name: str, case: Case, traffic: Path, tmp_path: Path, results: Path) -> None:
     run(name, case, 60.0, traffic, tmp_path, results)
+
+
+@pytest.mark.slow
+def test_agents_that_want_to_be_tracked_come_in_a_storm(traffic: Path, tmp_path: Path, results: Path) -> None:
+    """Each that the edge tracks has a process: as many as the machine bears, and no more."""
+    result = Result("streamed hellos", "streamed", SEED)
+    edge = EdgeProgram(tmp_path / "edge", Setup(), policy="streamed")
+    watch = harness.Watch(edge.process.pid, edge.http).start()
+    how = ("--corpus", traffic, "--seconds", 10.0, "--seed", SEED)
+    attack = siege.python("attacks.py", tmp_path / "attack.log", "streamed-hellos", edge.address, *how)
+    with harness.ended(edge, attack):
+        attack.process.wait(60)
+        watch.stop()
+        alive, pids = edge.running, harness.family(edge.process.pid)
+        code = edge.interrupt()
+    result.figures = {"processes": watch.processes(), "rss_mb": watch.rss_mb(), "attack": attack.said[-300:]}
+    result.expect(alive and code == 0, f"exit code {code}: {edge.said[-200:]}")
+    result.expect(watch.processes() <= 4 + 2 * (os.cpu_count() or 1), f"{watch.processes()} processes")
+    result.expect(watch.rss_mb()[1] < 1200, f"{watch.rss_mb()[1]:.0f} MB")
+    result.expect(not [p for p in pids if harness.alive(p)], "processes left behind")
+    result.write(results).check()
