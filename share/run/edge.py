@@ -115,17 +115,22 @@ class EdgeRun:
             while not self._stopping:
                 self._step()
         finally:
-            if self._mapping is not None:
-                self._mapping.close()
-            self._take_answers()
-            self._trackers.close()
-            if self._keeper is not None:
-                self._keeper.close()
-            self._link.close()
+            self.close()
             self._note()
             self._report["series"] = self._machine.series()
             self._finish(self._report)
         return self._report
+
+    def close(self) -> None:
+        """Ends the processes and threads it has started, also where it never came to `go`."""
+        self._stopping = True
+        if self._mapping is not None:
+            self._mapping.close()
+        self._take_answers()
+        self._trackers.close()
+        if self._keeper is not None:
+            self._keeper.close()
+        self._link.close()
 
     def report(self) -> dict[str, Any]:
         """As edge.json, a second old at most, and `trouble`: what is wrong now. From any thread."""
@@ -137,6 +142,7 @@ class EdgeRun:
         self._report_at = now + _REPORT_S
         failing = self._keeper is not None and self._keeper.failing
         trouble = [text for text, until in self._trouble.items() if now < until]
+        trouble += self._machine.trouble(time.monotonic_ns())
         self._report = {
             **self._machine.report(self._mapped),
             "refused_handshakes": self._refused.total(),
@@ -180,12 +186,11 @@ class EdgeRun:
     # ------------------------------------------------------------------ the loop
 
     def _step(self) -> None:
-        message = self._link.receive(TICK_MS)
-        for _ in range(_AT_ONCE):
+        for i in range(_AT_ONCE):
+            message = self._link.receive(0 if i else TICK_MS)
             if message is None:
                 break
-            self._handle(Received(*message))
-            message = self._link.receive(0)
+            self._handle(Received(message.peer, message.frames, self._link.names(message.key)))
         for line in self._link.refusals():
             self._refuse(line)
         self._take_answers()

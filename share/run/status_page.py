@@ -77,7 +77,7 @@ function lasted(s) {
 let before = null;
 function rate(name, agent, now) {
   const old = before?.agents[name];
-  if (!old || old.run_id !== agent.run_id || before.session !== now.session) return "–";
+  if (!old || old.run !== agent.run || before.session !== now.session) return "–";
   const bytes = agent.bytes_up + agent.bytes_down - old.bytes_up - old.bytes_down;
   return fixed(bytes / (now.uptime_s - before.uptime_s) / 1000, 1);
 }

@@ -14,7 +14,15 @@ import zmq
 
 from share.errors import TransportError, UsageError
 from share.io.keys import AgentKeys, EdgeKeys
-from share.io.transport import LINGER_MS, QUEUE_MESSAGES, Address, bind_error, check_keys, parse_address
+from share.io.transport import (
+    LINGER_MS,
+    QUEUE_MESSAGES,
+    Address,
+    Arrival,
+    bind_error,
+    check_keys,
+    parse_address,
+)
 from share.io.transport.handshake import Handshakes, Outcome
 from share.io.transport.zap import Doorkeeper
 from share.wire.codec import MAX_ARRAYS, MAX_FRAME_BYTES, Bytes
@@ -75,7 +83,7 @@ class _Socket:
             raise TransportError(f"cannot send: {error.strerror}") from None
         return True
 
-    def receive(self, timeout_ms: int) -> list[bytes] | None:
+    def receive(self, timeout_ms: int) -> list[zmq.Frame] | None:
         parts = self._receive_now()
         if parts is not None:
             return parts
@@ -84,13 +92,14 @@ class _Socket:
             self._wake_reader.recv(4096)
         return self._receive_now()
 
-    def _receive_now(self) -> list[bytes] | None:
+    def _receive_now(self) -> list[zmq.Frame] | None:
         try:
-            parts = [self.socket.recv(zmq.NOBLOCK)]
+            part = self.socket.recv(zmq.NOBLOCK, copy=False)
         except zmq.Again:
             return None
-        while self.socket.getsockopt(zmq.RCVMORE):
-            part = self.socket.recv(zmq.NOBLOCK)
+        parts = [part]
+        while part.more:
+            part = self.socket.recv(zmq.NOBLOCK, copy=False)
             if len(parts) <= _MAX_PARTS:  # one too many is kept, so that the decoder refuses it
                 parts.append(part)
         return parts
@@ -144,7 +153,8 @@ class ZmqAgentLink:
 
     def receive(self, timeout_ms: int) -> list[bytes] | None:
         self._keep_connected()
-        return self._link.receive(timeout_ms)
+        parts = self._link.receive(timeout_ms)
+        return [part.bytes for part in parts] if parts else None
 
     def trouble(self) -> str | None:
         return self._trouble
@@ -204,14 +214,25 @@ class ZmqEdgeLink:
     def send(self, peer: bytes, frames: Sequence[Bytes]) -> bool:
         return self._link.send([peer, *frames])
 
-    def receive(self, timeout_ms: int) -> tuple[bytes, list[bytes]] | None:
+    def receive(self, timeout_ms: int) -> Arrival | None:
         if self._door is not None and self._door.revoked():
             self._reopen()
         parts = self._link.receive(timeout_ms)
         if parts and len(parts[0]) != PEER_BYTES:  # libzmq still takes most bytes for ZMTP 1.0
             self.strangers += 1
             return None
-        return (parts[0], parts[1:]) if parts else None
+        return (
+            Arrival(parts[0].bytes, [part.bytes for part in parts[1:]], self._key(parts[0]))
+            if parts
+            else None
+        )
+
+    def _key(self, part: zmq.Frame) -> str:
+        """The sender's, that the doorkeeper gave as its ZAP user id."""
+        return "" if self._keys is None else str(part.get("User-Id"))
+
+    def names(self, key: str) -> frozenset[str] | None:
+        return None if self._keys is None else self._keys.allowed.agents(key)
 
     def refusals(self) -> list[str]:
         failed = [o for o in self._link.handshakes() if o in (Outcome.NO_KEYS, Outcome.BROKEN_OFF)]
