@@ -1,6 +1,7 @@
 """Attacks that are no fuzz: each an idea of its own. A process:
 
-    python attacks.py NAME ADDRESS --corpus FILE [--seconds S] [--count N] [--seed S] [--http URL] [--keys P S SERVER]
+    python attacks.py NAME ADDRESS --corpus FILE [--seconds S] [--count N] [--seed S] [--http URL]
+                      [--keys PUBLIC SECRET SERVER]
 
 Prints JSON. Nothing of `share` is imported.
 """
@@ -22,7 +23,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 
 from corpus import Corpus
-from fuzzer import CurvePeer, _small
+from fuzzer import CurvePeer, _small, own_name
 from raw_wire import GREETING, LONG, MORE, Message, RawPeer, dial, frame, pack, ready, unpack
 
 Counts = dict[str, Any]
@@ -49,7 +50,7 @@ class Ctx:
             else RawPeer(self.address, identity)
         )
         if hello:
-            peer.send([self.corpus.hello(name or f"eve{identity.hex()[:6]}", identity)])
+            peer.send([self.corpus.hello(name or own_name(identity, self.args.keys), identity)])
         return peer
 
     def keyframe(self, number: int, follows: int, far_m: float = 0.0, points: bool = False) -> Message:
@@ -177,7 +178,7 @@ def _stream(c: Ctx, push: Callable[[Any], None], size: int) -> None:
 
 
 def zmtp_garbage(c: Ctx) -> None:
-    """Bytes instead of a greeting, a handshake cut short, commands out of place, routing ids of all lengths."""
+    """Bytes for a greeting, handshakes cut short, commands out of place, routing ids of all lengths."""
     starts = [
         b"",
         b"\xff",
@@ -439,7 +440,8 @@ ATTACKS: dict[str, Callable[[Ctx], None]] = {
     f.__name__.replace("_", "-"): f
     for f in (
         leaps, far, names, never_ending, many_parts, huge_frame, zmtp_garbage, half_open, reset_while_full,
-        hello_storm, streamed_hellos, refused_hellos, replay, hijack, burst, strangers, slow_loris, http_garbage,
+        hello_storm, streamed_hellos, refused_hellos, replay, hijack, burst, strangers, slow_loris,
+        http_garbage,
     )
 }  # fmt: skip
 ATTACKS |= {f"flood-{kind}": flood(kind) for kind in ("ping", "pose", "evaluation", "keyframe")}

@@ -1,4 +1,4 @@
-"""What all attacks need: an edge and agents as real processes, samples of /proc, and a judgement in the end."""
+"""What all attacks need: an edge and agents as real processes, samples of /proc, and results."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from raw_wire import unpack
+
 HERE = Path(__file__).resolve().parent
 TESTS, ROOT = HERE.parent, HERE.parents[1]
 PYTHON = sys.executable
@@ -26,6 +28,7 @@ SHARE = [PYTHON, "-m", "share"]
 ENV = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
 PAGE = os.sysconf("SC_PAGE_SIZE")
 SAMPLE_S = 0.25
+AGENTS_OF = {"hope": ("hope", "faith"), "eve": tuple(f"eve{k}" for k in range(20))}  # names a key speaks for
 ALL_KEPT = "edge:\n  max_keyframes: 100000\n"  # none is taken out for want of room
 
 
@@ -233,7 +236,8 @@ class Keys:
         for name in names:
             public = _keys(folder / name, "generate", "--name", name)
             if name != names[-1]:
-                _keys(keys.edge, "authorize", name, public)
+                of = [f"--agent={agent}" for agent in AGENTS_OF.get(name, ())]
+                _keys(keys.edge, "authorize", name, public, *of)
         return keys
 
     def of(self, name: str) -> tuple[str, str, str]:
@@ -313,23 +317,20 @@ def _workers(pid: int) -> list[int]:
     return out
 
 
-def kept_by_run(path: Path) -> dict[str, set[int]]:
-    """Ids of the keyframes in a map file by their runs' keys, by plain SQL."""
+def kept_by_run(path: Path) -> dict[tuple[str, int], set[int]]:
+    """Ids of the keyframes in a map file by name and number of their run, by plain SQL and msgpack."""
+    out: dict[tuple[str, int], set[int]] = {}
     with contextlib.closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as db:
-        out: dict[str, set[int]] = {}
+        hellos = dict(db.execute("select key, hello from run"))
         for key, number in db.execute("select run, id from keyframe"):
-            out.setdefault(key, set()).add(number)
+            header: Any = unpack(unpack(hellos[key])[0])  # type: ignore[index]
+            out.setdefault((header[2][0], header[2][2]), set()).add(number)
     return out
 
 
 def kept_ids(path: Path, name: str) -> list[int]:
     """Of an agent of that name."""
-    return sorted(i for key, ids in kept_by_run(path).items() if key.rpartition("-")[0] == name for i in ids)
-
-
-def is_run(key: str, name: str, run_id: int) -> bool:
-    """Whether a key names that run: `NAME-` and the last digits of its number."""
-    return key.rpartition("-")[0] == name and f"{run_id:016x}".endswith(key.rpartition("-")[2])
+    return sorted(i for (who, _), ids in kept_by_run(path).items() if who == name for i in ids)
 
 
 # ------------------------------------------------------------------ honest agents

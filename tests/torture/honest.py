@@ -2,18 +2,20 @@
 
     python honest.py ADDRESS FRAMES ACKS [AGENT_KEYS SERVER_KEY] < (a line when to finish)
 
-A line of ACKS is an acknowledgement as it came: name, run id, keyframe. Prints JSON: of each agent when each keyframe was sent, acknowledged and corrected (CLOCK_MONOTONIC, s).
+A line of ACKS is an acknowledgement as it came: name, run id, keyframe. Prints JSON: of each
+agent when each keyframe was sent, acknowledged and corrected (CLOCK_MONOTONIC, s).
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 TESTS = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(TESTS), str(TESTS / "run"), str(Path(__file__).parent)]
@@ -86,10 +88,8 @@ class Watched:
     def receive(self, timeout_ms: int) -> list[bytes] | None:
         frames = self._link.receive(timeout_ms)
         if frames is not None:
-            try:
+            with contextlib.suppress(ValueError, LookupError, TypeError):
                 self._hear(unpack(frames[0]))
-            except (ValueError, IndexError, TypeError):
-                pass
         return frames
 
     def _hear(self, fields: Any) -> None:
@@ -142,7 +142,7 @@ def main() -> None:
     def watched(to: str, run_id: int) -> Watched:
         (agent,) = [a for a in agents if a._run_id == run_id]
         line = f"{agent.name} {run_id} "
-        agent.link = Watched(connect(to, run_id, keys), lambda k: acks.write(f"{line}{k}\n"))  # type: ignore[attr-defined]
+        agent.link = Watched(connect(to, run_id, keys), lambda k: _note(acks, line, k))  # type: ignore[attr-defined]
         return agent.link  # type: ignore[attr-defined, no-any-return]
 
     crowd.connect = watched  # type: ignore[assignment]
@@ -155,6 +155,10 @@ def main() -> None:
     for agent in agents:
         agent.join()
     print(json.dumps([agent.figures() for agent in agents]))
+
+
+def _note(acks: TextIO, line: str, number: int) -> None:
+    acks.write(f"{line}{number}\n")
 
 
 def _finish_when_told(agents: list[Honest]) -> None:

@@ -1,4 +1,4 @@
-"""`share agent` for hours: a recording played forwards and backwards in turns, so that motion goes on smoothly.
+"""`share agent` for hours: a recording to and fro, so that motion goes on smoothly.
 
     python loop_agent.py SESSION/NAME NAME ADDRESS OUT SECONDS
 

@@ -1,4 +1,6 @@
-"""An edge that lies: a ROUTER that answers agents with what no honest edge says. Nothing of `share` is imported.
+"""An edge that lies: a ROUTER that answers agents with what no honest edge says.
+
+Nothing of `share` is imported.
 
 Each mode is a function of what has come; the address is that of a thread of this process.
 """
@@ -208,6 +210,7 @@ Answer = Callable[[LyingEdge, str, list[Any]], list[Message]]
 MODES: dict[str, Answer] = {
     f.__name__.replace("_", "-"): f
     for f in (
-        mutated, acks, welcomes, corrections, clocks, rates, refuses, tracked, flood, silent, half_silent, resets,
+        mutated, acks, welcomes, corrections, clocks, rates, refuses, tracked, flood, silent, half_silent,
+        resets,
     )
 }  # fmt: skip

@@ -3,9 +3,9 @@
     python tests/torture/replay.py FILE tcp://H:P [--last N] [--keys PUBLIC SECRET SERVER]
     python tests/torture/replay.py FILE --shrink OUT
 
-Each peer of the file gets a connection with its routing id; messages go in their order. With --shrink an edge of its
-own (with a map file) is started for each try, and the fewest messages that still end it, or make it fill its log
-with a traceback, are sought by halving and written to OUT.
+Each peer of the file gets a connection with its routing id; messages go in their order. With --shrink an edge
+(with a map file) is started for each try, and the fewest messages that end it, or bring a traceback into
+its log, are sought by halving and written to OUT.
 """
 
 from __future__ import annotations

@@ -74,8 +74,8 @@ def stay(folder: Path, setup: Setup, attack: Attack, most_s: float = 600.0) -> S
         time.sleep(0.5)
     counts = json.loads(report.read_text()) if (report := edge.out / "edge.json").exists() else {}
     return Stay(
-        died, code, agents, since, until, watch.rss_mb(), watch.processes(), edge.bytes_said(), watch.health_ms,
-        watch.health_failed, unwell, edge.said, [p for p in strays_of if harness.alive(p)],
+        died, code, agents, since, until, watch.rss_mb(), watch.processes(), edge.bytes_said(),
+        watch.health_ms, watch.health_failed, unwell, edge.said, [p for p in strays_of if harness.alive(p)],
         _last_json(attacker), edge.map, counts,
     )  # fmt: skip
 

@@ -2,15 +2,16 @@
 
     python tests/torture/soak.py [--hours 8] [--warm-up-min 20] [--session DIR] [--out share-soak]
 
-An edge (map file, HTTP) and three agents (`loop_agent.py`: ann, bob and ann's recording again as cy), all real
-processes. RSS, open files and threads of each are sampled every 5 s. After the warm-up, of each: the slope an hour
-by Theil and Sen on medians of a minute (memory moves in steps, which least squares takes for slopes), with a 95 %
-interval by a moving-block bootstrap of what is left (blocks of the square root of the number of minutes, since
-what memory does in one minute it mostly does in the next). A process that is started anew begins anew.
+An edge (map file, HTTP) and three agents (`loop_agent.py`: ann, bob and ann's recording again as cy), all
+real processes. RSS, open files and threads of each are sampled every 5 s. After the warm-up, of each: the
+slope an hour by Theil and Sen on medians of a minute (memory moves in steps, which least squares takes for
+slopes), with a 95 % interval by a moving-block bootstrap of what is left (blocks of the square root of the
+number of minutes, since what memory does in one minute it mostly does in the next). A process started anew
+begins anew.
 
-Writes soak.json, samples.csv and soak.png; prints a table. Exit code 1 if a slope is surely not below its bound
-(1 MB, 1 file, 1 thread an hour: the lower end of the interval is above it), or if it is not surely below it where
-the run was long enough to say (the upper end), or a process died, or the edge did not end well.
+Writes soak.json, samples.csv and soak.png; prints a table. Exit code 1 if a slope is surely not below its
+bound (1 MB, 1 file, 1 thread an hour: the lower end of the interval is above it), or is not surely below it
+(the upper end) where the run was long enough to say, or a process died, or one did not end well.
 """
 
 from __future__ import annotations
@@ -201,12 +202,11 @@ def write(out: Path, series: Series, rows: list[dict[str, Any]], about: dict[str
 def text(rows: list[dict[str, Any]]) -> str:
     head = f"{'process':14s} {'figure':8s} {'most':>7s} {'an hour':>9s} {'95 % interval':>20s}  < bound"
     lines = [head]
+    form = "{process:14s} {figure:8s} {most:7.1f} {slope:9.2f} "
     for r in rows:
         verdict = "no" if r["fails"] else "yes" if r["sure"] else "not sure"
         interval = f"{r['low']:.2f} .. {r['high']:.2f}"
-        lines.append(
-            f"{r['process']:14s} {r['figure']:8s} {r['most']:7.1f} {r['slope']:9.2f} {interval:>20s}  {verdict}"
-        )
+        lines.append(f"{form.format(**r)}{interval:>20s}  {verdict}")
     return "\n".join(lines)
 
 

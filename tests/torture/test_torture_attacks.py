@@ -10,16 +10,16 @@ import harness
 import pytest
 import siege
 from attacks import ATTACKS
-from harness import EdgeProgram, Program, Result, Setup
+from harness import SETUPS, EdgeProgram, Program, Result, Setup
 
 SEED = 20261126
 
 
 @dataclass(frozen=True)
 class Case:
-    """An attack; `valid`: what it sends is what an agent might send, but more, so that latency may suffer."""
+    """How an attack is made. keys_of: whose keys it has, where the edge wants some."""
 
-    setup: Setup = Setup()
+    setup: Setup = SETUPS[0]
     said_bytes: int = siege.SAID_BYTES
     keys_of: str = "eve"
 

@@ -30,7 +30,7 @@ LONG = Form(10**6 // len(SETUPS), 4_000, 1.5, 10)
 
 
 def cases() -> list[object]:
-    """In the short form each kind with one setup, in the long one each with all; and what only an edge says."""
+    """In the short form each kind with one setup, in the long one with all; and what only an edge says."""
     short = [(kind, SETUPS[i % len(SETUPS)], SHORT) for i, kind in enumerate((*UP, "correction"))]
     long = [(kind, setup, LONG) for kind in KINDS for setup in SETUPS if kind in UP or setup == SETUPS[0]]
     return [

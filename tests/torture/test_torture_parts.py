@@ -115,7 +115,7 @@ def test_shrinking_finds_the_two_that_matter() -> None:
 def test_slope_of_a_leak_and_of_noise(rng: np.random.Generator) -> None:
     hours = np.linspace(0, 2, 240)
     noise = np.convolve(rng.normal(size=250), np.ones(11) / 3, mode="valid")  # it remembers a while
-    leak, low, high = slope(hours, 100 + 3.0 * hours + noise)
+    _, low, high = slope(hours, 100 + 3.0 * hours + noise)
     assert low < 3.0 < high
     assert low > 0
     _, low, high = slope(hours, 100 + noise)
