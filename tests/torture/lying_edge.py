@@ -24,6 +24,7 @@ from raw_wire import Message, pack, unpack
 
 FAR = (1e4, 1e6, 1e30, 1e153, 1e300, 1.7e308, -1.7e308)
 IDS = (2**31 - 1, 10**9, 2**53, 2**63 - 1)
+CLOCK_FAR_NS = 9 * 10**18  # 285 years
 CLOCKS_NS = (0, -(2**63), 2**63 - 1, 9 * 10**18, 3600 * 10**9, -3600 * 10**9)
 
 
@@ -166,6 +167,14 @@ def clocks(edge: LyingEdge, kind: str, scalars: list[Any]) -> list[Message]:
     return edge.honest(kind, scalars)
 
 
+def clock_far(edge: LyingEdge, kind: str, scalars: list[Any]) -> list[Message]:
+    """A clock that runs well, 285 years from the agent's."""
+    if kind == "ping":
+        at = time.monotonic_ns() + CLOCK_FAR_NS
+        return [edge.of("pong", scalars[0], scalars[1], at, at, edge.session)]
+    return edge.honest(kind, scalars)
+
+
 def rates(edge: LyingEdge, kind: str, scalars: list[Any]) -> list[Message]:
     out = edge.honest(kind, scalars)
     return [*out, edge.of("rate", edge.draw.choice((0.0, 5e-324, 1e-300, 1000.0, -1.0, math.inf, math.nan)))]
@@ -210,7 +219,7 @@ Answer = Callable[[LyingEdge, str, list[Any]], list[Message]]
 MODES: dict[str, Answer] = {
     f.__name__.replace("_", "-"): f
     for f in (
-        mutated, acks, welcomes, corrections, clocks, rates, refuses, tracked, flood, silent, half_silent,
+        mutated, acks, welcomes, corrections, clocks, clock_far, rates, refuses, tracked, flood, silent, half_silent,
         resets,
     )
 }  # fmt: skip

@@ -47,7 +47,14 @@ def run(name: str, case: Case, seconds: float, traffic: Path, tmp_path: Path, re
     def attack(edge: EdgeProgram) -> Program:
         more = ["--http", edge.http] if edge.http else []
         more += ["--keys", *edge.keys.of(case.keys_of)] if edge.keys else []
-        how = ("--corpus", traffic, "--seconds", seconds, "--seed", SEED)
+        how = (
+            "--corpus",
+            traffic,
+            "--seconds",
+            max(seconds, 40.0) if name == "burst" else seconds,
+            "--seed",
+            SEED,
+        )
         return siege.python("attacks.py", tmp_path / "attack.log", name, edge.address, *how, *more)
 
     stay = siege.stay(tmp_path / "edge", case.setup, attack, most_s=3 * seconds + 90)

@@ -19,7 +19,9 @@ NOBODY = "tcp://127.0.0.1:9"
 FRAMES = ":100"
 PATIENCE_S = 120.0  # a busy machine plays 100 frames in half a minute
 RSS_MB = 200.0
-SAID_BYTES = 500_000
+SAID_BYTES = 50_000  # 100 frames take some seconds
+MOST_SENT = 1000  # keyframes, each again and again, of 26
+FAR_MS = 100 * 365.25 * 86400e3  # no two clocks that run since they were started differ by a century
 Start = Callable[..., Program]
 
 
@@ -68,6 +70,10 @@ def _run(
     first, most = watch.rss_mb()
     result.expect(most < RSS_MB + max(first, 150), f"its memory grew to {most:.0f} MB")
     result.expect(ann.log.stat().st_size < SAID_BYTES, f"it wrote {ann.log.stat().st_size} bytes of log")
+    again = edge.heard["keyframe"]
+    result.expect(again < MOST_SENT, f"it sent its keyframes {again} times")
+    wild = [line for line in ann.said.splitlines() if not line.isprintable()]
+    result.expect(not wild, f"it writes what is not printable: {wild[:1]!r}")
     _check_files(result, folder / "ann", alone)
     return result
 
@@ -79,6 +85,8 @@ def _check_files(result: Result, out: Path, alone: bytes) -> None:
     report = json.loads((out / "report.json").read_text())
     result.figures["drop_late"] = report["drop_late"]
     result.figures["clock"] = report["clock"]
+    offset_ms = report["clock"].get("offset_ms") or 0.0
+    result.expect(abs(offset_ms) < FAR_MS, f"a clock that is off by {offset_ms:.3g} ms is believed")
     odometry = (out / "odom.tum").read_bytes()
     if not report["drop_late"]:
         result.expect(odometry == alone, "odometry differs from that without an edge")
