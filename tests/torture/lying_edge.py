@@ -219,7 +219,7 @@ Answer = Callable[[LyingEdge, str, list[Any]], list[Message]]
 MODES: dict[str, Answer] = {
     f.__name__.replace("_", "-"): f
     for f in (
-        mutated, acks, welcomes, corrections, clocks, clock_far, rates, refuses, tracked, flood, silent, half_silent,
-        resets,
+        mutated, acks, welcomes, corrections, clocks, clock_far, rates, refuses, tracked, flood, silent,
+        half_silent, resets,
     )
 }  # fmt: skip
