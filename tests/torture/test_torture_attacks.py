@@ -83,7 +83,7 @@ def test_attack_short(name: str, case: Case, traffic: Path, tmp_path: Path, resu
     ("name", "case"), [*CASES.items(), *ALSO], ids=lambda v: v if isinstance(v, str) else str(v.setup)
 )
 def test_attack_long(name: str, case: Case, traffic: Path, tmp_path: Path, results: Path) -> None:
-    run(name, case, 60.0, traffic, tmp_path, results)
+    run(name, case, 20.0, traffic, tmp_path, results)
 
 
 @pytest.mark.slow

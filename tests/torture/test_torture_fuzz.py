@@ -23,6 +23,7 @@ class Form:
     rate: float
     ratio: float
     slack_ms: float
+    control_s: float = 30.0  # at most: 200 keyframes
 
 
 SHORT = Form(10_000, 1_000, 1.5, 150)  # some forty keyframes: their p95 is two of them
@@ -65,13 +66,7 @@ def test_fuzz(kind: str, setup: Setup, form: Form, traffic: Path, tmp_path: Path
     attacked = siege.stay(tmp_path / "attacked", setup, lambda edge: attack(edge, "--ring", ring), most_s)
     siege.judge(result, attacked)
     if attacked.alive_s is None:
-        busy = (
-            "--valid",
-            "--cpu",
-            attacked.attack.get("cpu", 0.0),
-            "--seconds",
-            attacked.until - attacked.since,
-        )
+        busy = ("--valid", *_as_busy(attacked, form))
         control = siege.stay(tmp_path / "control", setup, lambda edge: attack(edge, *busy), most_s)
         siege.judge_latency(result, attacked, control, form.ratio, form.slack_ms)
     if result.findings and ring.exists():
@@ -80,6 +75,13 @@ def test_fuzz(kind: str, setup: Setup, form: Form, traffic: Path, tmp_path: Path
         shutil.copyfile(ring, kept)
         result.reproducer = str(kept)
     result.write(results).check()
+
+
+def _as_busy(attacked: siege.Stay, form: Form) -> tuple[object, ...]:
+    """The control: at the rate that the attack came to, and its share of a processor, for long enough."""
+    sent, took_s = attacked.attack.get("sent", 0), attacked.until - attacked.since
+    seconds = min(took_s, form.control_s)
+    return ("--cpu", attacked.attack.get("cpu", 0.0), "--rate", max(1.0, sent / took_s), "--seconds", seconds)
 
 
 def test_the_judge_notices_an_edge_that_is_killed(tmp_path: Path) -> None:
