@@ -69,6 +69,14 @@ def alive(pid: int) -> bool:
     return pid in family(pid)
 
 
+def left_of(pids: list[int], seconds: float = 10.0) -> list[int]:
+    """Those that are still alive when the others have had so long to end."""
+    deadline = time.monotonic() + seconds
+    while (left := [pid for pid in pids if alive(pid)]) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    return left
+
+
 def figures(pid: int) -> dict[str, float] | None:
     """RSS in MB, open files, threads, CPU seconds; None if it is gone."""
     try:

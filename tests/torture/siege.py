@@ -71,11 +71,10 @@ def stay(folder: Path, setup: Setup, attack: Attack, most_s: float = 600.0) -> S
         watch.stop()
         strays_of = edge.family
         code = edge.interrupt() if died is None else edge.process.returncode
-        time.sleep(0.5)
     counts = json.loads(report.read_text()) if (report := edge.out / "edge.json").exists() else {}
     return Stay(
         died, code, agents, since, until, watch.rss_mb(), watch.processes(), edge.bytes_said(),
-        watch.health_ms, watch.health_failed, unwell, edge.said, [p for p in strays_of if harness.alive(p)],
+        watch.health_ms, watch.health_failed, unwell, edge.said, harness.left_of(strays_of),
         _last_json(attacker), edge.map, counts,
     )  # fmt: skip
 

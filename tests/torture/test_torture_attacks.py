@@ -103,5 +103,5 @@ def test_agents_that_want_to_be_tracked_come_in_a_storm(traffic: Path, tmp_path:
     result.expect(alive and code == 0, f"exit code {code}: {edge.said[-200:]}")
     result.expect(watch.processes() <= 4 + 2 * (os.cpu_count() or 1), f"{watch.processes()} processes")
     result.expect(watch.rss_mb()[1] < 1200, f"{watch.rss_mb()[1]:.0f} MB")
-    result.expect(not [p for p in pids if harness.alive(p)], "processes left behind")
+    result.expect(not harness.left_of(pids), "processes left behind")
     result.write(results).check()

@@ -77,6 +77,7 @@ class Room:
         """All ended in good order; the judgement."""
         if self.relay is not None:
             self.relay.weather = Weather()
+        self._wait_for_one_map()
         agents, result = self.honest.finish(), self.result
         self.strays += harness.family(self.edge.process.pid)
         code = self.edge.interrupt()
@@ -91,10 +92,20 @@ class Room:
         maps = {agent["map"] for agent in agents}
         result.expect(len(maps) == 1, f"in {len(maps)} maps in the end: {maps}")
         self.compare_acknowledged()
-        deadline = time.monotonic() + 10
-        while (left := [pid for pid in self.strays if harness.alive(pid)]) and time.monotonic() < deadline:
-            time.sleep(0.2)
+        left = harness.left_of(self.strays)
         result.expect(not left, f"left behind: processes {left}")
+
+    def _wait_for_one_map(self, seconds: float = 40.0) -> None:
+        """Until the edge has both in one map; whether their own last words agree is judged after."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            with contextlib.suppress(OSError, ValueError):
+                agents = self.edge.snapshot()["agents"]
+                maps = {agents.get(name, {}).get("map_id") for name in ("hope", "faith")}
+                if len(maps) == 1 and maps != {None}:
+                    time.sleep(2.0)  # until they are told
+                    return
+            time.sleep(0.3)
 
     def compare_acknowledged(self) -> None:
         """Every acknowledgement that any agent ever got, with the file."""
