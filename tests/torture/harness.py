@@ -209,10 +209,11 @@ class Watch:
             except (OSError, ValueError) as error:
                 self.health_failed.append(f"{error}"[:200])
 
-    def rss_mb(self) -> tuple[float, float]:
-        """Of all processes together: first, most."""
-        sums = [sum(f["rss_mb"] for f in s["of"].values()) for s in self.samples]
-        return (sums[0], max(sums)) if sums else (0.0, 0.0)
+    def rss_mb(self, since: float = 0.0) -> tuple[float, float]:
+        """Of all processes together: at `since` (or at first), and the most from then on."""
+        sums = [(s["t"], sum(f["rss_mb"] for f in s["of"].values())) for s in self.samples]
+        before = [mb for t, mb in sums if t <= since] or [mb for _, mb in sums[:1]]
+        return (before[-1], max(mb for t, mb in sums if t >= min(since, sums[-1][0]))) if sums else (0.0, 0.0)
 
     def processes(self) -> int:
         return max((len(s["of"]) for s in self.samples), default=0)

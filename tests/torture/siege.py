@@ -13,7 +13,7 @@ import harness
 from harness import EdgeProgram, HonestAgents, Keys, Program, Result, Setup, Watch
 
 SETTLED_S = 3.0  # of the honest agents alone, before anything begins
-RSS_MB = 400.0  # by which all processes of the edge together may grow in an attack
+RSS_MB = 300.0  # by which all processes of the edge together may grow from the attack's beginning on
 BAD_WORDS = ("Traceback", "Warning:", "Assertion failed", "mapper lost", "job failed", "not written")
 SAID_BYTES = 2_000_000  # log and events together; honest agents of some minutes write a tenth of it
 
@@ -73,7 +73,7 @@ def stay(folder: Path, setup: Setup, attack: Attack, most_s: float = 600.0) -> S
         code = edge.interrupt() if died is None else edge.process.returncode
     counts = json.loads(report.read_text()) if (report := edge.out / "edge.json").exists() else {}
     return Stay(
-        died, code, agents, since, until, watch.rss_mb(), watch.processes(), edge.bytes_said(),
+        died, code, agents, since, until, watch.rss_mb(since), watch.processes(), edge.bytes_said(),
         watch.health_ms, watch.health_failed, unwell, edge.said, harness.left_of(strays_of),
         _last_json(attacker), edge.map, counts,
     )  # fmt: skip
