@@ -55,8 +55,7 @@ class Room:
 
     def __exit__(self, *error: object) -> None:
         for program in (self.honest, self.edge):
-            if program.running:
-                program.kill()
+            program.kill()
         if self.relay is not None:
             self.relay.close()
 
@@ -141,7 +140,7 @@ def test_kill(role: str, times: int, tmp_path: Path, results: Path) -> None:
                 room.edge.process.wait()
                 room.restart_edge()
             elif role == "agents":
-                room.honest.process.wait()
+                room.honest.kill()  # what is left of it
                 room.begin_agents()
             else:
                 until(f"another {role}", lambda old=pid: room.pid(role) != old, 30)
