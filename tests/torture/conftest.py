@@ -44,7 +44,7 @@ def traffic(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     edge = harness.EdgeProgram(folder, harness.Setup(http=False))
     relay = Relay(edge.address, record=True)
     address = relay.start()
-    agents = [agent(folder, name, session / name, address) for name in ("ann", "bob")]
+    agents = [harness.start_agent(folder, name, session / name, address) for name in ("ann", "bob")]
     with harness.ended(edge, *agents):
         codes = [a.process.wait(120) for a in agents]
         relay.close()
@@ -55,20 +55,13 @@ def traffic(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def agent(folder: Path, name: str, source: Path, address: str, *more: str, **how: object) -> harness.Program:
-    """A real `share agent`."""
-    where = ("--name", name, "--kind", "ar", "--edge", address, "--out", str(folder / name))
-    arguments = [*harness.SHARE, "agent", str(source), *where, *more]
-    return harness.Program(folder / f"{name}.log", arguments, **how)  # type: ignore[arg-type]
-
-
 @pytest.fixture
 def start_agent() -> Iterator[Callable[..., harness.Program]]:
-    """`agent`, ended with the test."""
+    """`harness.start_agent`, ended with the test."""
     started: list[harness.Program] = []
 
     def start(*arguments: object, **how: object) -> harness.Program:
-        started.append(agent(*arguments, **how))  # type: ignore[arg-type]
+        started.append(harness.start_agent(*arguments, **how))  # type: ignore[arg-type]
         return started[-1]
 
     yield start

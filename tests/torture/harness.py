@@ -345,7 +345,14 @@ def kept_ids(path: Path, name: str) -> list[int]:
     return sorted(i for (who, _), ids in kept_by_run(path).items() if who == name for i in ids)
 
 
-# ------------------------------------------------------------------ honest agents
+# ------------------------------------------------------------------ agents
+
+
+def start_agent(folder: Path, name: str, source: Path, address: str, *more: str, **how: Any) -> Program:
+    """A real `share agent`."""
+    where = ("--name", name, "--kind", "ar", "--edge", address, "--out", str(folder / name))
+    arguments = [*SHARE, "agent", str(source), *where, *more]
+    return Program(folder / f"{name}.log", arguments, **how)
 
 
 class HonestAgents(Program):

@@ -84,6 +84,7 @@ def _as_busy(attacked: siege.Stay, form: Form) -> tuple[object, ...]:
     return ("--cpu", attacked.attack.get("cpu", 0.0), "--rate", max(1.0, sent / took_s), "--seconds", seconds)
 
 
+@pytest.mark.slow
 def test_the_judge_notices_an_edge_that_is_killed(tmp_path: Path) -> None:
     """The suite can fail."""
 

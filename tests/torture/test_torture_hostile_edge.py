@@ -10,7 +10,6 @@ from typing import Any
 
 import harness
 import pytest
-from conftest import agent
 from harness import Program, Result, Watch
 from lying_edge import MODES, LyingEdge
 
@@ -30,7 +29,7 @@ def alone(session: Path, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """odom.tum of an agent without any edge."""
     folder = tmp_path_factory.mktemp("alone")
     for _ in range(3):  # until no frame was left out
-        program = agent(folder, "ann", session / "ann", NOBODY, "--frames", FRAMES)
+        program = harness.start_agent(folder, "ann", session / "ann", NOBODY, "--frames", FRAMES)
         assert program.process.wait(PATIENCE_S) == 1, program.said
         if not _report(folder)["drop_late"]:
             break
