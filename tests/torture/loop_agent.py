@@ -90,7 +90,9 @@ def main() -> None:
         source.stop()
         run.stop()
 
-    threading.Timer(float(seconds), end).start()
+    timer = threading.Timer(float(seconds), end)
+    timer.daemon = True  # nobody waits for it once the agent has ended
+    timer.start()
     with on_stop(end):
         run.go()
 
