@@ -77,6 +77,7 @@ class Edge:
         self._ticket = 0
         self._unsafe: deque[tuple[int, Peer, int]] = deque()  # ticket, and what is safe once it is kept
         self._effects: list[Effect] = []
+        self._now_ns = 0  # of the newest event
         for run in known:
             self._recall(run)
 
@@ -85,7 +86,7 @@ class Edge:
 
         An exception, which is a fault of ours, costs this event only: it is counted and said."""
         self._began_ns = now_ns if self._began_ns is None else self._began_ns
-        self._effects = []
+        self._effects, self._now_ns = [], now_ns
         try:
             self._react(event, now_ns)
         except Exception as error:
@@ -136,6 +137,7 @@ class Edge:
                 pong = wire.Pong(message.sequence, message.sent_ns, now_ns, now_ns, self._session)
                 self._send(event.peer, pong)
             case wire.Bye() if peer:
+                peer.status.left()
                 self._gone(peer, "left", "said bye", now_ns)
             case _ if peer:
                 self._told(event.peer, peer, message, now_ns)
@@ -149,7 +151,9 @@ class Edge:
                 self._keyframe(peer, message, now_ns)
             case wire.PoseUpdate():
                 peer.counts["poses"] += 1
-                peer.state = message.state
+                peer.status.posed(message.state, now_ns)
+            case wire.Status():
+                peer.status.told(message, now_ns)
             case wire.Evaluation():
                 self._evaluated(peer_id, peer, message, now_ns)
             case _:  # not this agent's word
@@ -170,6 +174,7 @@ class Edge:
 
     def _heard(self, peer: Peer, now_ns: int) -> None:
         peer.heard_ns = now_ns
+        peer.status.heard()
         if peer.gone:
             peer.gone = False
             self._effects.append(Present(peer.key, True))
@@ -379,13 +384,13 @@ class Edge:
 
         An agent's earlier runs stand under their run's own key.
         """
-        of_agents = mapped.get("agents", {})
+        of_agents, now_ns = mapped.get("agents", {}), self._now_ns
         return {
             "session": self._session,
             "policy": self._config.edge.policy,
             **mapped,
             "agents": {
-                peer.hello.name if self._latest[peer.hello.name] is peer else peer.key: peer.report()
+                peer.hello.name if self._latest[peer.hello.name] is peer else peer.key: peer.report(now_ns)
                 | self._report_of(peer)
                 | of_agents.get(peer.key, {})
                 for peer in self._peers.values()

@@ -12,10 +12,11 @@ import numpy as np
 from share.core.finding import Finding, in_map
 from share.core.inorder import InOrder
 from share.core.keeping import Kept, placed
+from share.core.peer_status import PeerStatus
 from share.core.rate import SECOND_NS, TokenBucket
 from share.geometry import se3
 from share.merge.join import Key, Loop
-from share.types import Keyframe, TrackState
+from share.types import Keyframe
 from share.wire.messages import Hello
 
 _LEAP_M, _LEAP_M_S = 2.0, 10.0  # further than this, and so much more a second, nobody moves between keyframes
@@ -88,7 +89,7 @@ class Peer:
     inorder: InOrder = field(default_factory=InOrder)
     safe: int = 0
     foot: Foot | None = None
-    state: TrackState = TrackState.INITIALISING
+    status: PeerStatus = field(default_factory=PeerStatus)
     counts: Counter[str] = field(default_factory=Counter)
     refusals: Refusals = field(default_factory=Refusals)
     keyframe_rate: TokenBucket = field(default_factory=_keyframe_rate)
@@ -128,12 +129,12 @@ class Peer:
             keyframe = replace(keyframe, cov=keyframe.cov * (_MOST_VARIANCE / most))
         return keyframe, complaint
 
-    def report(self) -> dict[str, Any]:
+    def report(self, now_ns: int) -> dict[str, Any]:
         """edge.json's fields of one run, as far as it was heard."""
         return {
             "kind": str(self.hello.kind),
             "run": self.key,
-            "state": str(self.state),
+            **self.status.report(now_ns, self.heard_ns),
             "gone": self.gone,
             **{name: self.counts[name] for name in _COUNTS},
             "refused_messages": self.refusals.n,

@@ -44,7 +44,7 @@ class TrackingEdge(Edge):
                 afar.is_ready = True
                 self._welcome(peer_id, peer, now_ns)
             case Answered():
-                peer.state = event.answer.state
+                peer.status.posed(event.answer.state, now_ns)
                 self._send(peer_id, event.answer)
                 self._do(afar.answered(event.answer, now_ns))
             case Lost():
@@ -56,6 +56,9 @@ class TrackingEdge(Edge):
                     self._send(peer_id, wire.Refused(f"the process that is to track it {event.how}"))
 
     def _told(self, peer_id: bytes, peer: Peer, message: wire.Message, now_ns: int) -> None:
+        if isinstance(message, wire.Status):
+            peer.status.told(message, now_ns)
+            return
         if not isinstance(message, Frame):
             peer.counts["unexpected"] += 1
             return

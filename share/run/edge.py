@@ -54,7 +54,7 @@ from share.run.mapping import Mapped, Restore, map_all
 from share.run.tracking import Trackers
 
 TICK_MS = 50
-_REPORT_S = 1.0
+_REPORT_S = 0.2  # so that what is shown of agents is true within a second
 _UNWELL_S = 10.0  # how long a death is trouble
 REFUSALS_SAID = 64  # strangers at the door; more are only counted
 _AT_ONCE = 64  # messages, before anything else is looked after
@@ -133,7 +133,7 @@ class EdgeRun:
         self._link.close()
 
     def report(self) -> dict[str, Any]:
-        """As edge.json, a second old at most, and `trouble`: what is wrong now. From any thread."""
+        """As edge.json, 0.2 s old, and `trouble`: what is wrong now. From any thread."""
         return self._report
 
     def _note(self) -> None:

@@ -53,6 +53,7 @@ Bytes = bytes | memoryview
 Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Ids = Annotated[tuple[Int64, ...], Meta(max_length=m.MAX_HELD)]
 Text = Annotated[str, Meta(max_length=m.MAX_TEXT)]
+Reason = Annotated[str, Meta(max_length=m.MAX_REASON)]
 Name = Annotated[str, Meta(max_length=MAX_NAME)]
 MapId = Annotated[str, Meta(max_length=MAX_MAP_ID)]
 
@@ -259,6 +260,7 @@ _LAYOUTS: dict[type, _Layout] = {
             _samples("imu.accel", "<f8", 3),
         ),
     ),
+    m.Status: _Layout(8, m.Status, _Scalars.of(state=TrackState, pose_age_ms=float, reason=Reason)),
     m.Welcome: _Layout(16, m.Welcome, _Scalars.of(session=Int64, next_keyframe=Int64)),
     m.Refused: _Layout(17, m.Refused, _Scalars.of(reason=Text)),
     m.Ack: _Layout(18, m.Ack, _Scalars.of(next_keyframe=Int64, held=Ids)),

@@ -48,6 +48,7 @@ EXAMPLES: list[m.Message] = [
     m.PoseUpdate(1_700_000_000_123_456_789, TrackState.INERTIAL_ONLY, 2**31 - 1, POSE),
     keyframe(5),
     m.Evaluation(3, 12.5, None),
+    m.Status(TrackState.LOST, 2100.5, "no image for 2.1 s"),
     m.Ping(1, 10**18),
     m.Bye(),
     m.Welcome(2**62, 3),

@@ -103,6 +103,12 @@ messages = st.one_of(
     st.builds(m.PoseUpdate, stamps, st.sampled_from(TrackState), ids_or_none, poses()),
     keyframes(),
     st.builds(m.Evaluation, ids, late, st.none() | late),
+    st.builds(
+        m.Status,
+        st.sampled_from(TrackState),
+        st.floats(0, m.MAX_AGE_MS),
+        st.text(st.characters(categories=["L", "N"]), max_size=m.MAX_REASON),
+    ),
     st.builds(m.Ping, int64, stamps),
     st.just(m.Bye()),
     st.builds(m.Welcome, int64, ids),
