@@ -236,7 +236,12 @@ def reset_while_full(c: Ctx) -> None:
     """Fills the edge's queue, and is gone by a reset in the middle of it."""
     ping = c.corpus.by_kind["ping"][:1] * 300
     while c.going:
-        peers = [c.peer() for _ in range(4)]
+        try:
+            peers = [c.peer() for _ in range(4)]
+        except OSError:  # closed as soon as it was open: not the end of the attack
+            c.counts["refused"] += 1
+            time.sleep(0.05)
+            continue
         for peer in peers:
             try:
                 peer.send([*ping, *[c.keyframe(k, k - 1) for k in range(60)]])
