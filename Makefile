@@ -3,7 +3,7 @@ PYTHON ?= $(shell python3.11 -c "" 2>/dev/null && echo python3.11 || echo python
 BIN := .venv/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
-.PHONY: install demo test lint type bench slow train-test freeze vio-figures
+.PHONY: install demo test lint type bench slow torture soak train-test freeze vio-figures
 
 install: .venv/installed
 .venv/installed: setup.cfg pyproject.toml
@@ -17,10 +17,14 @@ demo: install
 test: install
 	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile --ignore tests/run
 	$(BIN)/pytest tests/run  # real processes in real time: with the cores to themselves
-SLOW_ALONE := tests/run tests/frozen tests/booted tests/tutorial  # in real time, or with their own processes
+SLOW_ALONE := tests/run tests/frozen tests/booted tests/tutorial tests/torture  # in real time, or with their own processes
 slow: install
 	$(BIN)/pytest -m slow -n auto --maxprocesses 4 --dist loadfile $(SLOW_ALONE:%=--ignore %)
 	$(BIN)/pytest -m slow $(SLOW_ALONE)
+torture: install  # an hour or more, in real time; results as JSON in share-torture
+	TORTURE_OUT=$(or $(OUT),share-torture) $(BIN)/pytest -s -m torture tests/torture
+soak: install  # HOURS=2.5 make soak: shorter; 20 min of warm-up come before
+	$(BIN)/python tests/torture/soak.py --hours $(or $(HOURS),8) --out $(or $(OUT),share-soak)
 train-test: install  # brings torch
 	$(PIP) -e '.[train]'
 	$(BIN)/pytest tests/train -m "slow or not slow"
