@@ -155,14 +155,14 @@ class Agent:
         self._ledger.add(Entry(keyframe, frame.index, frame.arrived_ns))
         self._drift.sent(keyframe, frame.arrived_ns)
         if self._connected and self._clock.rtt_ms is not None:
-            delay_ms = self._clock.rtt_ms + (self._processing_ms or 0.0)
+            delay_ms = min(self._clock.rtt_ms + (self._processing_ms or 0.0), m.MAX_DELAY_MS)
             self._send(m.Evaluation(keyframe.id, delay_ms, self._expected_cm(frame.error_cm, now_ns)))
 
     def _expected_cm(self, local_cm: float | None, now_ns: int) -> float | None:
         drift_cm = self._drift.expected_cm(local_cm, now_ns)
         if drift_cm is None or self._T_odom_body is None or not self._config.agent.tell_placement:
             return drift_cm
-        return math.hypot(drift_cm, self._map.spread_cm(self._T_odom_body))
+        return min(math.hypot(drift_cm, self._map.spread_cm(self._T_odom_body)), m.MAX_ERROR_CM)
 
     def _localised(self, frame: ev.FrameTracked, T_odom_body: F64, now_ns: int) -> None:
         self._T_odom_body = T_odom_body

@@ -69,6 +69,10 @@ class TrackingEdge(Edge):
         window = Window(self._config.stream.window)
         self._afar[peer.key] = Afar(peer.key, peer.hello.rig, window)
 
+    def _forget(self, peer: Peer) -> None:
+        super()._forget(peer)
+        del self._afar[peer.key]
+
     def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
         """Now, or as soon as its tracker is ready."""
         afar = self._afar[peer.key]

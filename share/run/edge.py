@@ -137,6 +137,7 @@ class EdgeRun:
         self._report_at = now + _REPORT_S
         failing = self._keeper is not None and self._keeper.failing
         trouble = [text for text, until in self._trouble.items() if now < until]
+        trouble += self._machine.trouble(time.monotonic_ns())
         self._report = {
             **self._machine.report(self._mapped),
             "refused_handshakes": self._refused.total(),
@@ -180,12 +181,11 @@ class EdgeRun:
     # ------------------------------------------------------------------ the loop
 
     def _step(self) -> None:
-        message = self._link.receive(TICK_MS)
-        for _ in range(_AT_ONCE):
+        for i in range(_AT_ONCE):
+            message = self._link.receive(0 if i else TICK_MS)
             if message is None:
                 break
             self._handle(Received(*message))
-            message = self._link.receive(0)
         for line in self._link.refusals():
             self._refuse(line)
         self._take_answers()
