@@ -5,7 +5,7 @@
 Two agents run against an edge through a relay that keeps every message as it passes; then one agent streams
 to an edge that tracks. OUT/wire-N.msgpack.gz has the messages, OUT/map-N.sqlite.gz the edge's map file, where
 N is the wire version. tests/wire/recorded has those of the last releases, and how to read them is said in
-tests/wire/recording.py. Only the commands of SHARE are used, so that every release can be recorded.
+tests/recorded_traffic.py. Only the commands of SHARE are used, so that every release can be recorded.
 """
 
 from __future__ import annotations
