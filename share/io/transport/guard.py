@@ -34,6 +34,7 @@ _TICK_MS, _ALERT_MS = 20, 5
 _ROUND = 2 * CONNECTIONS  # messages; those of connections that are closed by now wait beside the others
 GROWTH_BYTES = 16_000_000  # of memory, beyond the bytes that wait: small parts take much more than they have
 _PAUSE_S = 2.0  # without newcomers from where somebody offended of whom no more is known than that
+_SETTLES_S = 0.05  # until all that libzmq has read of a connection that was cut off is there to be received
 _EVENTS_AT_ONCE = 256
 _HOMES = 4096
 _EVENTS = (
@@ -81,6 +82,10 @@ class Guard:
         self._admitted: deque[tuple[str, str]] = deque(maxlen=CONNECTIONS)  # key and address
         self._lines: deque[str] = deque(maxlen=128)
         self._empty_s = 0.0
+        # Descriptors of those that were cut off: what still waits of them is thrown away, and nobody new is
+        # let in (who could have such a descriptor next) until nothing waits any more.
+        self._cut_off: frozenset[int] = frozenset()
+        self._cut_off_s = 0.0  # when the last was
         # The thread's own:
         self._open: dict[int, _Connection] = {}  # by descriptor
         self._ended: dict[int, float] = {}  # when a descriptor was last given back
@@ -101,6 +106,10 @@ class Guard:
         with self._lock:
             bytes_, messages, _ = self._taken.get(descriptor, (0, 0, ""))
             self._taken[descriptor] = bytes_ + size, messages + 1, key
+
+    def discards(self, descriptor: int) -> bool:
+        """Whether what comes from that connection is to be thrown away."""
+        return descriptor in self._cut_off
 
     def empty(self, asked_s: float) -> None:
         """There was no message when asked at `asked_s` (time.monotonic)."""
@@ -181,11 +190,17 @@ class Guard:
         self._open[descriptor] = connection
         if self._closed_to(connection.address, time.monotonic()):
             self._cut(connection)
+            self._cut_off |= {descriptor}
         self._make_room()
 
     def _closed_to(self, address: str, now_s: float) -> bool:
         full = self._orphaned > self._bounds.total
-        return full or now_s < self._paused.get(address, now_s) or self._kept_out.holds(address, now_s)
+        return (
+            full
+            or bool(self._cut_off)
+            or now_s < self._paused.get(address, now_s)
+            or self._kept_out.holds(address, now_s)
+        )
 
     def _make_room(self) -> None:
         """Where there are too many, one that has said nothing goes, by chance among those of the address that
@@ -221,10 +236,12 @@ class Guard:
         if not self._open:
             return -1
         much = sum(max(0, connection.account.waiting) for connection in self._present())
-        if much <= self._bounds.message:
+        if empty_s > self._cut_off_s + _SETTLES_S:
+            self._cut_off = frozenset()
+        if much <= self._bounds.message and not self._cut_off:
             self._resident = tcp.resident_bytes()
             return _TICK_MS
-        if tcp.resident_bytes() - self._resident - much > GROWTH_BYTES:
+        if much > self._bounds.message and tcp.resident_bytes() - self._resident - much > GROWTH_BYTES:
             self._offend(self._worst(now_s), "many small parts", now_s)
         self._poke()
         return _ALERT_MS
@@ -286,9 +303,9 @@ class Guard:
         """Whatever it is that waits: who has too much of it goes, then who has the most for the longest."""
         for connection in self._present():
             if connection.account.waiting > self._bounds.peer:
-                self._offend(connection, "more than may wait", now_s)
+                self._shed(connection, "more than may wait")
         while sum(connection.account.waiting for connection in self._present()) > self._bounds.total:
-            self._offend(self._worst(now_s), "more than may wait of all together", now_s)
+            self._shed(self._worst(now_s), "more than may wait of all together")
 
     def _worst(self, now_s: float) -> _Connection:
         """Who has the most waiting, for the longest."""
@@ -299,10 +316,21 @@ class Guard:
         if connection is not None and connection.sure:
             self._offend(connection, reason, time.monotonic())
 
+    def _shed(self, connection: _Connection, reason: str) -> None:
+        """Too much waits. An honest agent comes to that where the edge is very busy: it may come back."""
+        self._end(connection)
+        self._lines.append(f"{connection.key or connection.address}: {reason}; cut off")
+
+    def _end(self, connection: _Connection) -> None:
+        self._cut(connection)
+        self._cut_off |= {connection.descriptor}
+        self._cut_off_s = time.monotonic()
+
     def _offend(self, connection: _Connection, reason: str, now_s: float) -> None:
+        """It sends what no agent does: it is kept out."""
         if connection.is_cut:
             return
-        self._cut(connection)
+        self._end(connection)
         who = self._culprit(connection)
         name = f"the key '{connection.key}'" if connection.key else connection.address
         self._lines.append(f"{name}: {reason}; cut off{' and kept out' if who else ''}")

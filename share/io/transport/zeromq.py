@@ -36,12 +36,12 @@ _MAX_PARTS = 2 + MAX_ARRAYS  # peer, header, arrays; parts beyond are read and t
 _SLICE = 2000  # of these, in one call: 3 ms
 _WAKE, _POKE = b"w", b"p"
 _REFUSALS = 128  # lines at a time
-_STRANGERS_AT_ONCE = 256  # messages
+_IN_VAIN = 2000  # messages of strangers, or of who was cut off, in one call
 _REDIAL_S = 1.0  # after a handshake that failed; libzmq itself gives up after most of them
 _COMMON: dict[int, int] = {
     zmq.LINGER: LINGER_MS,
     zmq.SNDHWM: QUEUE_MESSAGES,
-    zmq.RCVHWM: QUEUE_MESSAGES,
+    zmq.RCVHWM: 0,  # see ZmqEdgeLink: an edge that resets while a full queue stops the input ends an agent
     zmq.MAXMSGSIZE: MAX_FRAME_BYTES,  # a larger frame closes the connection of its sender
     zmq.HANDSHAKE_IVL: 2000,
     zmq.HEARTBEAT_IVL: 500,  # a peer whose network is gone is noticed, and its queue dropped, in 2 s
@@ -63,8 +63,8 @@ _ROUTER: dict[int, int] = {
     # without this, libzmq would never route to it again. Ids are 64 random bits.
     zmq.ROUTER_HANDOVER: 1,
     # The heartbeat's timer of a connection that another took over ends the process where its peer then resets
-    # it (libzmq 4.3.5, as with RCVHWM below). The kernel notices in 2 to 3 s that a network is gone: by what is
-    # not acknowledged, or where nothing is under way, by its own probes.
+    # it (libzmq 4.3.5, as with RCVHWM below). The kernel notices in 2 to 3 s that a network is gone: by what
+    # is not acknowledged, or where nothing is under way, by its own probes.
     zmq.HEARTBEAT_IVL: 0,
     zmq.TCP_MAXRT: 2000,
     zmq.TCP_KEEPALIVE: 1,
@@ -240,7 +240,7 @@ class ZmqEdgeLink:
             zmq.RCVHWM: 0,
         }
         self._kept_out = KeepOut()
-        self.strangers = 0  # messages dropped because their sender is no agent
+        self.strangers = 0  # messages dropped: their sender is no agent, or was cut off
         self._open()
 
     @property
@@ -261,24 +261,26 @@ class ZmqEdgeLink:
         return arrival
 
     def _receive_now(self) -> Arrival | None:
-        for _ in range(_STRANGERS_AT_ONCE):
+        for _ in range(_IN_VAIN):
             parts = self._link.receive_now()
             if parts is None:
                 self._guard.empty(self._link.empty_s)
                 return None
             key = self._account_for(parts)
-            if len(parts[0]) == PEER_BYTES:
+            if key is not None and len(parts[0]) == PEER_BYTES:
                 return Arrival(parts[0].bytes, [part.bytes for part in parts[1:]], key)
             self.strangers += 1
         return None
 
-    def _account_for(self, parts: list[zmq.Frame]) -> str:
-        """Tells the guard of a message; its sender's key."""
+    def _account_for(self, parts: list[zmq.Frame]) -> str | None:
+        """Tells the guard of a message; its sender's key, None where it is to be thrown away."""
         sealed = self._keys is not None
         try:
             descriptor, key = int(parts[0].get(zmq.SRCFD)), self._key(parts[0])
         except zmq.ZMQError:  # ZMTP 1.0 has no such thing
             return ""
+        if self._guard.discards(descriptor):
+            return None
         self._guard.took(descriptor, sum(wire_bytes(len(part), sealed) for part in parts[1:]), key)
         if len(parts[0]) != PEER_BYTES:  # libzmq still takes most bytes for ZMTP 1.0
             self._guard.charge(descriptor, "its id is not 8 bytes: no agent")
