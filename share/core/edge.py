@@ -25,17 +25,16 @@ from share.core.edge_events import (
     Kept,
     Present,
     Received,
-    Record,
     Send,
     Tick,
 )
 from share.core.finding import Finding
 from share.core.inorder import InOrder
 from share.core.keeping import Change, KeepKeyframe, KeepRun
-from share.core.peer import Known, Peer, Refusals
+from share.core.peer import Known, Peer, Refusals, refused_lines
 from share.core.rate import seconds
+from share.core.records import Records
 from share.core.schedule import Schedule
-from share.core.throttle import Throttle
 from share.core.versions import OtherVersions
 from share.errors import VersionError, WireError, describe
 from share.strict import to_mapping
@@ -43,7 +42,6 @@ from share.types import Keyframe
 from share.wire import messages as wire
 from share.wire.codec import VERSION, decode, encode
 
-_SAY_HZ, _SAY_BURST = 1.0, 20.0  # records that one peer can cause of one kind
 _MAX_IDLE_RUNS = 256  # gone without a keyframe; the oldest is forgotten
 
 
@@ -68,12 +66,11 @@ class Edge:
         self._peers: dict[bytes, Peer] = {}
         self._by_key: dict[str, bytes] = {}
         self._latest: dict[str, Peer] = {}  # run of each name
-        self._began_ns = began_ns
         self._schedule = Schedule(config.control, config.edge.policy)
         self._strangers: Counter[str] = Counter()
         self._strangers_refused = Refusals()
         self._admission = Admission(config.edge, self.tracks)
-        self._throttle, self._versions = Throttle(_SAY_HZ, _SAY_BURST), OtherVersions()
+        self._records, self._versions = Records(began_ns), OtherVersions()
         self._internal_errors = 0
         self._ticket = 0
         self._unsafe: deque[tuple[int, Peer, int]] = deque()  # ticket, and what is safe once it is kept
@@ -87,7 +84,7 @@ class Edge:
         """What `event` leads to. `now_ns` is the edge's clock and never goes back.
 
         An exception, which is a fault of ours, costs this event only: it is counted and said."""
-        self._began_ns = now_ns if self._began_ns is None else self._began_ns
+        self._records.begin(now_ns)
         self._effects, self._now_ns = [], now_ns
         try:
             self._react(event, now_ns)
@@ -316,7 +313,7 @@ class Edge:
 
     def _evaluated(self, peer_id: bytes, peer: Peer, told: wire.Evaluation, now_ns: int) -> None:
         peer.counts["evaluations"] += 1
-        hello, t_s = peer.hello, self._since_began_s(now_ns)
+        hello, t_s = peer.hello, self._records.since_began_s(now_ns)
         rate_hz = self._schedule.evaluated(hello.name, hello.kind, told, now_ns, t_s)
         if rate_hz is not None:
             self._send(peer_id, wire.Rate(rate_hz))
@@ -329,7 +326,8 @@ class Edge:
             return
         peer = self._peers[peer_id]
         if finding.correction is None:
-            self._record(now_ns, finding.what, peer, finding.reason)
+            record = self._record_seldom if finding.what == "job failed" else self._record
+            record(now_ns, finding.what, peer, finding.reason)
             return
         peer.newest = finding
         if not peer.gone and peer.greeted:  # who has not been greeted takes us for our predecessor
@@ -360,29 +358,16 @@ class Edge:
 
     def _record(self, now_ns: int, what: str, peer: Peer | None, reason: str, **fields: Any) -> None:
         agent = peer.hello.name if peer else None
-        head = {"t_s": self._since_began_s(now_ns), "event": what, "agent": agent, "reason": reason}
-        self._effects.append(Record(head | fields))
+        self._effects.append(self._records.of(now_ns, what, agent, reason, **fields))
 
     def _record_seldom(self, now_ns: int, what: str, peer: Peer | None, reason: str, **fields: Any) -> None:
-        """What a peer can cause at any rate: of each kind and agent only so many a second."""
-        held_back = self._throttle.admit((what, peer.hello.name if peer else None), now_ns)
-        if held_back is not None:
-            more = f" (and {held_back} more since the last line)" if held_back else ""
-            self._record(now_ns, what, peer, f"{reason}{more}", **fields)
+        """For what a peer can cause at any rate."""
+        agent = peer.hello.name if peer else None
+        if (record := self._records.seldom(now_ns, what, agent, reason, **fields)) is not None:
+            self._effects.append(record)
 
     def _refusals(self, peer: Peer | None) -> Refusals:
         return peer.refusals if peer else self._strangers_refused
-
-    def trouble(self, now_ns: int) -> list[str]:
-        """Who sends messages that are refused again and again: a line each."""
-        found = {f"agent '{peer.hello.name}'": peer.refusals for peer in self._peers.values()}
-        found["peers that have not joined"] = self._strangers_refused
-        lines = {who: refusals.trouble(now_ns) for who, refusals in found.items()}
-        return [f"{who}: {line}" for who, line in lines.items() if line]
-
-    def _since_began_s(self, now_ns: int) -> float:
-        assert self._began_ns is not None
-        return round((now_ns - self._began_ns) * 1e-9, 6)
 
     def series(self) -> dict[str, Any]:
         """Of every agent, its evaluations and what came of them (`share.core.schedule`)."""
@@ -409,6 +394,7 @@ class Edge:
                 for peer in self._peers.values()
             },
             "strangers": dict(self._strangers),
+            "refused": refused_lines(self._peers.values(), self._strangers_refused, now_ns),
             "internal_errors": self._internal_errors,
             "version": __version__,
             "config": to_mapping(self._config),

@@ -29,6 +29,7 @@ from share.core.keeping import (
 from share.core.lookups import Lookups, form_of, served_as
 from share.core.search import Effort, Search
 from share.core.steps import Look, Query, Solve, Step, Verify
+from share.errors import describe
 from share.graph.change import Solution
 from share.merge.atlas import Applied, Atlas, Placed
 from share.merge.join import Loop
@@ -157,11 +158,15 @@ class Mapper:
 
     def next_solve(self) -> Solve | None:
         """The next map to be solved; None if there is none, or one is under way."""
-        due = [] if self._solving else self._atlas.due()
-        if not due:
-            return None
-        self._solving = True
-        return Solve(self._atlas.snapshot(due[0]))
+        for map_id in [] if self._solving else self._atlas.due():
+            try:
+                job = self._atlas.snapshot(map_id)
+            except Exception:  # it costs this map its solution, not the others theirs
+                self._counts["failed_jobs"] += 1
+                continue
+            self._solving = True
+            return Solve(job)
+        return None
 
     def done(self, step: Step, result: Any, ms: float) -> list[Finding]:
         """What follows from a step's result; an exception as the result costs that step only."""
@@ -191,10 +196,14 @@ class Mapper:
         raise result
 
     def _failed(self, step: Step, error: Exception) -> list[Finding]:
-        """It is said; the map goes on without what the step was for."""
+        agent = None if isinstance(step, Solve) else self._atlas.key(step.number).agent
+        return self.failed(step.kind, error, agent)
+
+    def failed(self, what: str, error: Exception, agent: str | None = None) -> list[Finding]:
+        """It is counted and said; the map goes on without what raised `error`. agent: that it is about."""
         self._counts["failed_jobs"] += 1
-        agent = next(iter(self._hellos)) if isinstance(step, Solve) else self._atlas.key(step.number).agent
-        return [Finding(agent, "job failed", f"{step.kind}: {type(error).__name__}: {error}")]
+        agent = next(iter(self._hellos), None) if agent is None else agent
+        return [] if agent is None else [Finding(agent, "job failed", f"{what}: {describe(error)}")]
 
     def solver_lost(self) -> None:
         """The solver knows nothing any more."""

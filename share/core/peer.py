@@ -71,7 +71,7 @@ class Refusals:
     def add(self, reason: str, now_ns: int) -> None:
         self.n, self.reason, self.at_ns = self.n + 1, reason, now_ns
 
-    def trouble(self, now_ns: int) -> str | None:
+    def line(self, now_ns: int) -> str | None:
         """For a person, while messages are refused again and again."""
         if self.n < _AGAIN or now_ns - self.at_ns > _RECENT_S * SECOND_NS:
             return None
@@ -154,6 +154,14 @@ _COUNTS = (
     "bad_messages",
     "unexpected",
 )
+
+
+def refused_lines(peers: Iterable[Peer], strangers: Refusals, now_ns: int) -> list[str]:
+    """Who sends messages that are refused again and again: a line each."""
+    found = {f"agent '{peer.hello.name}'": peer.refusals for peer in peers}
+    found["peers that have not joined"] = strangers
+    lines = {who: refusals.line(now_ns) for who, refusals in found.items()}
+    return [f"{who}: {line}" for who, line in lines.items() if line]
 
 
 def known_runs(kept: Kept, known_m: float) -> list[Known]:

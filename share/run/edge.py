@@ -145,7 +145,6 @@ class EdgeRun:
         self._report_at = now + _REPORT_S
         kept = None if self._keeper is None else self._keeper.trouble
         trouble = [text for text, until in self._trouble.items() if now < until]
-        trouble += self._machine.trouble(time.monotonic_ns())
         self._report = {
             **self._machine.report(self._mapped),
             "refused_handshakes": self._refused.total(),

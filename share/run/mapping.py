@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from share.config import Config, GraphConfig
 from share.core.backoff import Backoff
@@ -18,6 +18,8 @@ from share.core.mapper import Mapper
 from share.core.steps import Solve
 from share.graph.solver import Solver
 from share.run.companion import END, Companion, Inbox
+
+T = TypeVar("T")
 
 _REPORT_S = 1.0
 _POSES_S = 5.0  # between two keepings of where everything lies
@@ -96,7 +98,7 @@ class _Mapping:
                 self._hear(message)
             self._give_solver()
             self._tell()
-            look = self._mapper.next_look()
+            look = self._guarded("place", self._mapper.next_look, None)
             if self._is_restoring:  # the views have been gone through by now
                 self._is_restoring = False
                 self._answer(Restored())
@@ -122,7 +124,8 @@ class _Mapping:
             case Present():
                 self._mapper.present(message.key, message.here)
             case Add():
-                self._findings += self._mapper.add(message.key, message.keyframe)
+                add = partial(self._mapper.add, message.key, message.keyframe)
+                self._findings += self._guarded("keyframe", add, [], message.key)
             case _Solved():
                 self._solved(message.result, message.ms)
             case _Lost():
@@ -130,8 +133,16 @@ class _Mapping:
             case _ if message is END:
                 self._ended = True
 
+    def _guarded(self, what: str, work: Callable[[], T], otherwise: T, agent: str | None = None) -> T:
+        """A fault of ours costs this message or step, never the process: the map file would bring it back."""
+        try:
+            return work()
+        except Exception as error:
+            self._findings += self._mapper.failed(what, error, agent)
+            return otherwise
+
     def _give_solver(self) -> None:
-        step = self._mapper.next_solve()
+        step = self._guarded("solve", self._mapper.next_solve, None)
         if step is not None:
             self._solving = step
             self._solver.send(step)

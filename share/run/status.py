@@ -74,6 +74,7 @@ def _health(report: dict[str, Any]) -> Answer:
     health: dict[str, Any] = {
         "status": "trouble" if trouble else "ok",
         "trouble": trouble,
+        "refused": list(report.get("refused") or ()),
         "agents": sorted(name for name, agent in agents if not agent.get("gone")),
         **{key: report[key] for key in ("uptime_s", "waiting", "last_solve_s") if key in report},
     }

@@ -104,7 +104,7 @@ function show(now) {
   const unwell = entries(now.agents).filter(([, a]) => lost(a) || late(a)).length;
   const without = `${unwell} agent${unwell === 1 ? "" : "s"} without a current pose`;
   mark(trouble.length ? "trouble" : unwell ? without : "ok", trouble.length || unwell);
-  at("trouble").replaceChildren(...trouble.map(t => node("li", t)));
+  at("trouble").replaceChildren(...trouble.concat(now.refused ?? []).map(t => node("li", t)));
   const about = [`up ${lasted(now.uptime_s)}`];
   if (now.waiting !== undefined) about.push(`waiting ${shown(now.waiting)}`);
   if (typeof now.last_solve_s === "number") about.push(`solved ${lasted(now.last_solve_s)} ago`);

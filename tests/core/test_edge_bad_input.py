@@ -117,7 +117,8 @@ def test_a_result_that_cannot_be_used_costs_its_step(monkeypatch):
 
     monkeypatch.setattr(mapper, "_begin_search", bad)
     (finding,) = mapper.done(step, step.run(), 1.0)
-    assert (finding.what, finding.reason) == ("job failed", "place: ValueError: no such thing")
+    assert finding.what == "job failed"
+    assert finding.reason.startswith("place: ValueError: no such thing")
     monkeypatch.undo()
     mapper.add("ann", keyframe(1))
     step = mapper.next_look()
