@@ -135,7 +135,7 @@ EUROC_DAMAGE = {
         "data.csv, line 3: stamp 'NaN' is not a whole number",
         lambda r: edit(r / CAM0 / "data.csv", "\n1403715273312142976,", "\nNaN,"),
     ),
-    "images gone": (1, "6 of 6 images are missing", lambda r: shutil.rmtree(r / CAM0 / "data")),
+    "images gone": (1, "is missing from", lambda r: shutil.rmtree(r / CAM0 / "data")),
     "imu cut": (1, "imu0/data.csv, line 4: 3 of 7 columns", lambda r: cut(r / IMU0 / "data.csv")),
     "imu NaN stamp": (1, "line 2: stamp 'nan'", lambda r: edit(r / IMU0 / "data.csv", "14", "nan,14", 1)),
     "imu NaN": (
@@ -362,8 +362,9 @@ def test_out_names_are_paths_like_any_other(room, share, tmp_path, monkeypatch):
     (tmp_path / "link").symlink_to("new/T.tum")
     (tmp_path / "new" / "T.tum").write_text("old")
     assert share("track", room / "ar1", "--out", "link", "--frames", ":5").code == 0
-    assert (tmp_path / "link").is_symlink()
-    assert len((tmp_path / "new" / "T.tum").read_text().splitlines()) == 5
+    assert not (tmp_path / "link").is_symlink()  # it is replaced, and not written through
+    assert len((tmp_path / "link").read_text().splitlines()) == 5
+    assert (tmp_path / "new" / "T.tum").read_text() == "old"
 
 
 @pytest.mark.skipif(
@@ -391,10 +392,10 @@ def test_the_same_bytes_twice(room, share, tmp_path):
 
 
 def test_track_of_a_damaged_image(damaged, share, tmp_path):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "T.tum").write_text("an older run\n")
-    with untouched(tmp_path):
-        said = complaint(share(*as_track(damaged, tmp_path / "out")), 1)
+    done = share(*as_track(damaged, tmp_path / "out"))
+    assert done.code == 0
+    (said,) = done.err.splitlines()
+    assert "1 frames could not be read and were left out; the first: " in said
     assert f"{damaged}/mav0/cam1/data/" in said
     assert "the image is cut short or damaged" in said
 
@@ -575,7 +576,9 @@ def test_a_port_in_use(share, tmp_path):
     )
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.skip(
+    reason="a link to /dev/full is replaced now; see the same of an agent, with a limit on file size"
+)
 def test_an_edge_whose_disk_is_full_serves_on(room, share, tmp_path):
     out = tmp_path / "edge"
     out.mkdir()

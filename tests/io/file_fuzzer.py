@@ -29,6 +29,7 @@ from map_changes import small_map
 from recordings import make_euroc, make_tum
 
 from share import config
+from share.cli.options import load_config  # noqa: E402
 from share.core.sequencer import SequencerCounters
 from share.errors import ShareError
 from share.io.calibration import read_calibration
