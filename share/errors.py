@@ -39,6 +39,14 @@ class WireError(ShareError):
     """Bytes from a peer that are not a valid message. Counted by the receiver, never fatal."""
 
 
+class VersionError(WireError):
+    """A message of another version of the wire. code: of its kind, None where that cannot be read."""
+
+    def __init__(self, version: int, code: int | None, own: int) -> None:
+        super().__init__(f"header: peer speaks wire {version}, this SHARE wire {own}: upgrade the older one")
+        self.version, self.code = version, code
+
+
 class TransportError(ShareError):
     """A socket cannot be opened or used (port in use, address not local)."""
 

@@ -12,10 +12,11 @@ import numpy as np
 from share.core.finding import Finding, in_map
 from share.core.inorder import InOrder
 from share.core.keeping import Kept, placed
+from share.core.peer_status import PeerStatus
 from share.core.rate import SECOND_NS, TokenBucket
 from share.geometry import se3
 from share.merge.join import Key, Loop
-from share.types import Keyframe, TrackState
+from share.types import Keyframe
 from share.wire.messages import Hello
 
 _LEAP_M, _LEAP_M_S = 2.0, 10.0  # further than this, and so much more a second, nobody moves between keyframes
@@ -88,7 +89,7 @@ class Peer:
     inorder: InOrder = field(default_factory=InOrder)
     safe: int = 0
     foot: Foot | None = None
-    state: TrackState = TrackState.INITIALISING
+    status: PeerStatus = field(default_factory=PeerStatus)
     counts: Counter[str] = field(default_factory=Counter)
     refusals: Refusals = field(default_factory=Refusals)
     keyframe_rate: TokenBucket = field(default_factory=_keyframe_rate)
@@ -103,9 +104,11 @@ class Peer:
         """Whether it is gone and never sent a keyframe."""
         return self.gone and self.inorder.next_keyframe == 0
 
-    def takes(self, now_ns: int) -> bool:
-        """Whether another keyframe may be applied now."""
-        return self.unsafe < _MAX_UNSAFE and self.keyframe_rate.take(now_ns)
+    def too_many(self, now_ns: int) -> str | None:
+        """Why no other keyframe is applied now; None if one may be."""
+        if self.unsafe >= _MAX_UNSAFE:
+            return f"{self.unsafe} keyframes wait for the disk"
+        return None if self.keyframe_rate.take(now_ns) else "keyframes come faster than they can be taken in"
 
     def place(self, keyframe: Keyframe) -> tuple[Keyframe, str | None]:
         """The next keyframe in order as the map may have it, and what was wrong with it.
@@ -128,12 +131,12 @@ class Peer:
             keyframe = replace(keyframe, cov=keyframe.cov * (_MOST_VARIANCE / most))
         return keyframe, complaint
 
-    def report(self) -> dict[str, Any]:
+    def report(self, now_ns: int) -> dict[str, Any]:
         """edge.json's fields of one run, as far as it was heard."""
         return {
             "kind": str(self.hello.kind),
             "run": self.key,
-            "state": str(self.state),
+            **self.status.report(now_ns, self.heard_ns),
             "gone": self.gone,
             **{name: self.counts[name] for name in _COUNTS},
             "refused_messages": self.refusals.n,

@@ -21,6 +21,13 @@ from share.types import Frame, ImuBatch
 _MISFITS = 10  # images of a wrong size before any of the right one: the calibration is another recording's
 _REMEMBERED = 600  # frames that are left out one after the other, whose IMU samples are kept
 
+_NO_MEASUREMENTS = {
+    "imu_out_of_range": "the IMU gave samples beyond {0.gyro:.3g} rad/s or {0.accel:.3g} m/s^2, or no "
+    "numbers; such are left out (sequencer.imu_out_of_range in the report)",
+    "imu_spikes": "the IMU gave single samples far from those before and after them; such are left out "
+    "(sequencer.imu_spikes in the report); look at its cable and supply",
+}
+
 
 def frames_of(
     source: Source,
@@ -28,19 +35,30 @@ def frames_of(
     counters: SequencerCounters,
     on_bad: Callable[[DataError], None] | None = None,
     spent: Callable[[float], None] = lambda cpu_s: None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> Iterator[Frame]:
     """Decoded frames in order. One with a damaged image is left out: the next one has its IMU samples too,
     and `on_bad` is told, or the source's losses are. Raises MisfitError where the first ten images, or all of
     them, are of another size than the calibration's.
 
-    `spent` is told the CPU time of each frame's decoding on this thread.
+    `spent` is told the CPU time of each frame's decoding on this thread; `say`, once, that the IMU gave what
+    is no measurement.
     """
     rig = source.rig
     bundles = sequence(
-        source.measurements(), streams_of(rig), source.rate_hz, config.sequencer, counters, rig.timeshift_ns
+        source.measurements(),
+        streams_of(rig),
+        source.rate_hz,
+        config.sequencer,
+        counters,
+        rig.timeshift_ns,
+        source.imu_range,
     )
-    left_out = _LeftOut(on_bad or partial(_lose, source))
+    left_out, silent = _LeftOut(on_bad or partial(_lose, source)), set(_NO_MEASUREMENTS)
     for bundle in bundles:
+        for name in [name for name in silent if getattr(counters, name)]:
+            silent.remove(name)
+            say(_NO_MEASUREMENTS[name].format(source.imu_range))
         began = time.thread_time()
         try:
             frame = load(left_out.before(bundle))

@@ -27,6 +27,8 @@ from share.types import (
 MAX_RATE_HZ = 1000.0
 MAX_HELD = 256  # ids in one Ack: the most keyframes that may wait at the edge for a gap to close
 MAX_TEXT = 512  # characters of anything a person reads
+MAX_REASON = 120  # characters of why an agent is in its state
+MAX_AGE_MS = 1e9  # 11 days
 MAX_SIDE = 8192  # px, of an image
 MAX_SAMPLES = 20_000  # of an IMU, in one frame
 MAX_DELAY_MS = 1e7  # three hours
@@ -47,8 +49,6 @@ def public_tag(run_id: int) -> str:
 
 
 def _check_camera(camera: Camera) -> None:
-    if not 1.0 <= min(camera.fx, camera.fy) <= max(camera.fx, camera.fy) <= 1e5:
-        raise ValueError(f"focal: {camera.fx}, {camera.fy} px are outside 1 .. 1e5")
     if max(camera.width, camera.height) > MAX_SIDE:
         raise ValueError(f"image: {camera.width}x{camera.height} px is more than {MAX_SIDE} a side")
 
@@ -107,6 +107,22 @@ class Evaluation:
             raise ValueError(f"delay_ms: {self.delay_ms} is outside 0 .. {MAX_DELAY_MS:g}")
         if self.error_cm is not None and not 0 <= self.error_cm <= MAX_ERROR_CM:
             raise ValueError(f"error_cm: {self.error_cm} is outside 0 .. {MAX_ERROR_CM:g}")
+
+
+@dataclass(frozen=True)
+class Status:
+    """Twice a second, and at once where it changes, also while no frame comes. pose_age_ms: since the newest
+    frame with a pose arrived, or the run began. reason: why it is so, for a person; empty: all is well."""
+
+    state: TrackState
+    pose_age_ms: float
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.pose_age_ms <= MAX_AGE_MS:
+            raise ValueError(f"pose_age_ms: {self.pose_age_ms} is outside 0 .. {MAX_AGE_MS:g}")
+        if len(self.reason) > MAX_REASON or not self.reason.isprintable():
+            raise ValueError(f"reason: at most {MAX_REASON} printable characters")
 
 
 @dataclass(frozen=True)
@@ -217,6 +233,6 @@ class Tracked:
             object.__setattr__(self, "T_odom_body", checked_pose("T_odom_body", self.T_odom_body))
 
 
-Up = Hello | PoseUpdate | Keyframe | Evaluation | Ping | Bye | Frame
+Up = Hello | PoseUpdate | Keyframe | Evaluation | Status | Ping | Bye | Frame
 Down = Welcome | Refused | Ack | Correction | Rate | Pong | Tracked
 Message = Up | Down
