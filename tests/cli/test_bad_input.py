@@ -180,7 +180,7 @@ TUM_DAMAGE = {
     "NaN stamp": (
         1,
         "stamp 'NaN' is not a time",
-        lambda r: (r / "rgb.txt").write_text("NaN rgb/0.jpg\n" * 5),
+        lambda r: (r / "rgb.txt").write_text("NaN rgb/0.jpg\n"),
     ),
     "no calibration": (2, "give the calibration with --calib", lambda r: (r / "camera.yaml").unlink()),
     "no depth scale": (
@@ -584,9 +584,9 @@ def test_a_port_in_use(share, tmp_path):
 
 
 def test_an_edge_whose_disk_is_full_serves_on(room, share, tmp_path):
-    """A limit on file size stands for the disk: 1 kB is full after a few events."""
+    """A limit on file size stands for the disk."""
     out = tmp_path / "edge"
-    with edge(out, "ulimit -f 1") as (server, address):
+    with edge(out, "ulimit -f 0") as (server, address):
         assert share(*as_agent(room / "ar1", tmp_path / "out", address), *FEW).code == 0
         done = end(server)
     assert done.code == 1
