@@ -92,6 +92,7 @@ def convert(
             to_mcap(opened, target, jpeg, bar)
         else:
             to_euroc(opened, target, bar)
+    options.say_losses(opened)
     click.echo(f"{target}: {opened.images_count} frames")
 
 

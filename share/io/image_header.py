@@ -56,8 +56,8 @@ def _jpeg(data: bytes) -> ImageHeader | None:
 
 
 def _of_frame(data: bytes, frame: int, scan: int) -> ImageHeader:
-    """One scan is all there is where it has all components of a frame that is not progressive: a decoder looks
-    no further. Else scans are counted, which takes a moment."""
+    """One scan is all there is where it has all components of a frame that is not progressive: a decoder
+    stops there. Else scans are counted, which takes a moment."""
     height, width = (int.from_bytes(data[k : k + 2], "big") for k in (frame + 5, frame + 7))
     whole = data[frame + 1] in _SEQUENTIAL and data[frame + 9] == data[scan + 4]
     return ImageHeader(width, height, False, 1 if whole else data.count(_SCAN))

@@ -29,6 +29,7 @@ from map_changes import small_map
 from recordings import make_euroc, make_tum
 
 from share import config
+from share.cli.options import load_config
 from share.core.sequencer import SequencerCounters
 from share.errors import ShareError
 from share.io.calibration import read_calibration
@@ -47,7 +48,7 @@ from share.run.pipeline import frames_of, tracker_for
 MEMORY = 3 * 2**30  # of addresses: Python, OpenCV and NumPy take 1.5 of them
 SECONDS = 30  # of CPU time, for one case
 EXTREMES = (
-    "nan", "inf", "-inf", "1e308", "-1e308", "1e-300", "0", "-1", "9223372036854775807", "-9223372036854775808",
+    "nan", "inf", "-inf", "1e308", "-1e308", "1e-300", "0", "-1", "9223372036854775807", "-9223372036854775808",  # noqa: E501
     "18446744073709551616", "1000000000000", "", "x", "9" * 400, "[", "{", "&a", "*a", "../../x", "/dev/zero",
     "\0", "1e9", "0.1", "'", "!!int", "true", "~",
 )  # fmt: skip
@@ -112,7 +113,7 @@ def seeds(root: Path) -> dict[str, Seed]:
     texts = kalibr_texts(RIG, "a rig")
     chain = "".join("      " + line + "\n" for text in texts.values() for line in text.splitlines())
     (root / "session" / "session.yaml").write_text(
-        f"schema: 1\nprovenance: {{a: 1}}\nagents:\n  ann:\n    kind: ar\n    sensors: rgbd+imu\n    rate_hz: 20.0\n"
+        f"schema: 1\nprovenance: {{a: 1}}\nagents:\n  ann:\n    kind: ar\n    sensors: rgbd+imu\n    rate_hz: 20.0\n"  # noqa: E501
         f"    clock_offset_ns: 5\n    calibration:\n{chain}"
     )
     (root / "session" / "truth" / "ann.tum").write_text("1.0 0 0 0 0 0 0 1\n1.1 0 0 0 0 0 0 1\n")
@@ -138,7 +139,7 @@ def seeds(root: Path) -> dict[str, Seed]:
     }
 
 
-_MOTIVE = """Format Version,1.23,Take Name,a,Rotation Type,Quaternion,Length Units,Meters,Coordinate Space,Global
+_MOTIVE = """Format Version,1.23,Rotation Type,Quaternion,Length Units,Meters,Coordinate Space,Global
 
 ,Type,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body
 ,Name,A,A,A,A,A,A,A

@@ -39,7 +39,8 @@ def damage() -> tuple[type[Exception], ...]:
     from mcap.stream_reader import CRCValidationError
 
     return (McapError, CRCValidationError, zstandard.ZstdError, ValueError, IndexError, zlib.error,
-            struct.error, UnicodeDecodeError, EOFError, RuntimeError, KeyError, OverflowError, OSError, MemoryError)  # fmt: skip
+            struct.error, UnicodeDecodeError, EOFError, RuntimeError, KeyError, OverflowError, OSError,
+            MemoryError)  # fmt: skip
 
 
 def check_magic(path: Path) -> None:
