@@ -39,6 +39,14 @@ class WireError(ShareError):
     """Bytes from a peer that are not a valid message. Counted by the receiver, never fatal."""
 
 
+class VersionError(WireError):
+    """A message of another version of the wire. code: of its kind, None where that cannot be read."""
+
+    def __init__(self, version: int, code: int | None, own: int) -> None:
+        super().__init__(f"header: peer speaks wire {version}, this SHARE wire {own}: upgrade the older one")
+        self.version, self.code = version, code
+
+
 class TransportError(ShareError):
     """A socket cannot be opened or used (port in use, address not local)."""
 
@@ -61,3 +69,12 @@ def not_installed(packages: str, extra: str) -> str:
     if getattr(sys, "frozen", False):
         return f"this frozen program has no {packages}; use a computer with Python: {how}"
     return f"{packages} is not installed: {how}"
+
+
+def one_line(text: str) -> str:
+    """A message that quotes somebody's file: without control characters, of a bearable length."""
+    clean = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return clean if len(clean) <= _LONGEST else f"{clean[: _LONGEST // 2]} … {clean[-_LONGEST // 2 :]}"
+
+
+_LONGEST = 1500  # characters

@@ -10,7 +10,7 @@ import struct
 from types import TracebackType
 
 MORE, LONG, COMMAND = 1, 2, 4
-_MIN_GREETING = 64
+_GREETING, _READY = 64, 43  # bytes of a greeting, and of READY of a ROUTER
 
 
 def greeting(mechanism: bytes = b"NULL", server: bool = False, version: tuple[int, int] = (3, 0)) -> bytes:
@@ -55,11 +55,15 @@ def command(name: bytes, data: bytes = b"") -> bytes:
 
 def ready(identity: bytes, kind: bytes = b"DEALER") -> bytes:
     """READY with the peer's routing id."""
-    metadata = b"".join(
+    return command(b"READY", metadata(identity, kind))
+
+
+def metadata(identity: bytes, kind: bytes = b"DEALER") -> bytes:
+    """Properties of a peer, as in READY or INITIATE."""
+    return b"".join(
         bytes([len(name)]) + name + struct.pack(">I", len(value)) + value
         for name, value in ((b"Socket-Type", kind), (b"Identity", identity))
     )
-    return command(b"READY", metadata)
 
 
 class RawPeer:
@@ -74,10 +78,16 @@ class RawPeer:
 
     @classmethod
     def joined(cls, endpoint: str, identity: bytes, timeout_s: float = 5.0) -> RawPeer:
-        """One that has shaken hands without keys."""
+        """One that has shaken hands without keys. Raises OSError where it is not let in."""
         peer = cls(endpoint, timeout_s)
-        peer.socket.sendall(greeting() + ready(identity))
-        peer.hear(_MIN_GREETING + 20)
+        try:
+            peer.socket.sendall(greeting())
+            early = peer.hear(_GREETING)  # libzmq does not look at what comes in one segment with a greeting
+            peer.socket.sendall(ready(identity))
+            peer.hear(_READY - max(0, len(early) - _GREETING))
+        except OSError:
+            peer.close()
+            raise
         return peer
 
     def send(self, data: bytes) -> bool:
@@ -109,6 +119,11 @@ class RawPeer:
         except OSError:
             pass
         return True
+
+    def reset(self) -> None:
+        """Breaks off at once: what is under way is thrown away."""
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self.socket.close()
 
     def close(self) -> None:
         self.socket.close()

@@ -115,6 +115,7 @@ def agent(
     with on_stop(run.stop):
         run.go()
     line.end()
+    options.say_losses(opened)
     click.echo(json.dumps(run.report) if as_json else _summary(run))
     if not run.report["protocol"]["edge_sessions"]:
         if (refusal := run.report["protocol"]["refusal"]) is not None:

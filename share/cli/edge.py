@@ -124,7 +124,15 @@ def _say_keys(keys: EdgeKeys | None) -> None:
 
 
 _NEWS = {"joined the edge", "left", "back", "silent", "refused"}
-_NEWS |= {"not let in", "maps joined", "merge undone", "job failed", "not written", "mapper lost"}
+_NEWS |= {
+    "not let in",
+    "maps joined",
+    "merge undone",
+    "job failed",
+    "not written",
+    "mapper lost",
+    "solver lost",
+}
 _NEWS |= {"odometry doubted", "map", "tracking lost"}
 
 

@@ -7,6 +7,7 @@ give the same effects. Odometry passes through untouched: the edge only moves th
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 from share.config import Config
@@ -22,12 +23,13 @@ from share.core.own_status import OwnStatus
 from share.core.pings import Pings
 from share.core.rate import Every, TokenBucket, seconds
 from share.core.streaming import Streaming
+from share.core.versions import EdgeVersion
 from share.core.worth import Worth
-from share.errors import UsageError, WireError
+from share.errors import UsageError, VersionError, WireError
 from share.geometry.se3 import inverse
 from share.types import F64, Correction, Keyframe
 from share.wire import messages as m
-from share.wire.codec import decode, encode, size
+from share.wire.codec import Bytes, decode, encode, size
 
 _COUNTED = (
     *("bytes_up", "bytes_down", "bad_messages", "poses", "candidates", "drop_rate"),
@@ -66,6 +68,7 @@ class Agent:
         self._silent_ns = seconds(link.silent_s)
         self._heard_ns: int | None = None  # or when waiting for the edge began
         self._silence_said = False
+        self._edge_version = EdgeVersion()
         self._lines = Lines()
         self._now_ns = 0  # of the newest event
         self._finish_by_ns: int | None = None
@@ -98,6 +101,7 @@ class Agent:
                 self._status.over()
                 self._finish_by_ns = now_ns + seconds(self._config.agent.finish_s)
             case ev.Connected():  # whether it knows us, its welcome says sooner than a ping's answer
+                self._edge_version.reached()
                 self._send_hello(now_ns)
             case ev.Tick():
                 self._status.ticked(event)
@@ -210,9 +214,11 @@ class Agent:
     def _received(self, event: ev.Received, now_ns: int) -> None:
         self._counts["bytes_down"] += size(event.frames)
         try:
-            message = decode(event.frames)
+            message = self._decode(event.frames)
         except WireError as error:
             self._complain(f"a message from the edge is not understood: {error}")
+            return
+        if message is None:
             return
         self._heard_ns = now_ns
         match message:
@@ -232,6 +238,16 @@ class Agent:
                 self._tracked_afar(message, self._streaming, now_ns)
             case _:
                 self._complain(f"the edge sent a {type(message).__name__}, which is not for this agent")
+
+    def _decode(self, frames: Sequence[Bytes]) -> m.Message | None:
+        """None for what an edge of an older version says, of which a person is told. Raises WireError."""
+        try:
+            return decode(frames)
+        except VersionError as error:
+            if (line := self._edge_version.heard(frames, error)) is not None:
+                self._silence_said = True
+                self._say(f"{line}; {self._alone}")
+            return None
 
     def _complain(self, text: str) -> None:
         """Counts a bad message; says each kind once."""
@@ -256,6 +272,7 @@ class Agent:
             self._complain("the edge sent a welcome that nobody asked for; it is not believed")
             return
         returned, self._connected, self._silence_said = not self._connected, True, False
+        self._edge_version.answered()
         if welcome.session != self._lives.session:
             self._new_session(welcome, now_ns)
         elif returned:
@@ -351,6 +368,8 @@ class Agent:
         self._hello_timer.postpone(now_ns + seconds(self._config.link.hello_s))
         self._lives.ask()
         self._send_frames(self._hello)
+        for ping in self._edge_version.pings(now_ns):
+            self._send_frames(ping)
 
     def _watch_silence(self, now_ns: int) -> None:
         assert self._heard_ns is not None

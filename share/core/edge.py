@@ -36,11 +36,12 @@ from share.core.peer import Known, Peer, Refusals
 from share.core.rate import seconds
 from share.core.schedule import Schedule
 from share.core.throttle import Throttle
-from share.errors import WireError, describe
+from share.core.versions import OtherVersions
+from share.errors import VersionError, WireError, describe
 from share.strict import to_mapping
 from share.types import Keyframe
 from share.wire import messages as wire
-from share.wire.codec import decode, encode
+from share.wire.codec import VERSION, decode, encode
 
 _SAY_HZ, _SAY_BURST = 1.0, 20.0  # records that one peer can cause of one kind
 _MAX_IDLE_RUNS = 256  # gone without a keyframe; the oldest is forgotten
@@ -72,10 +73,11 @@ class Edge:
         self._strangers: Counter[str] = Counter()
         self._strangers_refused = Refusals()
         self._admission = Admission(config.edge, self.tracks)
-        self._throttle = Throttle(_SAY_HZ, _SAY_BURST)
+        self._throttle, self._versions = Throttle(_SAY_HZ, _SAY_BURST), OtherVersions()
         self._internal_errors = 0
         self._ticket = 0
         self._unsafe: deque[tuple[int, Peer, int]] = deque()  # ticket, and what is safe once it is kept
+        self._kept_to = 0  # the newest ticket that is kept
         self._effects: list[Effect] = []
         self._now_ns = 0  # of the newest event
         for run in known:
@@ -122,6 +124,9 @@ class Edge:
         counts["bytes_up"] += sum(len(frame) for frame in event.frames)
         try:
             message = decode(event.frames)
+        except VersionError as error:
+            self._other_version(event.peer, error, now_ns)
+            return
         except WireError as error:
             self._complain(peer, str(error), now_ns)
             return
@@ -164,6 +169,11 @@ class Edge:
         what = "before its hello" if peer is None else "which is not an agent's to send"
         self._refusals(peer).add(f"a {type(message).__name__} {what}", now_ns)
 
+    def _other_version(self, peer_id: bytes, error: VersionError, now_ns: int) -> None:
+        self._strangers["other_version"] += 1
+        if (reason := self._versions.refusal(peer_id, error, now_ns)) is not None:
+            self._refuse(peer_id, reason, now_ns, error.version)
+
     def _complain(self, peer: Peer | None, reason: str, now_ns: int) -> None:
         """Counts a bad message; says the first of each peer."""
         counts = self._counts(peer)
@@ -194,10 +204,8 @@ class Edge:
     def _greet(self, event: Received, hello: wire.Hello, now_ns: int) -> None:
         """Welcome a new run or a known one; refuse a name that somebody else is using."""
         peer_id = event.peer
-        if (reason := self._admission.objection(event, hello, self._peers, now_ns)) is not None:
-            self._send(peer_id, wire.Refused(reason))
-            self._refusals(self._peers.get(peer_id)).add(reason, now_ns)
-            self._record_seldom(now_ns, "refused", None, reason)
+        if (reason := self._objection(event, hello, now_ns)) is not None:
+            self._refuse(peer_id, reason, now_ns)
             return
         if peer_id not in self._peers:
             self._forget_idle()
@@ -206,6 +214,14 @@ class Edge:
             joined = f"{hello.kind} '{hello.name}'"
             self._record_seldom(now_ns, "joined the edge", self._peers[peer_id], joined)
         self._welcome(peer_id, self._peers[peer_id], now_ns)
+
+    def _objection(self, event: Received, hello: wire.Hello, now_ns: int) -> str | None:
+        return self._admission.objection(event, hello, self._peers, now_ns)
+
+    def _refuse(self, peer_id: bytes, reason: str, now_ns: int, version: int = VERSION) -> None:
+        self._send(peer_id, wire.Refused(reason), version)
+        self._refusals(self._peers.get(peer_id)).add(reason, now_ns)
+        self._record_seldom(now_ns, "refused", None, reason)
 
     def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
         """Who says hello has lost the edge: whatever was on its way to him may be gone, or was not taken."""
@@ -251,15 +267,14 @@ class Edge:
             peer.unsafe += 1
             self._apply(peer, ready, now_ns)
             self._unsafe.append((self._ticket, peer, ready.id + 1))
-        if not self._keeps:
-            self._kept(self._ticket)
+        self._kept(self._kept_to if self._keeps else self._ticket)
         if not applicable:  # the others are acknowledged once they are safe
             self._acknowledge(peer)
 
     def _in_order(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> list[Keyframe]:
         """What can be applied now; nothing of an agent that sends more than is taken in."""
-        if not peer.takes(now_ns):
-            peer.refusals.add("keyframes come faster than they can be taken in", now_ns)
+        if (reason := peer.too_many(now_ns)) is not None:
+            peer.refusals.add(reason, now_ns)
             return []
         try:
             return peer.inorder.push(keyframe)
@@ -286,6 +301,7 @@ class Edge:
 
     def _kept(self, ticket: int) -> None:
         """Acknowledge what is safe now."""
+        self._kept_to = max(self._kept_to, ticket)
         told = {}
         while self._unsafe and self._unsafe[0][0] <= ticket:
             _, peer, next_keyframe = self._unsafe.popleft()
@@ -334,8 +350,8 @@ class Edge:
 
     # ------------------------------------------------------------------ going out
 
-    def _send(self, peer_id: bytes, message: wire.Down) -> None:
-        frames = encode(message)
+    def _send(self, peer_id: bytes, message: wire.Down, version: int = VERSION) -> None:
+        frames = encode(message, version)
         self._counts(self._peers.get(peer_id))["bytes_down"] += sum(len(frame) for frame in frames)
         self._effects.append(Send(peer_id, frames))
 

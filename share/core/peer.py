@@ -104,9 +104,11 @@ class Peer:
         """Whether it is gone and never sent a keyframe."""
         return self.gone and self.inorder.next_keyframe == 0
 
-    def takes(self, now_ns: int) -> bool:
-        """Whether another keyframe may be applied now."""
-        return self.unsafe < _MAX_UNSAFE and self.keyframe_rate.take(now_ns)
+    def too_many(self, now_ns: int) -> str | None:
+        """Why no other keyframe is applied now; None if one may be."""
+        if self.unsafe >= _MAX_UNSAFE:
+            return f"{self.unsafe} keyframes wait for the disk"
+        return None if self.keyframe_rate.take(now_ns) else "keyframes come faster than they can be taken in"
 
     def place(self, keyframe: Keyframe) -> tuple[Keyframe, str | None]:
         """The next keyframe in order as the map may have it, and what was wrong with it.

@@ -321,6 +321,7 @@ class AgentRun:
             "bytes_down": protocol["bytes_down"],
             "damaged_images": self._damaged,
             "failed_steps": self._guard.failed,
+            "left_out": self._source.losses.counts,
             "drop_late": self._late.dropped,
             **self._lateness.report(),
             **self._source.report(),

@@ -19,7 +19,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from share.errors import WireError
+from share.errors import VersionError, WireError
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.types import (
     DESCRIPTOR_BYTES,
@@ -44,6 +44,7 @@ from share.types import (
 from share.wire import messages as m
 
 VERSION = 5
+OLDEST = 2  # from which on messages that tell versions, those of FROZEN, are what they are now
 MAX_HEADER_BYTES = 4096
 MAX_ARRAYS = 8
 MAX_FRAME_BYTES = MAX_KEYPOINTS * DESCRIPTOR_BYTES  # the largest array of any message but Frame
@@ -60,10 +61,11 @@ MapId = Annotated[str, Meta(max_length=MAX_MAP_ID)]
 _DTYPES = {code: np.dtype(code) for code in ("<f8", "<f4", "<i8", "|u1")}
 
 
-class _Version(msgspec.Struct, array_like=True):
-    """The head of every header, of this and of all other versions."""
+class _Head(msgspec.Struct, array_like=True):
+    """The beginning of every header, of this and of all other versions."""
 
     version: int
+    code: Any = None
 
 
 class _Header(msgspec.Struct, array_like=True):
@@ -74,7 +76,7 @@ class _Header(msgspec.Struct, array_like=True):
 
 
 _encoder = msgspec.msgpack.Encoder(enc_hook=lambda scalar: scalar.item())  # numpy scalars
-_read_version = msgspec.msgpack.Decoder(_Version).decode
+_read_head = msgspec.msgpack.Decoder(_Head).decode
 _read_header = msgspec.msgpack.Decoder(_Header).decode
 
 
@@ -292,16 +294,19 @@ _LAYOUTS: dict[type, _Layout] = {
     ),
 }
 _BY_CODE = {layout.code: (cls, layout) for cls, layout in _LAYOUTS.items()}
+FROZEN = (m.Ping, m.Pong, m.Refused)  # the same in all versions, so that two of them can tell each other
 
 # Everything that msgspec, numpy and the validation of our own types raise on bad bytes.
 _BAD = (msgspec.MsgspecError, ValueError, OverflowError, RecursionError)
 
 
-def encode(message: m.Message) -> list[Bytes]:
-    """Frames of a message; array frames are views on its (read-only) arrays.
+def encode(message: m.Message, version: int = VERSION) -> list[Bytes]:
+    """Frames of a message; array frames are views on its (read-only) arrays. version: another one for a
+    message of FROZEN.
 
     Raises WireError if a field does not fit the wire, so that what is sent can always be decoded.
     """
+    assert version == VERSION or isinstance(message, FROZEN)
     layout = _LAYOUTS[type(message)]
     arrays = [spec.get(message) for spec in layout.arrays]
     table = [(spec.dtype, array.shape) for spec, array in zip(layout.arrays, arrays, strict=True)]
@@ -309,19 +314,19 @@ def encode(message: m.Message) -> list[Bytes]:
         scalars = msgspec.Raw(layout.scalars.encode(message))
     except _BAD as error:
         raise _wire_error(type(message).__name__, error) from None
-    header = _encoder.encode((VERSION, layout.code, scalars, table))
+    header = _encoder.encode((version, layout.code, scalars, table))
     return [header, *(array.data.cast("B") if array.size else b"" for array in arrays)]
 
 
 def decode(frames: Sequence[Bytes], versions: Sequence[int] = (VERSION,)) -> m.Message:
     """The message in `frames`; its arrays may be read-only views on them. versions: for what was kept, those
-    in which its kind has not changed. Raises WireError only."""
+    in which its kind has not changed. Raises WireError only, VersionError for any other version."""
     if not frames:
         raise WireError("empty message")
     if memoryview(frames[0]).nbytes > MAX_HEADER_BYTES:
         raise WireError(f"header of {memoryview(frames[0]).nbytes} bytes, at most {MAX_HEADER_BYTES}")
     try:
-        _check_version(_read_version(frames[0]).version, versions)
+        _check_version(_read_head(frames[0]), versions)
         header = _read_header(frames[0])
     except _BAD as error:
         raise _wire_error("header", error) from None
@@ -345,9 +350,14 @@ def _wire_error(where: str, error: Exception) -> WireError:
     return WireError(line[:200])
 
 
-def _check_version(version: int, versions: Sequence[int]) -> None:
-    if version not in versions:
-        raise ValueError(f"peer speaks version {version}, this is {VERSION}; update the older one")
+def _check_version(head: _Head, versions: Sequence[int]) -> None:
+    if head.version not in versions:
+        raise VersionError(head.version, head.code if isinstance(head.code, int) else None, VERSION)
+
+
+def code_of(kind: type[m.Message]) -> int:
+    """By which a header says that its message is of this kind."""
+    return _LAYOUTS[kind].code
 
 
 def _arrays(layout: _Layout, header: _Header, frames: Sequence[Bytes]) -> dict[str, NDArray[Any] | None]:

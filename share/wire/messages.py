@@ -49,8 +49,6 @@ def public_tag(run_id: int) -> str:
 
 
 def _check_camera(camera: Camera) -> None:
-    if not 1.0 <= min(camera.fx, camera.fy) <= max(camera.fx, camera.fy) <= 1e5:
-        raise ValueError(f"focal: {camera.fx}, {camera.fy} px are outside 1 .. 1e5")
     if max(camera.width, camera.height) > MAX_SIDE:
         raise ValueError(f"image: {camera.width}x{camera.height} px is more than {MAX_SIDE} a side")
 

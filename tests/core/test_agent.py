@@ -125,7 +125,7 @@ def test_another_wire_version_is_said_in_words() -> None:
     newer = b"\x94\x09\x01\x90\x90"
     assert said(handle(agent, ev.Received([newer]), 0)) == [
         "a message from the edge is not understood: "
-        f"header: peer speaks version 9, this is {VERSION}; update the older one"
+        f"header: peer speaks wire 9, this SHARE wire {VERSION}: upgrade the older one"
     ]
 
 

@@ -64,11 +64,13 @@ def keyframes(draw: st.DrawFn) -> Keyframe:
 
 
 focals, sides = st.floats(1, 1e5), st.integers(1, m.MAX_SIDE)
-distortions = st.sampled_from([0, 4, 5]).flatmap(lambda n: st.tuples(*[finite] * n))
+coefficients = st.floats(-1e4, 1e4)
+distortions = st.sampled_from([0, 4, 5]).flatmap(lambda n: st.tuples(*[coefficients] * n))
 cameras = st.builds(Camera, sides, sides, focals, focals, finite, finite, distortions)
 amount = st.floats(0, 1e9)
 late = st.floats(0, min(m.MAX_DELAY_MS, m.MAX_ERROR_CM))
-imus = st.builds(ImuNoise, amount, amount, amount, amount, amount)
+noise = st.floats(0, 1e3)
+imus = st.builds(ImuNoise, noise, noise, noise, noise, st.floats(0, 1e5))
 
 
 @st.composite
