@@ -19,6 +19,7 @@ from share.io.trajectory import format_pose
 from share.metrics.runlog import RunLog
 from share.types import F64
 
+_MOST_MAPS = 100  # an edge that moves an agent from map to map must not fill a folder
 _NAMES = ("odom.tum", "map.tum", "latency.csv", "report.json")
 
 
@@ -39,6 +40,7 @@ class AgentFiles:
         self._open: dict[str, LineFile] = {}
         self._map_id: str | None = None
         self._maps_before = 0
+        self._too_many_said = False
         self._claim = None if out is None else _claim(out)
         self._remove_partials()  # of a run that was killed
 
@@ -48,10 +50,18 @@ class AgentFiles:
     def map(self, stamp_ns: int, T_map_body: F64, map_id: str) -> None:
         if self._map_id not in (None, map_id) and "map.tum" in self._open and self._out is not None:
             self._open.pop("map.tum").close()
-            self._maps_before += 1
-            (self._out / "map.tum.partial").rename(self._out / f"map.before-{self._maps_before}.tum.partial")
+            self._keep_map(self._out / "map.tum.partial")
         self._map_id = map_id
         self._line("map.tum", stamp_ns, T_map_body)
+
+    def _keep_map(self, partial: Path) -> None:
+        """Poses of the map before, but not of more than _MOST_MAPS."""
+        if self._maps_before < _MOST_MAPS:
+            self._maps_before += 1
+            partial.rename(partial.with_name(f"map.before-{self._maps_before}.tum.partial"))
+        elif not self._too_many_said:
+            self._too_many_said = True
+            self._say(f"taken into more than {_MOST_MAPS} maps: poses of those between are not kept")
 
     def finish(self, log: RunLog, report: dict[str, Any]) -> None:
         """Close what is open and give everything its name; the report also says in which map map.tum is: a

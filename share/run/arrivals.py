@@ -110,12 +110,12 @@ class Seen:
 
     def __init__(self, frames: Frames, camera: LiveSource) -> None:
         self._frames, self._camera = frames, camera
-        self._dropped = 0
+        self._dropped: int | None = None  # before the first frame nobody has read the camera yet
         self._dropped_at = -_DROPS_S  # when it last grew
 
     def tick(self) -> Tick:
         now, dropped = time.monotonic(), self._camera.images_dropped
-        if dropped > self._dropped:
+        if self._dropped is not None and dropped > self._dropped:
             self._dropped, self._dropped_at = dropped, now
         slow = _TOO_SLOW if now - self._dropped_at < _DROPS_S else ""
         return Tick(self._camera.image_ns, "; ".join(filter(None, (self._camera.trouble, slow))))
@@ -125,4 +125,6 @@ class Seen:
 
     def each(self) -> Iterator[tuple[Frame, int]]:
         for frame in self._frames():
+            if self._dropped is None:
+                self._dropped = self._camera.images_dropped
             yield frame, self._camera.arrived_ns(frame.stamp_ns)

@@ -23,6 +23,19 @@ def test_a_map_that_comes_after_the_last_pose_is_not_that_of_the_file(tmp_path):
     assert len(read_tum(tmp_path / "map.tum").stamps_ns) == 1
 
 
+def test_an_edge_that_moves_an_agent_from_map_to_map_does_not_fill_the_folder(tmp_path):
+    said = []
+    files = AgentFiles(tmp_path, said.append)
+    for k in range(300):
+        files.odom(k, np.eye(4))
+        files.map(k, np.eye(4), f"map {k}")
+    files.finish(RunLog(), {})
+    assert len(list(tmp_path.glob("map.before-*"))) == 100
+    assert said == ["taken into more than 100 maps: poses of those between are not kept"]
+    assert len(read_tum(tmp_path / "odom.tum").stamps_ns) == 300
+    assert read_tum(tmp_path / "map.tum").stamps_ns.tolist() == [299]
+
+
 def test_who_was_told_of_the_join_too_late_is_not_scored_with_the_others(tmp_path):
     stamps = np.arange(50) * 10**8
     T = np.tile(np.eye(4), (50, 1, 1))

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 
-from share.run.arrivals import READ_AHEAD, Played
+from share.core.events import Tick
+from share.run.arrivals import READ_AHEAD, Played, Seen
 from share.run.late import Late
 from share.types import Frame, ImuBatch
 
@@ -69,3 +71,23 @@ def test_a_stop_ends_it_while_the_reader_waits_for_room() -> None:
     arrivals.stop()
     assert list(played) == []
     assert not [t for t in threading.enumerate() if t.name == "reader"]
+
+
+class _Camera:
+    """A live camera by what its arrivals ask of it."""
+
+    image_ns, trouble, images_dropped = 7, "", 61
+
+    def arrived_ns(self, stamp_ns: int) -> int:
+        return stamp_ns
+
+
+def test_images_left_out_are_told_but_not_those_before_anybody_read_the_camera() -> None:
+    camera: Any = _Camera()
+    seen = Seen(_Recording(3).frames, camera)
+    assert seen.tick() == Tick(7, "")
+    frames = seen.each()
+    next(frames)
+    assert seen.tick().trouble == ""
+    camera.images_dropped += 1
+    assert seen.tick().trouble == "too slow for the camera: images are left out"
