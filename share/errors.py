@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+import traceback
+from pathlib import Path
 
 
 class ShareError(Exception):
@@ -43,6 +45,14 @@ class TransportError(ShareError):
 
 class StoreError(ShareError):
     """The file of a map cannot be opened, read or written."""
+
+
+def describe(error: BaseException) -> str:
+    """One line on an exception that nobody expected: its kind, its text, and where it was raised."""
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    text = "".join(c if c.isprintable() else "?" for c in str(error))[:200]
+    return f"{type(error).__name__}: {text}{where}"
 
 
 def not_installed(packages: str, extra: str) -> str:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 from share.core.afar import Afar
 from share.core.edge import Edge
-from share.core.edge_events import Answered, Event, Lost, Ready, ToTracker
+from share.core.edge_events import Answered, Event, Lost, Ready, Received, ToTracker
 from share.core.peer import Peer
 from share.core.window import Window
 from share.types import Frame
@@ -54,7 +54,7 @@ class TrackingEdge(Edge):
                 afar.is_ready = True
                 self._welcome(peer_id, peer, now_ns)
             case Answered():
-                peer.state = event.answer.state
+                peer.status.posed(event.answer.state, now_ns)
                 self._send(peer_id, event.answer)
                 self._do(afar.answered(event.answer, now_ns))
             case Lost():
@@ -66,6 +66,9 @@ class TrackingEdge(Edge):
                     self._send(peer_id, wire.Refused(f"the process that is to track it {event.how}"))
 
     def _told(self, peer_id: bytes, peer: Peer, message: wire.Message, now_ns: int) -> None:
+        if isinstance(message, wire.Status):
+            peer.status.told(message, now_ns)
+            return
         if not isinstance(message, Frame):
             peer.counts["unexpected"] += 1
             return
@@ -74,9 +77,9 @@ class TrackingEdge(Edge):
         except ValueError as error:
             self._complain(peer, str(error), now_ns)
 
-    def _objection(self, peer_id: bytes, hello: wire.Hello, now_ns: int) -> str | None:
-        known = self._peers.get(peer_id)
-        return super()._objection(peer_id, hello, now_ns) or self._full(None if known is None else known.key)
+    def _objection(self, event: Received, hello: wire.Hello, now_ns: int) -> str | None:
+        known = self._peers.get(event.peer)
+        return super()._objection(event, hello, now_ns) or self._full(None if known is None else known.key)
 
     def _full(self, key: str | None) -> str | None:
         """Why no tracker can begin for this run, or for a new one, if none can."""
@@ -90,6 +93,10 @@ class TrackingEdge(Edge):
         self._know(peer_id, peer)
         window = Window(self._config.stream.window)
         self._afar[peer.key] = Afar(peer.key, peer.hello.rig, window)
+
+    def _forget(self, peer: Peer) -> None:
+        super()._forget(peer)
+        del self._afar[peer.key]
 
     def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
         """Now, or as soon as its tracker is ready."""

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from share.core.imu_check import ImuRange
 from share.core.measurement import CAM0, IMU, LazyImage, Measurement
 from share.errors import DataError, UsageError
 from share.geometry.camera import Rig
@@ -26,6 +27,7 @@ class Source(ABC):
     rig: Rig
     notes: tuple[str, ...]
     serial: str | None = None
+    imu_range = ImuRange()  # of the widest usual sensor, where nobody says which it is
 
     @abstractmethod
     def stamps(self) -> dict[str, I64]:

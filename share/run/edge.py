@@ -55,7 +55,7 @@ from share.run.restarts import Restarts
 from share.run.tracking import Trackers, room
 
 TICK_MS = 50
-_REPORT_S = 1.0
+_REPORT_S = 0.2  # so that what is shown of agents is true within a second
 _UNWELL_S = 10.0  # how long a death is trouble
 REFUSALS_SAID = 64  # strangers at the door; more are only counted
 _AT_ONCE = 64  # messages, before anything else is looked after
@@ -118,20 +118,25 @@ class EdgeRun:
             while not self._stopping:
                 self._step()
         finally:
-            if self._mapping is not None:
-                self._mapping.close()
-            self._take_answers()
-            self._trackers.close()
-            if self._keeper is not None:
-                self._keeper.close()
-            self._link.close()
+            self.close()
             self._note()
             self._report["series"] = self._machine.series()
             self._finish(self._report)
         return self._report
 
+    def close(self) -> None:
+        """Ends the processes and threads it has started, also where it never came to `go`."""
+        self._stopping = True
+        if self._mapping is not None:
+            self._mapping.close()
+        self._take_answers()
+        self._trackers.close()
+        if self._keeper is not None:
+            self._keeper.close()
+        self._link.close()
+
     def report(self) -> dict[str, Any]:
-        """As edge.json, a second old at most, and `trouble`: what is wrong now. From any thread."""
+        """As edge.json, 0.2 s old, and `trouble`: what is wrong now. From any thread."""
         return self._report
 
     def _note(self) -> None:
@@ -140,6 +145,7 @@ class EdgeRun:
         self._report_at = now + _REPORT_S
         kept = None if self._keeper is None else self._keeper.trouble
         trouble = [text for text, until in self._trouble.items() if now < until]
+        trouble += self._machine.trouble(time.monotonic_ns())
         self._report = {
             **self._machine.report(self._mapped),
             "refused_handshakes": self._refused.total(),
@@ -188,12 +194,11 @@ class EdgeRun:
     # ------------------------------------------------------------------ the loop
 
     def _step(self) -> None:
-        message = self._link.receive(TICK_MS)
-        for _ in range(_AT_ONCE):
+        for i in range(_AT_ONCE):
+            message = self._link.receive(0 if i else TICK_MS)
             if message is None:
                 break
-            self._handle(Received(*message))
-            message = self._link.receive(0)
+            self._handle(Received(message.peer, message.frames, self._link.names(message.key)))
         for line in self._link.refusals():
             self._refuse(line)
         self._take_answers()

@@ -15,6 +15,13 @@ from share.io.images import load
 from share.io.source import Source
 from share.types import Frame
 
+_LEFT_OUT = {
+    "imu_out_of_range": "the IMU gave samples beyond {0.gyro:.3g} rad/s or {0.accel:.3g} m/s^2, or no "
+    "numbers; such are left out (sequencer.imu_out_of_range in the report)",
+    "imu_spikes": "the IMU gave single samples far from those before and after them; such are left out "
+    "(sequencer.imu_spikes in the report); look at its cable and supply",
+}
+
 
 def frames_of(
     source: Source,
@@ -22,18 +29,30 @@ def frames_of(
     counters: SequencerCounters,
     on_bad: Callable[[DataError], None] | None = None,
     spent: Callable[[float], None] = lambda cpu_s: None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> Iterator[Frame]:
     """Decoded frames in order. A damaged image raises DataError, or goes to `on_bad` and is left out.
 
     Images of another size than the calibration's always raise: all of them will be.
 
-    `spent` is told the CPU time of each frame's decoding on this thread.
+    `spent` is told the CPU time of each frame's decoding on this thread; `say`, once, that the IMU gave what
+    is no measurement.
     """
     rig = source.rig
     bundles = sequence(
-        source.measurements(), streams_of(rig), source.rate_hz, config.sequencer, counters, rig.timeshift_ns
+        source.measurements(),
+        streams_of(rig),
+        source.rate_hz,
+        config.sequencer,
+        counters,
+        rig.timeshift_ns,
+        source.imu_range,
     )
+    silent = set(_LEFT_OUT)
     for bundle in bundles:
+        for name in [name for name in silent if getattr(counters, name)]:
+            silent.remove(name)
+            say(_LEFT_OUT[name].format(source.imu_range))
         began = time.thread_time()
         try:
             frame = load(bundle)

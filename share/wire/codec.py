@@ -27,6 +27,9 @@ from share.types import (
     F64,
     I64,
     MAX_KEYPOINTS,
+    MAX_MAP_ID,
+    MAX_NAME,
+    MAX_STAMP_NS,
     AgentKind,
     Correction,
     Frame,
@@ -35,10 +38,12 @@ from share.types import (
     TrackState,
     View,
     Wait,
+    checked_id,
+    checked_stamp,
 )
 from share.wire import messages as m
 
-VERSION = 4
+VERSION = 5
 MAX_HEADER_BYTES = 4096
 MAX_ARRAYS = 8
 MAX_FRAME_BYTES = MAX_KEYPOINTS * DESCRIPTOR_BYTES  # the largest array of any message but Frame
@@ -48,7 +53,9 @@ Bytes = bytes | memoryview
 Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Ids = Annotated[tuple[Int64, ...], Meta(max_length=m.MAX_HELD)]
 Text = Annotated[str, Meta(max_length=m.MAX_TEXT)]
-Name = Annotated[str, Meta(max_length=64)]
+Reason = Annotated[str, Meta(max_length=m.MAX_REASON)]
+Name = Annotated[str, Meta(max_length=MAX_NAME)]
+MapId = Annotated[str, Meta(max_length=MAX_MAP_ID)]
 
 _DTYPES = {code: np.dtype(code) for code in ("<f8", "<f4", "<i8", "|u1")}
 
@@ -160,6 +167,11 @@ def _samples(path: str, dtype: str, *shape: int) -> _Array:
 
 
 def _frame(*, stamps_ns: I64, gyro: F64, accel: F64, **fields: Any) -> Frame:
+    checked_id("index", fields["index"])
+    for name in ("stamp_ns", "gap_ns"):
+        checked_stamp(name, fields[name])
+    if len(stamps_ns) and not -MAX_STAMP_NS <= stamps_ns.min() <= stamps_ns.max() <= MAX_STAMP_NS:
+        raise ValueError("stamps_ns: are beyond any clock")
     depth: F32 | None = fields["depth"]
     if depth is not None and not (np.isfinite(depth) & (depth >= 0)).all():
         raise ValueError("depth: has values that are negative or not finite")
@@ -248,13 +260,14 @@ _LAYOUTS: dict[type, _Layout] = {
             _samples("imu.accel", "<f8", 3),
         ),
     ),
+    m.Status: _Layout(8, m.Status, _Scalars.of(state=TrackState, pose_age_ms=float, reason=Reason)),
     m.Welcome: _Layout(16, m.Welcome, _Scalars.of(session=Int64, next_keyframe=Int64)),
     m.Refused: _Layout(17, m.Refused, _Scalars.of(reason=Text)),
     m.Ack: _Layout(18, m.Ack, _Scalars.of(next_keyframe=Int64, held=Ids)),
     Correction: _Layout(
         19,
         Correction,
-        _Scalars.of(map_id=Name, revision=Int64, about=Int64, answers=Int64),
+        _Scalars.of(map_id=MapId, revision=Int64, about=Int64, answers=Int64),
         (_pose("T_map_odom"), _Array("cov", "<f8", (6, 6))),
     ),
     m.Rate: _Layout(20, m.Rate, _Scalars.of(hz=float)),

@@ -125,7 +125,7 @@ def test_a_runs_number_is_not_shared_by_two_names() -> None:
 
 def test_what_waits_for_the_disk_is_bounded(monkeypatch) -> None:
     """An agent that does not wait for acknowledgements is not taken in beyond a bound, and loses nothing."""
-    monkeypatch.setattr("share.core.edge._MOST_UNSAFE", 5)
+    monkeypatch.setattr("share.core.peer._MAX_UNSAFE", 5)
     edge = Edge(Config(), 7, keeps=True)
     tell(edge, HELLO)
     keeps = [keep for k in range(20) for keep in of(tell(edge, keyframe(k, k - 1)), ed.Keep)]

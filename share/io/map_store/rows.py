@@ -29,7 +29,7 @@ COLUMNS = {
     "poses": ("keys", "T_map_body"),
 }
 
-_READABLE = (3, codec.VERSION)  # wire versions in which a Hello and a Keyframe are what they are now
+_READABLE = (3, 4, codec.VERSION)  # wire versions in which a Hello and a Keyframe are what they are now
 _pack = msgspec.msgpack.encode
 _frames = msgspec.msgpack.Decoder(list[bytes]).decode
 _placed = msgspec.msgpack.Decoder(list[tuple[str, int, str]]).decode
