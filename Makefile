@@ -59,7 +59,7 @@ lock: install
 	    --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" -o $(LOCKS)/$$one.txt || exit 1; done
 sbom: install $(FREEZE)/installed
 	$(PIP) -e '.[release]'
-	$(BIN)/python tools/sbom.py $(FREEZE)/python dist/share/share.cdx.json
+	$(BIN)/python tools/sbom.py $(FREEZE)/python dist/share.cdx.json
 licenses: install $(FREEZE)/installed
 	$(BIN)/python tools/licenses.py $(FREEZE)/python docs/licenses.md
 audit: install
