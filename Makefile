@@ -64,4 +64,4 @@ licenses: install $(FREEZE)/installed
 	$(BIN)/python tools/licenses.py $(FREEZE)/python docs/licenses.md
 audit: install
 	$(PIP) -e '.[release]'
-	@for one in $(LOCKS)/*.txt; do echo "$$one"; $(BIN)/pip-audit --disable-pip --require-hashes -r $$one || exit 1; done
+	@for one in $(LOCKS)/*.txt; do echo "$$one"; $(BIN)/pip-audit --strict --disable-pip --require-hashes -r $$one || exit 1; done
