@@ -59,9 +59,9 @@ lock: install
 	    --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" -o $(LOCKS)/$$one.txt || exit 1; done
 sbom: install $(FREEZE)/installed
 	$(PIP) -e '.[release]'
-	$(BIN)/python tools/sbom.py $(FREEZE)/python dist/share/share.cdx.json
+	$(BIN)/python tools/sbom.py $(FREEZE)/python dist/share.cdx.json
 licenses: install $(FREEZE)/installed
 	$(BIN)/python tools/licenses.py $(FREEZE)/python docs/licenses.md
 audit: install
 	$(PIP) -e '.[release]'
-	@for one in $(LOCKS)/*.txt; do echo "$$one"; $(BIN)/pip-audit --disable-pip --require-hashes -r $$one || exit 1; done
+	@for one in $(LOCKS)/*.txt; do echo "$$one"; $(BIN)/pip-audit --strict --disable-pip --require-hashes -r $$one || exit 1; done

@@ -26,7 +26,7 @@ import msgspec
 import zmq
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from small_session import small_profile  # noqa: E402
+from small_session import small_profile
 
 SECONDS = 6
 PER_KIND, PER_RAW = 12, 3  # messages kept of each kind, peer and direction; of raw frames
