@@ -1,9 +1,9 @@
-"""Which agents agree with each other on scale, calibration and how sure they are, and which must not move others.
+"""Which agents agree on scale, calibration and how sure they are, and which must not move others.
 
 Every two agents are compared by the loops between them (`share.merge.consistency`). What differs both
-significantly and by more than does no harm is a disagreement. Of several agents the one that disagrees with most is
-set apart, as in pairwise consistency (Mangelson et al., ICRA 2018), with agents for loops; of two, nobody can say
-which is wrong, and they keep a map each.
+significantly and by more than does no harm is a disagreement. Of several agents the one that disagrees with
+most is set apart, as in pairwise consistency (Mangelson et al., ICRA 2018), with agents for loops; of two,
+nobody can say which is wrong, and they keep a map each.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from share.types import F64
 _MOST = 32  # loops kept of two stretches
 _SIGMAS = 4.5  # that a difference must have: of thousands of comparisons none by chance
 _TURN, _TILT = np.radians(1.5), np.radians(1.0)  # rad, less does no harm
-_NIS = 4.0  # beyond what honest agents are too sure
+_NIS = 3.0  # beyond what honest agents are too sure
 _ENOUGH_POINTS, _ENOUGH_PATH = 3, 8  # loops before a comparison by points, or by ways, says anything
 _INSIDE = 0.6  # of the loops must fit, or they are of more than one place
 _CALM = 0.6  # a disagreement ends below this part of what began it
@@ -30,8 +30,8 @@ _CALM = 0.6  # a disagreement ends below this part of what began it
 
 @dataclass(frozen=True)
 class Standing:
-    """Of an agent, for people. state: `agrees`, `set apart`, `disputed` or `unknown`. log_scale, sigma: against
-    the others; nis: see `share.merge.consistency`; None where not known."""
+    """Of an agent, for people. state: `agrees`, `set apart`, `disputed` or `unknown`. log_scale, sigma: of
+    its depths against the others'; nis: see `share.merge.consistency`; None where not known."""
 
     state: str = "unknown"
     reason: str = ""
@@ -42,8 +42,7 @@ class Standing:
 
 @dataclass(eq=False)
 class _Pair:
-    """Of two agents, the lesser first. loops: by stretches. severity: 1 or more is a disagreement. news: loops
-    since it was compared."""
+    """Of two agents, the lesser first. loops: by stretches. news: loops since it was compared."""
 
     loops: dict[tuple[int, int], list[Witness]] = field(default_factory=dict)
     points: Estimate | None = None
@@ -58,8 +57,8 @@ Names = tuple[str, str]
 
 
 class Agreement:
-    """Of all agents. tolerance: log scale that does no harm. apart: agents that must not move others. disputed:
-    pairs of which nobody can say who is wrong."""
+    """Of all agents. tolerance: log scale that does no harm. apart: agents that must not move others.
+    disputed: pairs of which nobody can say who is wrong."""
 
     def __init__(self, tolerance: float) -> None:
         self.apart: frozenset[str] = frozenset()
@@ -171,8 +170,8 @@ class Agreement:
         apart = set[str]()
         while left:
             against = Counter(name for names in left for name in names)
-            worst = max((count, -friends[name]) for name, count in against.items())
-            who = [name for name, count in against.items() if (count, -friends[name]) == worst]
+            rank = {name: (count, -friends[name]) for name, count in against.items()}
+            who = [name for name in rank if rank[name] == max(rank.values())]
             if len(who) > 1:
                 break
             apart.add(who[0])
@@ -208,7 +207,7 @@ def tilt_between(
     there = edge.T_a_b[:3, :3] @ up_b
     cross = np.linalg.norm(np.cross(up_a, there)) / np.linalg.norm(up_a) / np.linalg.norm(up_b)
     sigma = np.sqrt(sigma_a**2 + sigma_b**2 + np.trace(edge.cov[:3, :3]) / 3)
-    return float(np.arcsin(min(1.0, cross))), float(sigma)
+    return float(np.arcsin(min(1.0, float(cross)))), float(sigma)
 
 
 def _by_gravity(loops: list[Witness]) -> list[tuple[float, str, str]]:
@@ -234,10 +233,10 @@ def _told(found: Estimate, harmless: float, text: str, words: Names) -> tuple[fl
 
 def _reason(agent: str, bad: list[tuple[Names, _Pair]]) -> str:
     """From the pairs in which it disagrees."""
-    said = [
-        f"against {names[0] if agent == names[1] else names[1]} {pair.what if agent == names[1] else pair.turned}"
-        for names, pair in bad
-    ]
+    said = []
+    for (first, second), pair in bad:
+        other, what = (first, pair.what) if agent == second else (second, pair.turned)
+        said.append(f"against {other} {what}")
     return "; ".join(said) + ": check its calibration"
 
 

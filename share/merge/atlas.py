@@ -60,8 +60,8 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Parted:
-    """Agents whose standing with the others has changed, and how it is now; dropped: loops that are taken back
-    because of it."""
+    """Agents whose standing with the others has changed, and how it is now; dropped: loops that are taken
+    back because of it."""
 
     standing: dict[str, Standing] = field(default_factory=dict)
     dropped: tuple[Loop, ...] = ()

@@ -1,16 +1,17 @@
 """Whether two agents' odometries and depths are of one world, by the loops between them.
 
-Every loop i between keyframes a of one stretch and b of another measures where the other odometry lies in the
-one: Z = T_a T_a_b T_b^-1, as T_a, T_b are known since the starts of their stretches. If both tell the truth all
-Z are one pose G, but for noise: of the loop, and of either odometry's random walk, which loops have in common
-as far as both have walked. In left perturbations, xi = log(Z G^-1), that walk simply adds up:
+Every loop i between keyframes a of one stretch and b of another measures where the other odometry lies in
+the one: Z = T_a T_a_b T_b^-1, as T_a, T_b are known since the starts of their stretches. If both tell the
+truth all Z are one pose G, but for noise: of the loop, and of either odometry's random walk, which loops have
+in common as far as both have walked. In left perturbations, xi = log(Z G^-1), that walk simply adds up:
 
     cov(xi_i, xi_j) = P_a(min) + Ad_G P_b(min) Ad_G' + [i = j] Ad_(G T_b) S_i Ad_(G T_b)',   P(k) = sum to k
 
 What agents may be wrong about are further unknowns of these equations: a path that is longer by e^l than the
 other's moves xi by -l times where the loop is, a camera that is turned on its body by phi turns it by
 Ad_(G T_b) (phi, 0). Generalised least squares gives each with its sigma; loops are under a Cauchy kernel, for
-some are false. What is left over, per degree of freedom, says by how much the covariances are too sure.
+some are false. The noise that is left for a loop, per degree of freedom, in the median, says whether the
+covariances are too sure.
 Source: Barfoot, *State Estimation for Robotics* (2017), chapters 5 and 8.
 """
 
@@ -29,6 +30,7 @@ _SURER = 2.0  # honest agents' sigmas of odometry are up to this much too small,
 _LOOP_SURER = 1.3  # those of loops this much
 _CAUCHY = 12.0  # squared width of the kernel, of 6 dof
 _ROUNDS = 6
+_MEDIAN = 5.35  # of chi-square with 6 dof
 _PRIOR = np.array([0.2, 0.1, 0.1, 0.1])  # log scale, rad: only so that two loops have a solution
 _SCALE_FLOOR = 0.004  # of the log scale of one loop's points, beside what it says: occlusions, pixels
 _ALIKE = 0.003  # of honest agents' log scales: no two are calibrated better
@@ -85,7 +87,7 @@ class Estimate:
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Of b with a. points: log scale of b's depths; path: log of how much longer its way is. turn: of its
-    camera on its body, rad. nis: residual per degree of freedom beyond all this, 1 if covariances are right.
+    camera on its body, rad. nis: of the loops' noise beyond all this, 1 if covariances are right.
     inside: share of the loops that fit."""
 
     path: Estimate
@@ -162,10 +164,10 @@ def _solved(xi: F64, J: F64, walk: F64, own: F64) -> Comparison:
         noise = (own @ told[:, :, None])[:, :, 0] / weight[:, None]
         chi2 = np.einsum("ni,nij,nj->n", noise, information, noise)
         weight = 1 / (1 + chi2 / _CAUCHY)
-    nis = float(left @ inverse @ left) / max(1, 6 * n - 10)
+    nis = float(np.median(chi2)) / _MEDIAN
     cov = np.linalg.inv(normal) * max(1.0, nis)
     turn = theta[7:]
-    chi = float(np.sqrt(max(1e-12, turn @ np.linalg.solve(cov[7:, 7:], turn))))
+    chi = max(1e-6, float(turn @ np.linalg.solve(cov[7:, 7:], turn))) ** 0.5
     size = float(np.linalg.norm(turn))
     return Comparison(
         Estimate(float(theta[6]), float(np.sqrt(cov[6, 6])), n),

@@ -66,7 +66,7 @@ def _linear(
     J = np.concatenate([by_pose(moved), (K[:, 2] * y[2])[None]]).transpose(2, 1, 0)
     covariance = np.einsum("ikn,k,jkn->nij", K, noise_q.variances, K) + np.diag(noise_c.variances)
     residual = (target - moved).T
-    seen = np.isfinite(moved).all(0)
+    seen = np.isfinite(moved.sum(0))
     J, residual = np.where(seen[:, None, None], J, 0.0), np.where(seen[:, None], residual, 0.0)
     information = np.zeros_like(covariance)
     information[seen] = np.linalg.inv(covariance[seen])

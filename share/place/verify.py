@@ -96,8 +96,8 @@ def verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int = 0) -
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """What a rough pose becomes: T_c_q of the cameras, its covariance, the matches beside it (M, 3), (M, 3), and
-    those of them, y_q, y_c (N, 3), that are inliers."""
+    """What a rough pose becomes: T_c_q of the cameras, its covariance, the matches beside it (M, 3), (M, 3),
+    and those of them, y_q, y_c (N, 3), that are inliers."""
 
     T: F64
     cov: F64
