@@ -3,7 +3,7 @@ PYTHON ?= $(shell python3.11 -c "" 2>/dev/null && echo python3.11 || echo python
 BIN := .venv/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
-.PHONY: install demo test lint type bench slow train-test freeze vio-figures
+.PHONY: install demo test lint type bench slow torture soak train-test freeze lock sbom licenses audit vio-figures
 
 install: .venv/installed
 .venv/installed: setup.cfg pyproject.toml
@@ -17,10 +17,14 @@ demo: install
 test: install
 	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile --ignore tests/run
 	$(BIN)/pytest tests/run  # real processes in real time: with the cores to themselves
-SLOW_ALONE := tests/run tests/frozen tests/booted tests/tutorial  # in real time, or with their own processes
+SLOW_ALONE := tests/run tests/frozen tests/booted tests/tutorial tests/torture  # in real time, or with their own processes
 slow: install
 	$(BIN)/pytest -m slow -n auto --maxprocesses 4 --dist loadfile $(SLOW_ALONE:%=--ignore %)
 	$(BIN)/pytest -m slow $(SLOW_ALONE)
+torture: install  # an hour or more, in real time; results as JSON in share-torture
+	TORTURE_OUT=$(or $(OUT),share-torture) $(BIN)/pytest -s -m torture tests/torture
+soak: install  # HOURS=2.5 make soak: shorter; 20 min of warm-up come before
+	$(BIN)/python tests/torture/soak.py --hours $(or $(HOURS),8) --out $(or $(OUT),share-soak)
 train-test: install  # brings torch
 	$(PIP) -e '.[train]'
 	$(BIN)/pytest tests/train -m "slow or not slow"
@@ -32,7 +36,32 @@ bench: install
 	$(BIN)/python tools/bench.py
 vio-figures: install
 	$(BIN)/python tools/measure_vio.py
-freeze: install
-	$(PIP) -e '.[freeze]'
-	@$(PIP) -e '.[realsense]' || echo "make: no pyrealsense2 for this machine: the program will not capture"
-	$(BIN)/pyinstaller --noconfirm --log-level ERROR tools/share.spec
+# The frozen program is built in an environment of its own, of exactly what the lock file says.
+LOCKS := tools/locks
+LOCK := $(LOCKS)/$(shell $(PYTHON) -c "import platform, sys; print('%s-py%d.%d' % (platform.machine(), *sys.version_info[:2]))").txt
+FREEZE := build/freeze-env/bin
+freeze: $(FREEZE)/installed
+	$(FREEZE)/pyinstaller --noconfirm --log-level ERROR tools/share.spec
+$(FREEZE)/installed: $(LOCK) setup.cfg pyproject.toml
+	rm -rf build/freeze-env
+	$(PYTHON) -m venv build/freeze-env
+	$(FREEZE)/pip install --quiet --disable-pip-version-check --require-hashes --only-binary :all: -r $(LOCK)
+	$(FREEZE)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	touch $@
+$(LOCKS)/%.txt:
+	@echo "make: there is no $@; there are $(wildcard $(LOCKS)/*.txt): use one of those machines and Pythons, or add this one to LOCKED in the Makefile and run make lock" >&2; exit 1
+
+LOCKED := x86_64-py3.11 x86_64-py3.12 aarch64-py3.12
+lock: install
+	$(PIP) -e '.[release]'
+	@for one in $(LOCKED); do echo "$(LOCKS)/$$one.txt"; $(BIN)/uv pip compile --quiet --upgrade setup.cfg --extra freeze --extra realsense \
+	    --python-version $${one#*-py} --python-platform $${one%-py*}-manylinux_2_28 --only-binary :all: --generate-hashes \
+	    --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" -o $(LOCKS)/$$one.txt || exit 1; done
+sbom: install $(FREEZE)/installed
+	$(PIP) -e '.[release]'
+	$(BIN)/python tools/sbom.py $(FREEZE)/python dist/share/share.cdx.json
+licenses: install $(FREEZE)/installed
+	$(BIN)/python tools/licenses.py $(FREEZE)/python docs/licenses.md
+audit: install
+	$(PIP) -e '.[release]'
+	@for one in $(LOCKS)/*.txt; do echo "$$one"; $(BIN)/pip-audit --disable-pip --require-hashes -r $$one || exit 1; done

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+import traceback
+from pathlib import Path
 
 
 class ShareError(Exception):
@@ -37,6 +39,14 @@ class WireError(ShareError):
     """Bytes from a peer that are not a valid message. Counted by the receiver, never fatal."""
 
 
+class VersionError(WireError):
+    """A message of another version of the wire. code: of its kind, None where that cannot be read."""
+
+    def __init__(self, version: int, code: int | None, own: int) -> None:
+        super().__init__(f"header: peer speaks wire {version}, this SHARE wire {own}: upgrade the older one")
+        self.version, self.code = version, code
+
+
 class TransportError(ShareError):
     """A socket cannot be opened or used (port in use, address not local)."""
 
@@ -45,9 +55,26 @@ class StoreError(ShareError):
     """The file of a map cannot be opened, read or written."""
 
 
+def describe(error: BaseException) -> str:
+    """One line on an exception that nobody expected: its kind, its text, and where it was raised."""
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    text = "".join(c if c.isprintable() else "?" for c in str(error))[:200]
+    return f"{type(error).__name__}: {text}{where}"
+
+
 def not_installed(packages: str, extra: str) -> str:
     """Who wants `packages` is told how to get them: with an extra of SHARE, and not in a frozen program."""
     how = f"pip install 'share-slam[{extra}]', in a checkout .venv/bin/pip install -e '.[{extra}]'"
     if getattr(sys, "frozen", False):
         return f"this frozen program has no {packages}; use a computer with Python: {how}"
     return f"{packages} is not installed: {how}"
+
+
+def one_line(text: str) -> str:
+    """A message that quotes somebody's file: without control characters, of a bearable length."""
+    clean = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return clean if len(clean) <= _LONGEST else f"{clean[: _LONGEST // 2]} … {clean[-_LONGEST // 2 :]}"
+
+
+_LONGEST = 1500  # characters

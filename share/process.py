@@ -9,6 +9,8 @@ from __future__ import annotations
 import os
 import sys
 
+from share import children
+
 _THREADS = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -21,7 +23,9 @@ _KEEP_BYTES = 512 * 1024 * 1024
 
 
 def prepare() -> None:
-    """Thread counts and malloc thresholds. What the user set in the environment stays."""
+    """Ends with the SHARE process that started it, if one did; thread counts and malloc thresholds. What the
+    user set in the environment stays."""
+    children.follow_starter()
     for name in _THREADS:
         os.environ.setdefault(name, "1")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")

@@ -62,27 +62,16 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
 
 
 def load_yaml(text: str, where: str) -> Any:
-    """As yaml.safe_load, which of a key that stands there twice takes the last. Raises ConfigError."""
+    """As yaml.safe_load, but it refuses a key that stands there twice and what would take more time or
+    memory than a file of settings needs. Raises ConfigError."""
     import yaml
 
-    class Loader(yaml.SafeLoader):
-        def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-            seen = set()
-            for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
-                if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE:
-                    if (key.tag, key.value) in seen:
-                        twice = f"key '{key.value}' for the second time"
-                        raise yaml.MarkedYAMLError(problem=twice, problem_mark=key.start_mark)
-                    seen.add((key.tag, key.value))
-            return super().construct_mapping(node, deep)
+    from share.plain_yaml import PlainLoader
 
     try:
-        return yaml.load(text, Loader)
+        return yaml.load(text, PlainLoader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark else ""
         reason = getattr(error, "problem", None) or str(error).splitlines()[0]
         raise ConfigError(f"{where}{line}: not valid YAML: {reason}") from None
-
-
-_MERGE = "tag:yaml.org,2002:merge"  # of `<<`

@@ -21,7 +21,17 @@ U8 = NDArray[np.uint8]
 I64 = NDArray[np.int64]
 
 DESCRIPTOR_BYTES = 32  # ORB: 256 bits
-MAX_KEYPOINTS = 2000  # per keyframe; bounds what a peer can make us allocate
+
+# Limits of value. Whatever exceeds them is refused where the value is made, so that nothing computed from it
+# overflows: not a room, not a sensor, not a run of any length gets near them.
+MAX_KEYPOINTS = 2000  # per keyframe
+MAX_NAME = 64  # characters, of an agent's name
+MAX_MAP_ID = MAX_NAME + 32  # characters: a run's key has at most 17 more than its name, a segment's number 11
+MAX_M = 1e5  # m, of a position or a landmark
+MAX_UV = 1e3  # of normalised image coordinates: 89.9 degrees off the axis
+MAX_ID = 2**31 - 1  # of keyframes, frames and revisions: 13 years at 5 Hz
+MAX_SIGMA = 1e6  # of anything, in its unit
+MAX_STAMP_NS = 2**62  # either way of 0: 146 years; differences fit 64 bits
 
 
 class AgentKind(StrEnum):
@@ -95,11 +105,38 @@ def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
 
 
 def checked_pose(name: str, value: ArrayLike) -> F64:
-    """`value` as a read-only rigid transform (4, 4). Raises ValueError if it is not one (1e-3)."""
+    """`value` as a read-only rigid transform (4, 4). Raises ValueError if it is not one (1e-3), or if its
+    translation exceeds MAX_M."""
     T = checked(name, value, (4, 4), np.float64)
-    if not _is_rigid(*T.tolist()):
+    rows = T.tolist()
+    if not _is_rigid(*rows):
         raise ValueError(f"{name}: is not a rigid transform")
+    if not max(abs(row[3]) for row in rows) <= MAX_M:
+        raise ValueError(f"{name}: is more than {MAX_M:g} m away")
     return T
+
+
+def checked_id(name: str, value: int, least: int = 0) -> int:
+    """`value`, from `least` to MAX_ID. Raises ValueError."""
+    if not least <= value <= MAX_ID:
+        raise ValueError(f"{name}: {value} is outside {least} .. {MAX_ID}")
+    return value
+
+
+def checked_stamp(name: str, value: int) -> int:
+    """`value` in ns, at most MAX_STAMP_NS either way. Raises ValueError."""
+    if abs(value) > MAX_STAMP_NS:
+        raise ValueError(f"{name}: {value} ns is beyond any clock")
+    return value
+
+
+def checked_up(name: str, value: ArrayLike) -> F64:
+    """`value` as a read-only unit vector (3,), or zeros where it is unknown. Raises ValueError (1e-3)."""
+    up = checked(name, value, (3,), np.float64)
+    x, y, z = up.tolist()
+    if any(up) and not abs(x * x + y * y + z * z - 1) <= 1e-3:
+        raise ValueError(f"{name}: is no unit vector")
+    return up
 
 
 def _is_rigid(x: list[float], y: list[float], z: list[float], last: list[float]) -> bool:
@@ -132,9 +169,9 @@ def checked_cov(name: str, value: ArrayLike) -> F64:
 
 
 def checked_sigma(name: str, value: float) -> float:
-    """`value` as a float. Raises ValueError if it is negative or not finite."""
+    """`value` as a float. Raises ValueError if it is negative or exceeds MAX_SIGMA."""
     sigma = float(value)
-    if not 0 <= sigma < np.inf:
+    if not 0 <= sigma <= MAX_SIGMA:
         raise ValueError(f"{name}: {sigma} is no standard deviation")
     return sigma
 
@@ -246,8 +283,10 @@ class View:
             points=checked("points", self.points, (n, 3), np.float32, finite=False),
             descriptors=checked("descriptors", self.descriptors, (n, DESCRIPTOR_BYTES), np.uint8),
         )
-        if np.isinf(self.points).any():
-            raise ValueError("points: has infinite values (unknown depth is NaN)")
+        if (np.abs(self.uv) > MAX_UV).any():
+            raise ValueError(f"uv: exceeds {MAX_UV:g}")
+        if (np.abs(self.points) > MAX_M).any():  # NaN does not
+            raise ValueError(f"points: are more than {MAX_M:g} m away (unknown depth is NaN)")
 
     def __len__(self) -> int:
         return len(self.uv)
@@ -278,7 +317,7 @@ class Candidate:
             T_odom_body=checked_pose("T_odom_body", self.T_odom_body),
             T_last_body=checked_pose("T_last_body", self.T_last_body),
             cov=checked_cov("cov", self.cov),
-            up=checked("up", self.up, (3,), np.float64),
+            up=checked_up("up", self.up),
             up_sigma=checked_sigma("up_sigma", self.up_sigma),
         )
 
@@ -308,6 +347,8 @@ class Keyframe:
     follows: int = -1
 
     def __post_init__(self) -> None:
+        checked_id("id", self.id)
+        checked_stamp("stamp_ns", self.stamp_ns)
         if not -1 <= self.reference < self.id:
             raise ValueError(f"reference: {self.reference} must lie in -1 .. {self.id - 1}")
         _set(self, follows=max(self.reference, self.follows))
@@ -318,7 +359,7 @@ class Keyframe:
             T_ref_body=checked_pose("T_ref_body", self.T_ref_body),
             cov=checked_cov("cov", self.cov),
             T_odom_body=checked_pose("T_odom_body", self.T_odom_body),
-            up=checked("up", self.up, (3,), np.float64),
+            up=checked_up("up", self.up),
             up_sigma=checked_sigma("up_sigma", self.up_sigma),
         )
 
@@ -340,6 +381,11 @@ class Correction:
     answers: int = -1
 
     def __post_init__(self) -> None:
+        if not (0 < len(self.map_id) <= MAX_MAP_ID and self.map_id.isprintable()):
+            raise ValueError(f"map_id: 1 to {MAX_MAP_ID} printable characters")
+        checked_id("revision", self.revision)
+        checked_id("about", self.about)
+        checked_id("answers", self.answers, least=-1)
         _set(
             self,
             T_map_odom=checked_pose("T_map_odom", self.T_map_odom),

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from share.emulate.world.build import build  # noqa: E402
 from share.emulate.world.files import load_room, save_room  # noqa: E402
 from share.emulate.world.scenes import SCENES, layout  # noqa: E402
 from share.geometry.camera import Camera  # noqa: E402
+from share.spawning import SPAWN  # noqa: E402
 
 D435I = Camera(640, 480, 383.2, 384.1, 318.7, 242.3)
 EUROC = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019359, 1.76e-05))
@@ -95,9 +95,8 @@ def cpu_ms(renderer: GlRenderer, room: Room, job: str, images: int) -> float:
 
 def per_second(room: Room, processes: int, images: int) -> float:
     """Images without depth, of all processes together, each on its own."""
-    spawn = get_context("spawn")
-    barrier, done = spawn.Barrier(processes + 1), spawn.Queue()
-    workers = [spawn.Process(target=draw, args=(room, images, barrier, done)) for _ in range(processes)]
+    barrier, done = SPAWN.Barrier(processes + 1), SPAWN.Queue()
+    workers = [SPAWN.Process(target=draw, args=(room, images, barrier, done)) for _ in range(processes)]
     for worker in workers:
         worker.start()
     barrier.wait()

@@ -60,7 +60,7 @@ def keys(folder: Path) -> tuple[EdgeKeys, AgentKeys]:
 def echo(edge: EdgeLink, stop: threading.Event) -> None:
     while not stop.is_set():
         if heard := edge.receive(100):
-            edge.send(*heard)
+            edge.send(heard.peer, heard.frames)
 
 
 def round_trip(agent: AgentLink, frames: list[Bytes]) -> None:

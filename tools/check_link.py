@@ -123,7 +123,7 @@ def listen(edge: EdgeLink, out: Delays, over: threading.Event) -> None:
     """Delays, ms, by size."""
     while not over.is_set():
         if (message := edge.receive(20)) is not None:
-            (frame,) = message[1]
+            (frame,) = message.frames
             out[len(frame)].append((time.monotonic_ns() - int.from_bytes(frame[:8], "big")) / 1e6)
 
 

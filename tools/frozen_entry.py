@@ -4,6 +4,6 @@ from multiprocessing import freeze_support
 
 freeze_support()  # a spawned worker does its work in here and goes no further
 
-from share.cli.main import main  # noqa: E402
+from share.__main__ import run  # noqa: E402
 
-main()
+run()

@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import children, process
 
 process.prepare()
 
@@ -89,6 +89,7 @@ def carry(agents: int, seconds: float, config: Path | None) -> Row:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
+            env=children.environment(),
         ) as generator:
             used = _watch(generator, front, status)
             told, _ = generator.communicate("\n")
@@ -107,7 +108,9 @@ def edge(folder: Path, config: Path | None) -> Iterator[tuple[subprocess.Popen[s
     command = [sys.executable, "-m", "share", "edge", "--bind", "tcp://127.0.0.1:0", "--http", "0"]
     command += ["--map", folder / "map.sqlite", "--out", folder / "out"]
     command += [] if config is None else ["--config", config]
-    front = subprocess.Popen([str(word) for word in command], stderr=subprocess.PIPE, text=True)
+    front = subprocess.Popen(
+        [str(word) for word in command], stderr=subprocess.PIPE, text=True, env=children.environment()
+    )
     try:
         assert front.stderr is not None
         found: dict[str, str] = {}

@@ -17,7 +17,6 @@ import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 
 from share import process
@@ -33,6 +32,7 @@ from tool_main import exit_code, line  # noqa: E402
 
 from share.emulate.recipe import Recipe  # noqa: E402
 from share.errors import UsageError  # noqa: E402
+from share.spawning import SPAWN  # noqa: E402
 
 KINDS = ("ar", "ar", "robot")
 APART_M = 1000.0  # of rooms
@@ -67,7 +67,7 @@ def simulate(options: argparse.Namespace) -> None:
     ]
     print("\n".join(line(cells) for cells in (HEAD, ["---"] * len(HEAD))), flush=True)
     rows: list[Row] = []
-    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(options.workers, SPAWN) as pool:
         played = pool.map(_played, jobs)
         for size in sizes:
             runs = [next(played) for _ in seeds]

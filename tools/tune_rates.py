@@ -22,7 +22,6 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +38,7 @@ from tool_main import exit_code, line  # noqa: E402
 
 from share.emulate.recipe import Recipe  # noqa: E402
 from share.errors import UsageError  # noqa: E402
+from share.spawning import SPAWN  # noqa: E402
 
 FIGURES = ("AR latency", "robot latency", "AR error", "robot error", "merges")
 USUAL = {"ar": "walk:", "robot": "robot:"}
@@ -76,7 +76,7 @@ def tune(options: argparse.Namespace) -> None:
         ("edge.policy=" + json.dumps(options.policy), *_settings(names, point)) for point in points
     ]
     jobs = [(room, settings, options.link) for room in rooms for settings in sets]  # a room stays in memory
-    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(options.workers, SPAWN) as pool:
         rows = list(pool.map(_play, jobs, chunksize=len(sets)))
     runs = dict(zip(jobs, rows, strict=True))
     head = (*names, *FIGURES, "AR QoE", "least QoE")

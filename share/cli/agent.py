@@ -115,8 +115,11 @@ def agent(
     with on_stop(run.stop):
         run.go()
     line.end()
+    options.say_losses(opened)
     click.echo(json.dumps(run.report) if as_json else _summary(run))
     if not run.report["protocol"]["edge_sessions"]:
+        if (refusal := run.report["protocol"]["refusal"]) is not None:
+            raise ShareError(f"the edge at {address} refuses '{hello.name}': {refusal}")
         raise ShareError(f"no edge ever answered at {address}; {run.trouble or _NOBODY}")
 
 
@@ -201,7 +204,7 @@ class _LiveLine(LiveLine):
         self._feed, self._total = getattr(source, "feed", None), source.images_count
 
     def show(self, status: Status) -> None:
-        if not self.seen or (status.frames % 5 and status.frames != self._total):
+        if not self.seen or (status.frames % 5 and status.frames != self._total and not status.idle):
             return
         r = status.report()
         rtt = "  –  " if r["rtt_ms"] is None else f"{r['rtt_ms']:.1f} ms"
@@ -230,6 +233,8 @@ def _summary(run: AgentRun) -> str:
         lines += [f"{keyframes}, {traffic}"]
     if r["drop_late"]:
         lines.append(f"{r['drop_late']} more frames came too late and were left out")
+    if r["frames_late"]:
+        lines.append(f"{r['frames_late']} poses were late, by up to {r['latest_s']:.1f} s")
     if p95 is not None:
         lines.append(f"pose after {r['track_ms']['p50']:.1f} ms (95 %: {p95:.1f} ms)")
     if r["clock"]["uncertainty_ms"] is not None:

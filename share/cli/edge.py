@@ -71,15 +71,23 @@ def edge(
         raise UsageError("--map: there is none by policy streamed; leave it out, or take another policy")
     most = MAX_IMAGE_BYTES if raw else MAX_FRAME_BYTES
     folder = None if out is None else Path(out)
+    runs: list[EdgeRun] = []
     with ExitStack() as stack:
         link = stack.enter_context(closing(bind_link(bind, with_keys, most)))
+        status = None
+        if http is not None:  # before any process is started: the port may be in use
+            status = stack.enter_context(
+                closing(StatusServer(http, lambda: runs[0].report() if runs else {}))
+            )
         store = None if map_file is None else stack.enter_context(_open_map(Path(map_file)))
-        run = EdgeRun(settings, link, folder, lambda e: _tell(e, verbose), store)
+        run = stack.enter_context(
+            closing(EdgeRun(settings, link, folder, lambda e: _tell(e, verbose), store))
+        )
+        runs.append(run)
         with on_stop(run.stop):
             click.echo(f"listening on {link.endpoint}, policy {settings.edge.policy}", err=True)
             _say_keys(with_keys)
-            if http is not None:
-                status = stack.enter_context(closing(StatusServer(http, run.report)))
+            if status is not None:
                 click.echo(f"status at http://{status.endpoint}/", err=True)
             report = run.go()
     click.echo(json.dumps(report) if as_json else _summary(report))
@@ -116,7 +124,15 @@ def _say_keys(keys: EdgeKeys | None) -> None:
 
 
 _NEWS = {"joined the edge", "left", "back", "silent", "refused"}
-_NEWS |= {"not let in", "maps joined", "merge undone", "job failed", "not written", "mapper lost"}
+_NEWS |= {
+    "not let in",
+    "maps joined",
+    "merge undone",
+    "job failed",
+    "not written",
+    "mapper lost",
+    "solver lost",
+}
 _NEWS |= {"odometry doubted", "map", "tracking lost"}
 
 

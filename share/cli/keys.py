@@ -48,18 +48,27 @@ def generate(name: str | None, keys: str | None) -> None:
 @keys.command(short_help="Let an agent in.")
 @click.argument("name")
 @click.argument("public_key", metavar="KEY|FILE")
+@click.option(
+    "--agent",
+    "agents",
+    multiple=True,
+    metavar="AGENT",
+    help="An agent that may run there, where that is not called NAME; may be given several times.",
+)
 @options.keys
-def authorize(name: str, public_key: str, keys: str | None) -> None:
+def authorize(name: str, public_key: str, agents: tuple[str, ...], keys: str | None) -> None:
     """Let an agent in, by the public key of its machine: the text in single quotes, or NAME.public.
 
-    An edge that is running lets it in at its next attempt, within about a second.
+    NAME is the machine's. Its key speaks for the agent of that name, or for those given with --agent, and
+    for no other. An edge that is running lets it in at its next attempt, within about a second.
 
     \b
     Example:  share keys authorize ann ann.public
+              share keys authorize headset1 headset1.public --agent ann
     """
     from share.io import keys as store
 
-    store.authorize(_folder(keys), name, store.public_key(public_key))
+    store.authorize(_folder(keys), name, store.public_key(public_key), agents)
 
 
 @keys.command(short_help="Let an agent in no more.")
@@ -89,15 +98,16 @@ def show(keys: str | None, as_json: bool) -> None:
 
     folder = _folder(keys)
     found = edge_keys(folder)
-    names = sorted((name, key) for key, name in found.allowed.names().items())
+    grants = sorted((grant.name, key, grant.agents) for key, grant in found.allowed.grants().items())
     own: dict[str, Any] = {"name": found.own.name, "public_key": found.own.public}
     if as_json:
-        listed = [{"name": name, "public_key": key} for name, key in names]
+        listed = [{"name": name, "public_key": key, "agents": agents} for name, key, agents in grants]
         click.echo(json.dumps({"folder": str(folder), "own": own, "authorized": listed}))
         return
     click.echo(f"{found.own.public}  {found.own.name} (this machine)")
-    for name, key in names:
-        click.echo(f"{key}  {name}")
+    for name, key, agents in grants:
+        others = "" if agents == (name,) else f", for {', '.join(agents)}"
+        click.echo(f"{key}  {name}{others}")
 
 
 def _folder(given: str | None) -> Path:

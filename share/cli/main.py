@@ -9,14 +9,14 @@ process.prepare()  # before anything below can import numpy
 import contextlib  # noqa: E402
 import difflib  # noqa: E402
 import importlib  # noqa: E402
-import signal  # noqa: E402
 import sys  # noqa: E402
 from typing import Any  # noqa: E402
 
 import click  # noqa: E402
 
 from share import __version__  # noqa: E402
-from share.errors import ShareError, UsageError  # noqa: E402
+from share.cli.unwinding import unwinding  # noqa: E402
+from share.errors import ShareError, UsageError, one_line  # noqa: E402
 
 # name: (module, attribute, one line of help). Literal, so that a freezer sees every module.
 COMMANDS = {
@@ -61,13 +61,11 @@ class _Lazy(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
-        try:  # so SIGTERM unwinds too: children are ended, temporary files removed
-            return super().invoke(ctx)
+        try:
+            with unwinding():
+                return super().invoke(ctx)
         except KeyboardInterrupt:  # click would put an empty line before ours
             raise _InterruptedError("interrupted") from None
-        finally:
-            signal.signal(signal.SIGTERM, before)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
@@ -124,7 +122,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _fail(text: str, code: int) -> None:
     with contextlib.suppress(OSError):  # its terminal may be gone
-        click.echo(f"share: {text}", err=True)
+        click.echo(f"share: {one_line(text)}", err=True)
     sys.exit(code)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from share.errors import UsageError
+from share.errors import UsageError, one_line
 
 if TYPE_CHECKING:
     from share.config import Config
@@ -82,11 +82,12 @@ frames = click.option(
 def load_config(path: str | None) -> Config:
     """The settings of a YAML file, or the defaults. Raises ConfigError or UsageError."""
     from share import config as settings
+    from share.io.regular_file import SETTINGS, read_text
 
     if path is None:
         return settings.Config()
     try:
-        text = Path(path).read_text()
+        text = read_text(Path(path), SETTINGS)
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise UsageError(f"{path}: cannot read the configuration: {reason}") from None
@@ -95,8 +96,10 @@ def load_config(path: str | None) -> Config:
 
 def agent_name(value: str) -> str:
     """A name that can be a file's. Raises UsageError."""
-    if not re.fullmatch(r"[\w.-]{1,64}", value) or value.startswith("."):
-        raise UsageError(f"--name '{value}': use 1 to 64 letters, digits, '_', '-' or '.'")
+    from share.io.session import AGENT_NAME, is_agent_name
+
+    if not is_agent_name(value):
+        raise UsageError(f"--name '{value}': use {AGENT_NAME}")
     return value
 
 
@@ -115,6 +118,12 @@ def say_notes(source: Source) -> None:
     """What a person should know of a recording, such as streams that are not used: a line each on stderr."""
     for note in source.notes:
         click.echo(f"share: {source.name}: {note}", err=True)
+
+
+def say_losses(source: Source) -> None:
+    """What of a recording could not be read: a line a kind on stderr."""
+    for line in source.losses.lines():
+        click.echo(f"share: {source.name}: {one_line(line)}", err=True)
 
 
 def say_another(name: str, said: Calibration | None, serial: str | None) -> None:

@@ -65,6 +65,7 @@ def track(
     wanted = _targets(named, source)
     truth = opened.truth()  # if it is damaged, better now than after tracking
     run = _tracked(opened, settings, line)
+    options.say_losses(opened)
     if not len(run.trajectory.stamps_ns):
         raise DataError(
             f"{opened.name}: none of its {run.report['frames']} frames could be tracked; are they dark, "

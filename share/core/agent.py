@@ -6,33 +6,37 @@ give the same effects. Odometry passes through untouched: the edge only moves th
 
 from __future__ import annotations
 
-import math
-from collections import Counter, deque
+from collections import Counter
+from collections.abc import Sequence
 from typing import Any
 
 from share.config import Config
 from share.core import events as ev
 from share.core.chain import Chain
-from share.core.clock import ClockFilter, smoothed
 from share.core.clock_claim import ClockClaim
-from share.core.drift import Drift
 from share.core.ledger import Entry, Ledger
+from share.core.lines import Lines
+from share.core.lives import Lives
 from share.core.map_frame import MapFrame
+from share.core.own_error import OwnError
+from share.core.own_status import OwnStatus
+from share.core.pings import Pings
 from share.core.rate import Every, TokenBucket, seconds
 from share.core.streaming import Streaming
+from share.core.versions import EdgeVersion
 from share.core.worth import Worth
-from share.errors import UsageError, WireError
+from share.errors import UsageError, VersionError, WireError
 from share.geometry.se3 import inverse
 from share.types import F64, Correction, Keyframe
 from share.wire import messages as m
-from share.wire.codec import decode, encode, size
+from share.wire.codec import Bytes, decode, encode, size
 
 _COUNTED = (
     *("bytes_up", "bytes_down", "bad_messages", "poses", "candidates", "drop_rate"),
     *("corrections", "corrections_stale"),
 )
 _BOOKED = ("sent", "resent", "acknowledged", "drop_oldest_acknowledged", "drop_oldest", "bad_acks")
-_REMEMBERED = 16  # pings under way, earlier lives of the edge, complaints
+_LEAST_HZ = 0.1  # keyframes that an edge cannot forbid: without any it would learn of no reason to allow more
 
 
 class Agent:
@@ -51,22 +55,22 @@ class Agent:
         self._bucket = TokenBucket(config.agent.rate_burst)
         self._worth = Worth()
         self._map = MapFrame(config.agent)
-        self._drift = Drift()
+        self._error = OwnError(config.agent.tell_placement)
         self._streaming = Streaming(config.stream) if hello.streams else None
-        self._clock = ClockFilter(config.clock)
-        self._hello_timer, self._ping_timer = Every(link.hello_s), Every(link.ping_s)
+        self._pings = Pings(link, config.clock)
+        self._hello_timer = Every(link.hello_s)
         self._T_odom_body: F64 | None = None
+        self._status = OwnStatus(link.ping_s, hello.streams)
         self._stretch = 0  # of odometry, in the order in which they began
-        self._processing_ms: float | None = None  # from a frame's arrival to its keyframe, of late
         self._connected = False
-        self._session: int | None = None
-        self._sessions: deque[int] = deque(maxlen=_REMEMBERED)
+        self._lives = Lives()
+        self._refusal: str | None = None  # the edge's last
         self._silent_ns = seconds(link.silent_s)
         self._heard_ns: int | None = None  # or when waiting for the edge began
         self._silence_said = False
-        self._revision = -1
-        self._pings: deque[m.Ping] = deque(maxlen=_REMEMBERED)
-        self._complaints: deque[str] = deque(maxlen=_REMEMBERED)
+        self._edge_version = EdgeVersion()
+        self._lines = Lines()
+        self._now_ns = 0  # of the newest event
         self._finish_by_ns: int | None = None
         self._ended = False
         self._counts: Counter[str] = Counter()
@@ -76,15 +80,17 @@ class Agent:
         """What to do about `event` at `now_ns` (host monotonic clock, never falling)."""
         if self._ended:
             return []
-        self._effects = []
+        self._effects, self._now_ns = [], now_ns
         if self._heard_ns is None:
             self._heard_ns = now_ns
+        self._status.begin(now_ns)
         match event:
             case ev.FrameTracked():
                 self._frame_tracked(event, now_ns)
             case ev.KeyframeMade():
                 self._offer(event, now_ns)
             case ev.FrameArrived() if self._streaming:
+                self._status.image_came(event.arrived_ns)
                 self._streaming.arrived(event, self._connected)
             case ev.NotTaken() if self._streaming:
                 self._streaming.not_taken(event.sent.index)
@@ -92,13 +98,19 @@ class Agent:
             case ev.Received():
                 self._received(event, now_ns)
             case ev.Finished():
-                self._finished(now_ns)
+                self._status.over()
+                self._finish_by_ns = now_ns + seconds(self._config.agent.finish_s)
             case ev.Connected():  # whether it knows us, its welcome says sooner than a ping's answer
+                self._edge_version.reached()
                 self._send_hello(now_ns)
             case ev.Tick():
-                pass
+                self._status.ticked(event)
         if not self._ended:
             self._keep_up(now_ns)
+        return self._effects
+
+    def unfinished(self) -> list[ev.AgentEffect]:
+        """What the newest event had led to before its handling failed."""
         return self._effects
 
     @property
@@ -116,19 +128,25 @@ class Agent:
             "open": self._ledger.open,
             "rate_hz": self._bucket.hz,
             "connected": self._connected,
-            "edge_sessions": len(self._sessions),
+            "edge_sessions": len(self._lives),
             "map_id": self._map.map_id,
-            "revision": self._revision,
-            **self._clock.report(),
+            "revision": self._lives.revision,
+            "refusal": self._refusal,
+            **self._pings.clock.report(),
         }
+
+    def status(self, now_ns: int) -> m.Status:
+        """What it knows of its own state at `now_ns`."""
+        return self._status.at(now_ns)
 
     def clock(self, now_ns: int) -> ClockClaim:
         """What may be said of the edge's clock at `now_ns`."""
-        return ClockClaim.of(self._clock, now_ns, self._config.clock.claim_ms)
+        return ClockClaim.of(self._pings.clock, now_ns, self._config.clock.claim_ms)
 
     # ------------------------------------------------------------ frames
 
     def _frame_tracked(self, frame: ev.FrameTracked, now_ns: int) -> None:
+        self._status.tracked(frame, now_ns)
         if frame.new_stretch:
             self._chain.break_off()
             self._map.forget()
@@ -142,7 +160,7 @@ class Agent:
         """Makes a keyframe of a candidate, if the rate allows (drop_rate)."""
         self._counts["candidates"] += 1
         frame, candidate = made.frame, made.candidate
-        self._processing_ms = smoothed(self._processing_ms, (now_ns - frame.arrived_ns) / 1e6)
+        self._error.processed((now_ns - frame.arrived_ns) / 1e6)
         self._chain.extend(candidate)
         sent = self._bucket.take(now_ns, self._worth.is_rather_high(candidate.view))
         if sent:
@@ -153,16 +171,13 @@ class Agent:
 
     def _add(self, keyframe: Keyframe, frame: ev.FrameTracked, now_ns: int) -> None:
         self._ledger.add(Entry(keyframe, frame.index, frame.arrived_ns))
-        self._drift.sent(keyframe, frame.arrived_ns)
-        if self._connected and self._clock.rtt_ms is not None:
-            delay_ms = self._clock.rtt_ms + (self._processing_ms or 0.0)
-            self._send(m.Evaluation(keyframe.id, delay_ms, self._expected_cm(frame.error_cm, now_ns)))
-
-    def _expected_cm(self, local_cm: float | None, now_ns: int) -> float | None:
-        drift_cm = self._drift.expected_cm(local_cm, now_ns)
-        if drift_cm is None or self._T_odom_body is None or not self._config.agent.tell_placement:
-            return drift_cm
-        return math.hypot(drift_cm, self._map.spread_cm(self._T_odom_body))
+        self._error.drift.sent(keyframe, frame.arrived_ns)
+        if self._connected and (clock := self._pings.clock).rtt_ms is not None:
+            self._send(
+                self._error.evaluation(
+                    keyframe.id, clock.rtt_ms, frame.error_cm, self._T_odom_body, self._map, now_ns
+                )
+            )
 
     def _localised(self, frame: ev.FrameTracked, T_odom_body: F64, now_ns: int) -> None:
         self._T_odom_body = T_odom_body
@@ -199,9 +214,11 @@ class Agent:
     def _received(self, event: ev.Received, now_ns: int) -> None:
         self._counts["bytes_down"] += size(event.frames)
         try:
-            message = decode(event.frames)
+            message = self._decode(event.frames)
         except WireError as error:
             self._complain(f"a message from the edge is not understood: {error}")
+            return
+        if message is None:
             return
         self._heard_ns = now_ns
         match message:
@@ -210,11 +227,11 @@ class Agent:
             case m.Refused():
                 self._refused(message, now_ns)
             case m.Ack():
-                self._ledger.acknowledge(message)
+                self._acknowledged(message)
             case Correction():
                 self._corrected(message, now_ns)
             case m.Rate():
-                self._bucket.limit(message.hz, now_ns)
+                self._bucket.limit(max(message.hz, _LEAST_HZ), now_ns)
             case m.Pong():
                 self._ponged(message, now_ns)
             case m.Tracked() if self._streaming:
@@ -222,30 +239,52 @@ class Agent:
             case _:
                 self._complain(f"the edge sent a {type(message).__name__}, which is not for this agent")
 
+    def _decode(self, frames: Sequence[Bytes]) -> m.Message | None:
+        """None for what an edge of an older version says, of which a person is told. Raises WireError."""
+        try:
+            return decode(frames)
+        except VersionError as error:
+            if (line := self._edge_version.heard(frames, error)) is not None:
+                self._silence_said = True
+                self._say(f"{line}; {self._alone}")
+            return None
+
     def _complain(self, text: str) -> None:
         """Counts a bad message; says each kind once."""
         self._counts["bad_messages"] += 1
-        if text not in self._complaints:
-            self._complaints.append(text)
-            self._say(text)
+        self._add_line(self._lines.complain(text, self._now_ns))
+
+    def _is_unsent(self, what: str, *keyframes: int) -> bool:
+        """Whether the edge speaks of a keyframe that it cannot know of; then the message is not believed."""
+        unsent = max(keyframes, default=-1) >= self._ledger.next_unsent
+        if unsent:
+            self._complain(f"the edge sent {what} of keyframes that were never sent; it is not believed")
+        return unsent
+
+    def _acknowledged(self, ack: m.Ack) -> None:
+        if not self._ledger.acknowledge(ack):
+            self._is_unsent("an acknowledgement", ack.next_keyframe - 1, *ack.held)
 
     def _welcomed(self, welcome: m.Welcome, now_ns: int) -> None:
-        if welcome.session != self._session and welcome.session in self._sessions:
-            return  # overtaken on its way by that of a later life of the edge
+        if self._lives.is_over(welcome.session) or self._is_unsent("a welcome", welcome.next_keyframe - 1):
+            return
+        if self._lives.is_unasked(welcome.session):
+            self._complain("the edge sent a welcome that nobody asked for; it is not believed")
+            return
         returned, self._connected, self._silence_said = not self._connected, True, False
-        if welcome.session != self._session:
+        self._edge_version.answered()
+        if welcome.session != self._lives.session:
             self._new_session(welcome, now_ns)
         elif returned:
             self._ledger.resume(welcome)
             self._say("the edge is back")
 
     def _new_session(self, welcome: m.Welcome, now_ns: int) -> None:
-        again = self._session is not None
-        self._session, self._revision = welcome.session, -1
-        self._sessions.append(welcome.session)
+        again = self._lives.session is not None
+        self._lives.begin(welcome.session)
+        self._refusal = None
         self._bucket.limit(None, now_ns)
-        self._clock.reset()
-        self._pings.clear()
+        self._pings.begin()
         held = self._ledger.begin(welcome)
         if again and self._streaming:
             self._streaming.edge_restarted()
@@ -256,8 +295,9 @@ class Agent:
             self._say("connected to the edge")
 
     def _refused(self, refused: m.Refused, now_ns: int) -> None:
-        text = f"the edge refuses '{self._name}': {refused.reason}"
-        if self._session is None:
+        self._refusal = "".join(c if c.isprintable() else "?" for c in refused.reason)
+        text = f"the edge refuses '{self._name}': {self._refusal}"
+        if self._lives.session is None and self._status.has_just_begun(now_ns, self._silent_ns):
             self._ended = True
             self._effects.append(ev.Fail(UsageError(text)))
             return
@@ -266,19 +306,17 @@ class Agent:
         self._say(f"{text}; {self._alone}")
 
     def _corrected(self, correction: Correction, now_ns: int) -> None:
-        if not self._connected or correction.revision <= self._revision or not self._of_stretch(correction):
+        if self._is_unsent("a correction", correction.about, correction.answers):
+            return
+        of_now = self._connected and correction.about >= self._chain.first_of_stretch  # of odometry
+        if not (of_now and self._lives.is_newer(correction.revision)):
             self._counts["corrections_stale"] += 1
             return
-        self._revision = correction.revision
         self._counts["corrections"] += 1
         T_odom_body = correction.T_map_odom if self._T_odom_body is None else self._T_odom_body
         new_map = self._map.correct(correction, T_odom_body, now_ns)
-        self._drift.answered(correction.answers)
-        entry = self._ledger.find(correction.answers)
-        corrected_ms = None
-        if entry is not None and not (entry.answered or entry.replayed):
-            entry.answered = True
-            corrected_ms = (now_ns - entry.arrived_ns) / 1e6
+        self._error.drift.answered(correction.answers)
+        entry, corrected_ms = self._ledger.answered(correction.answers, now_ns)
         self._effects.append(
             ev.CorrectionApplied(
                 entry.keyframe.id if entry else None,
@@ -291,10 +329,6 @@ class Agent:
             )
         )
 
-    def _of_stretch(self, correction: Correction) -> bool:
-        """Whether it is about the present stretch of odometry."""
-        return correction.about >= self._chain.first_of_stretch
-
     def _tracked_afar(self, answer: m.Tracked, streaming: Streaming, now_ns: int) -> None:
         frame = streaming.tracked(answer, now_ns)
         if frame is not None:
@@ -302,22 +336,23 @@ class Agent:
             self._frame_tracked(frame, now_ns)
 
     def _ponged(self, pong: m.Pong, now_ns: int) -> None:
-        ping = m.Ping(pong.sequence, pong.sent_ns)
-        if ping not in self._pings:
+        if not self._pings.answers(pong):
             return
-        self._pings.remove(ping)
-        if pong.session != self._session:
+        if pong.session != self._lives.session:
             self._connected = False  # the edge has restarted and does not know us: hello
             return
-        self._clock.update(pong.sent_ns, pong.received_ns, pong.replied_ns, now_ns)
+        self._pings.measure(pong, now_ns)
 
     # ------------------------------------------------------------ what is due
 
     def _keep_up(self, now_ns: int) -> None:
         self._watch_silence(now_ns)
+        self._say_status(now_ns)
         if self._connected:
-            self._ping(now_ns)
-            self._send_keyframes(now_ns)
+            if (ping := self._pings.due(now_ns)) is not None:
+                self._send(ping)
+            for entry in self._ledger.due(now_ns):
+                self._send(entry.keyframe)
             self._send_frame(now_ns)
         elif self._hello_timer.due(now_ns):
             self._send_hello(now_ns)
@@ -331,7 +366,10 @@ class Agent:
 
     def _send_hello(self, now_ns: int) -> None:
         self._hello_timer.postpone(now_ns + seconds(self._config.link.hello_s))
+        self._lives.ask()
         self._send_frames(self._hello)
+        for ping in self._edge_version.pings(now_ns):
+            self._send_frames(ping)
 
     def _watch_silence(self, now_ns: int) -> None:
         assert self._heard_ns is not None
@@ -340,19 +378,14 @@ class Agent:
         self._connected = False
         if not self._silence_said:
             self._silence_said = True
-            gone = "the edge is silent" if self._session is not None else "no edge answers yet"
+            gone = "the edge is silent" if self._lives.session is not None else "no edge answers yet"
             self._say(f"{gone}; {self._alone}")
 
-    def _ping(self, now_ns: int) -> None:
-        if self._ping_timer.due(now_ns):
-            self._counts["pings"] += 1
-            ping = m.Ping(self._counts["pings"], now_ns)
-            self._pings.append(ping)
-            self._send(ping)
-
-    def _send_keyframes(self, now_ns: int) -> None:
-        for entry in self._ledger.due(now_ns):
-            self._send(entry.keyframe)
+    def _say_status(self, now_ns: int) -> None:
+        if (said := self._status.due(now_ns)) is not None:
+            self._effects.append(said)
+            if self._connected:
+                self._send(said.status)
 
     def _send_frame(self, now_ns: int) -> None:
         frame = None if self._streaming is None else self._streaming.next(now_ns)
@@ -360,9 +393,6 @@ class Agent:
             frames = encode(frame)
             self._counts["bytes_up"] += size(frames)
             self._effects.append(ev.SendFrame(frame.index, frames))
-
-    def _finished(self, now_ns: int) -> None:
-        self._finish_by_ns = now_ns + seconds(self._config.agent.finish_s)
 
     def _end(self) -> None:
         if self._connected:
@@ -382,4 +412,8 @@ class Agent:
         return "nobody tracks this agent" if self._streaming else "tracking goes on alone"
 
     def _say(self, text: str) -> None:
-        self._effects.append(ev.Say(text))
+        self._add_line(self._lines.say(text, self._now_ns))
+
+    def _add_line(self, line: str | None) -> None:
+        if line is not None:
+            self._effects.append(ev.Say(line))

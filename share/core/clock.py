@@ -13,6 +13,8 @@ from share.core.rate import SECOND_NS
 from share.types import F64
 
 _SMOOTHING = 1 / 8  # RFC 6298, section 2
+MOST_APART_NS = 10 * 365 * 86_400 * SECOND_NS  # clocks that begin at start-up: no machine is up for longer
+_WITNESSES = 3  # exchanges that agree before a clock is believed: its stamps must advance as ours do
 _SETTLED = 8  # exchanges before the quickest of them counts as one that met no queue
 
 
@@ -48,6 +50,12 @@ class ClockFilter:
         self._at_ns = 0
         self._recent_ns: deque[int] = deque(maxlen=self._config.least_of)
         self._refused_in_a_row = 0
+        self._agreeing = 0  # exchanges since the clock was last set
+
+    @property
+    def is_witnessed(self) -> bool:
+        """Whether so many exchanges agree that it is a clock at all."""
+        return self._agreeing >= _WITNESSES
 
     def update(self, sent_ns: int, received_ns: int, replied_ns: int, back_ns: int) -> bool:
         """One exchange: sent and back by the agent's clock, received and replied by the edge's.
@@ -55,7 +63,7 @@ class ClockFilter:
         Returns whether it was believed.
         """
         exchange = Exchange(sent_ns, received_ns, replied_ns, back_ns)
-        if not exchange.is_possible:
+        if not exchange.is_possible or abs(exchange.offset_ns) > MOST_APART_NS:
             self.rejected += 1
             return False
         rtt_ns, offset_ns = exchange.delay_ns, exchange.offset_ns
@@ -115,6 +123,7 @@ class ClockFilter:
         self._filter.H = np.array([[1.0, 0.0]])
         self._base_ns, self._at_ns = offset_ns, at_ns
         self._refused_in_a_row = 0
+        self._agreeing = 1
         self.accepted += 1
 
     def _correct(self, offset_ns: int, at_ns: int, variance: float) -> bool:
@@ -126,6 +135,7 @@ class ClockFilter:
             return self._refuse(offset_ns, at_ns, variance)
         kf.update(np.array([(offset_ns - self._base_ns) / 1e3]), R=variance)
         self._refused_in_a_row = 0
+        self._agreeing += 1
         self.accepted += 1
         return True
 

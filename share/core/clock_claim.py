@@ -17,7 +17,7 @@ from share.core.clock import ClockFilter
 @dataclass(frozen=True)
 class ClockClaim:
     """Of the edge's monotonic clock minus the agent's, ms. sigma_ms: standard deviation by the filter;
-    asymmetry_ms: half of the least recent round trip, which no filter sees; None before an exchange.
+    asymmetry_ms: half of the least recent round trip, which no filter sees; None before exchanges that agree.
     offset_ms: None too where it is not claimed."""
 
     offset_ms: float | None
@@ -33,7 +33,7 @@ class ClockClaim:
             clock.sigma_ns(now_ns),
             clock.asymmetry_ns,
         )
-        if offset_ns is None or sigma_ns is None or asymmetry_ns is None:
+        if not clock.is_witnessed or offset_ns is None or sigma_ns is None or asymmetry_ns is None:
             return cls(None, None, None, claim_ms)
         found = cls(offset_ns / 1e6, sigma_ns / 1e6, asymmetry_ns / 1e6, claim_ms)
         return found if found.claimed else cls(None, found.sigma_ms, found.asymmetry_ms, claim_ms)

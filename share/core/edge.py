@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 
 from share import __version__
 from share.config import Config
+from share.core.admission import Admission, new_key
 from share.core.edge_events import (
     Add,
     Effect,
@@ -31,14 +32,19 @@ from share.core.edge_events import (
 from share.core.finding import Finding
 from share.core.inorder import InOrder
 from share.core.keeping import Change, KeepKeyframe, KeepRun
-from share.core.peer import Known, Peer
+from share.core.peer import Known, Peer, Refusals
 from share.core.rate import seconds
 from share.core.schedule import Schedule
-from share.errors import WireError
+from share.core.throttle import Throttle
+from share.core.versions import OtherVersions
+from share.errors import VersionError, WireError, describe
 from share.strict import to_mapping
 from share.types import Keyframe
 from share.wire import messages as wire
-from share.wire.codec import decode, encode
+from share.wire.codec import VERSION, decode, encode
+
+_SAY_HZ, _SAY_BURST = 1.0, 20.0  # records that one peer can cause of one kind
+_MAX_IDLE_RUNS = 256  # gone without a keyframe; the oldest is forgotten
 
 
 class Edge:
@@ -65,18 +71,37 @@ class Edge:
         self._began_ns = began_ns
         self._schedule = Schedule(config.control, config.edge.policy)
         self._strangers: Counter[str] = Counter()
+        self._strangers_refused = Refusals()
+        self._admission = Admission(config.edge, self.tracks)
+        self._throttle, self._versions = Throttle(_SAY_HZ, _SAY_BURST), OtherVersions()
+        self._internal_errors = 0
         self._ticket = 0
         self._unsafe: deque[tuple[int, Peer, int]] = deque()  # ticket, and what is safe once it is kept
+        self._kept_to = 0  # the newest ticket that is kept
         self._effects: list[Effect] = []
+        self._now_ns = 0  # of the newest event
         for run in known:
             self._recall(run)
 
     def handle(self, event: Event, now_ns: int) -> list[Effect]:
-        """What `event` leads to. `now_ns` is the edge's clock and never goes back."""
+        """What `event` leads to. `now_ns` is the edge's clock and never goes back.
+
+        An exception, which is a fault of ours, costs this event only: it is counted and said."""
         self._began_ns = now_ns if self._began_ns is None else self._began_ns
-        self._effects = []
-        self._react(event, now_ns)
+        self._effects, self._now_ns = [], now_ns
+        try:
+            self._react(event, now_ns)
+        except Exception as error:
+            self._failed(event, error, now_ns)
         return self._effects
+
+    def _failed(self, event: Event, error: Exception, now_ns: int) -> None:
+        self._internal_errors += 1
+        peer = self._peers.get(event.peer) if isinstance(event, Received) else None
+        reason = f"{type(event).__name__}: {describe(error)}"
+        if peer is not None:
+            peer.refusals.add(reason, now_ns)
+        self._record_seldom(now_ns, "internal error", peer, reason)
 
     def _react(self, event: Event, now_ns: int) -> None:
         match event:
@@ -99,23 +124,30 @@ class Edge:
         counts["bytes_up"] += sum(len(frame) for frame in event.frames)
         try:
             message = decode(event.frames)
+        except VersionError as error:
+            self._other_version(event.peer, error, now_ns)
+            return
         except WireError as error:
             self._complain(peer, str(error), now_ns)
+            return
+        if peer is not None and not event.speaks_for(peer.hello.name):
+            self._complain(None, f"a key that does not speak for '{peer.hello.name}' used its run", now_ns)
             return
         if peer is not None:
             self._heard(peer, now_ns)
         match message:
             case wire.Hello():
-                self._greet(event.peer, message, now_ns)
-            case wire.Ping():  # a stranger's too: our session tells him to say hello
+                self._greet(event, message, now_ns)
+            case wire.Ping():  # a stranger's too: our session tells it to say hello
                 pong = wire.Pong(message.sequence, message.sent_ns, now_ns, now_ns, self._session)
                 self._send(event.peer, pong)
             case wire.Bye() if peer:
+                peer.status.left()
                 self._gone(peer, "left", "said bye", now_ns)
             case _ if peer:
                 self._told(event.peer, peer, message, now_ns)
             case _:  # from a stranger
-                counts["unexpected"] += 1
+                self._unexpected(None, message, now_ns)
 
     def _told(self, peer_id: bytes, peer: Peer, message: wire.Message, now_ns: int) -> None:
         """What an agent says of itself."""
@@ -124,16 +156,29 @@ class Edge:
                 self._keyframe(peer, message, now_ns)
             case wire.PoseUpdate():
                 peer.counts["poses"] += 1
-                peer.state = message.state
+                peer.status.posed(message.state, now_ns)
+            case wire.Status():
+                peer.status.told(message, now_ns)
             case wire.Evaluation():
                 self._evaluated(peer_id, peer, message, now_ns)
             case _:  # not this agent's word
-                peer.counts["unexpected"] += 1
+                self._unexpected(peer, message, now_ns)
+
+    def _unexpected(self, peer: Peer | None, message: wire.Message, now_ns: int) -> None:
+        self._counts(peer)["unexpected"] += 1
+        what = "before its hello" if peer is None else "which is not an agent's to send"
+        self._refusals(peer).add(f"a {type(message).__name__} {what}", now_ns)
+
+    def _other_version(self, peer_id: bytes, error: VersionError, now_ns: int) -> None:
+        self._strangers["other_version"] += 1
+        if (reason := self._versions.refusal(peer_id, error, now_ns)) is not None:
+            self._refuse(peer_id, reason, now_ns, error.version)
 
     def _complain(self, peer: Peer | None, reason: str, now_ns: int) -> None:
         """Counts a bad message; says the first of each peer."""
         counts = self._counts(peer)
         counts["bad_messages"] += 1
+        self._refusals(peer).add(reason, now_ns)
         if counts["bad_messages"] == 1:
             self._record(now_ns, "bad message", peer, reason)
 
@@ -142,7 +187,7 @@ class Edge:
         if peer.gone:
             peer.gone = False
             self._effects.append(Present(peer.key, True))
-            self._record(now_ns, "back", peer, "is heard again")
+            self._record_seldom(now_ns, "back", peer, "is heard again")
 
     def _notice_silence(self, now_ns: int) -> None:
         for peer in self._peers.values():
@@ -152,53 +197,38 @@ class Edge:
     def _gone(self, peer: Peer, what: str, reason: str, now_ns: int) -> None:
         peer.gone = True
         self._effects.append(Present(peer.key, False))
-        self._record(now_ns, what, peer, reason)
+        self._record_seldom(now_ns, what, peer, reason)
 
     # ------------------------------------------------------------------ coming in
 
-    def _greet(self, peer_id: bytes, hello: wire.Hello, now_ns: int) -> None:
+    def _greet(self, event: Received, hello: wire.Hello, now_ns: int) -> None:
         """Welcome a new run or a known one; refuse a name that somebody else is using."""
-        if (reason := self._objection(peer_id, hello, now_ns)) is not None:
-            self._send(peer_id, wire.Refused(reason))
-            self._record(now_ns, "refused", None, reason)
+        peer_id = event.peer
+        if (reason := self._objection(event, hello, now_ns)) is not None:
+            self._refuse(peer_id, reason, now_ns)
             return
         if peer_id not in self._peers:
-            self._enter(peer_id, Peer(hello, self._key(hello), now_ns))
+            self._forget_idle()
+            self._enter(peer_id, Peer(hello, new_key(hello, self._by_key), now_ns))
             self._schedule.begin(hello.name)
-            self._record(now_ns, "joined the edge", self._peers[peer_id], f"{hello.kind} '{hello.name}'")
+            joined = f"{hello.kind} '{hello.name}'"
+            self._record_seldom(now_ns, "joined the edge", self._peers[peer_id], joined)
         self._welcome(peer_id, self._peers[peer_id], now_ns)
+
+    def _objection(self, event: Received, hello: wire.Hello, now_ns: int) -> str | None:
+        return self._admission.objection(event, hello, self._peers, now_ns)
+
+    def _refuse(self, peer_id: bytes, reason: str, now_ns: int, version: int = VERSION) -> None:
+        self._send(peer_id, wire.Refused(reason), version)
+        self._refusals(self._peers.get(peer_id)).add(reason, now_ns)
+        self._record_seldom(now_ns, "refused", None, reason)
 
     def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
         """Who says hello has lost the edge: whatever was on its way to him may be gone, or was not taken."""
         peer.greeted = True
         self._send(peer_id, wire.Welcome(self._session, peer.safe))
         if peer.newest is not None:
-            self._correct(peer_id, peer, peer.newest, now_ns)
-
-    def _objection(self, peer_id: bytes, hello: wire.Hello, now_ns: int) -> str | None:
-        """Why this run cannot be taken in, if it cannot."""
-        edge, known = self._config.edge, self._peers.get(peer_id)
-        if hello.streams and not self.tracks:
-            return "this edge tracks nobody: start it with --policy streamed, or the agent without --streamed"
-        if self.tracks and not hello.streams:
-            return "this edge tracks its agents (policy streamed): start the agent with --streamed"
-        if known is not None:
-            same = known.hello.name == hello.name
-            return None if same else f"this run's number is in use by '{known.hello.name}'; start again"
-        present = [peer for peer in self._peers.values() if not peer.gone]
-        for peer in present:
-            if peer.hello.name == hello.name and now_ns - peer.heard_ns < seconds(edge.name_hold_s):
-                return f"the name '{hello.name}' is in use by another agent; choose another with --name"
-        if len(present) >= edge.max_agents:
-            return f"the edge serves {len(present)} agents already, as many as it may (edge.max_agents)"
-        return None
-
-    def _key(self, hello: wire.Hello) -> str:
-        """Names the run: as much of its number as sets it apart from earlier runs of that name."""
-        digits = 4
-        while (key := f"{hello.name}-{hello.run_id % 16**digits:0{digits}x}") in self._by_key:
-            digits += 1
-        return key
+            self._correct(peer_id, peer, peer.newest, now_ns, again=True)
 
     def _enter(self, peer_id: bytes, peer: Peer) -> None:
         self._know(peer_id, peer)
@@ -216,18 +246,41 @@ class Edge:
         self._peers[peer_id] = self._latest[peer.hello.name] = peer
         self._by_key[peer.key] = peer_id
 
+    def _forget_idle(self) -> None:
+        """Whoever joins again and again without a keyframe fills no memory."""
+        idle = [(peer.heard_ns, peer_id) for peer_id, peer in self._peers.items() if peer.is_idle]
+        if len(idle) >= _MAX_IDLE_RUNS:
+            self._forget(self._peers.pop(min(idle)[1]))
+
+    def _forget(self, peer: Peer) -> None:
+        del self._by_key[peer.key]
+        if self._latest[peer.hello.name] is peer:
+            del self._latest[peer.hello.name]
+            self._schedule.drop(peer.hello.name)
+
     # ------------------------------------------------------------------ keyframes
 
     def _keyframe(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> None:
-        applicable = peer.inorder.push(keyframe)
+        applicable = self._in_order(peer, keyframe, now_ns)
         for ready in applicable:
             peer.counts["keyframes"] += 1
+            peer.unsafe += 1
             self._apply(peer, ready, now_ns)
             self._unsafe.append((self._ticket, peer, ready.id + 1))
-        if not self._keeps:
-            self._kept(self._ticket)
+        self._kept(self._kept_to if self._keeps else self._ticket)
         if not applicable:  # the others are acknowledged once they are safe
             self._acknowledge(peer)
+
+    def _in_order(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> list[Keyframe]:
+        """What can be applied now; nothing of an agent that sends more than is taken in."""
+        if (reason := peer.too_many(now_ns)) is not None:
+            peer.refusals.add(reason, now_ns)
+            return []
+        try:
+            return peer.inorder.push(keyframe)
+        except ValueError as error:
+            self._complain(peer, str(error), now_ns)
+            return []
 
     def _apply(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> None:
         try:
@@ -236,7 +289,7 @@ class Edge:
             self._complain(peer, str(error), now_ns)
             return
         if complaint:
-            self._record(now_ns, "odometry doubted", peer, complaint)
+            self._record_seldom(now_ns, "odometry doubted", peer, complaint)
         assert peer.foot is not None
         self._keep(KeepKeyframe(peer.key, keyframe))
         self._effects.append(Add(peer.key, keyframe))
@@ -248,10 +301,12 @@ class Edge:
 
     def _kept(self, ticket: int) -> None:
         """Acknowledge what is safe now."""
+        self._kept_to = max(self._kept_to, ticket)
         told = {}
         while self._unsafe and self._unsafe[0][0] <= ticket:
             _, peer, next_keyframe = self._unsafe.popleft()
             peer.safe = next_keyframe
+            peer.unsafe -= 1
             told[peer.key] = peer
         for peer in told.values():
             self._acknowledge(peer)
@@ -270,7 +325,8 @@ class Edge:
 
     def _found(self, finding: Finding, now_ns: int) -> None:
         """Write down what the mapper decided, and send what follows from it."""
-        peer_id = self._by_key[finding.agent]
+        if (peer_id := self._by_key.get(finding.agent)) is None:  # forgotten meanwhile
+            return
         peer = self._peers[peer_id]
         if finding.correction is None:
             self._record(now_ns, finding.what, peer, finding.reason)
@@ -279,19 +335,23 @@ class Edge:
         if not peer.gone and peer.greeted:  # who has not been greeted takes us for our predecessor
             self._correct(peer_id, peer, finding, now_ns)
 
-    def _correct(self, peer_id: bytes, peer: Peer, finding: Finding, now_ns: int) -> None:
+    def _correct(
+        self, peer_id: bytes, peer: Peer, finding: Finding, now_ns: int, again: bool = False
+    ) -> None:
+        """again: as it asked for it, so that it is not said each time."""
         assert finding.correction is not None
         peer.revision += 1
         peer.counts["corrections"] += 1
         correction = replace(finding.correction, revision=peer.revision)
         self._send(peer_id, correction)
         fields = {"map_id": correction.map_id, "revision": peer.revision, "answers": correction.answers}
-        self._record(now_ns, finding.what, peer, finding.reason, **fields)
+        record = self._record_seldom if again else self._record
+        record(now_ns, finding.what, peer, finding.reason, **fields)
 
     # ------------------------------------------------------------------ going out
 
-    def _send(self, peer_id: bytes, message: wire.Down) -> None:
-        frames = encode(message)
+    def _send(self, peer_id: bytes, message: wire.Down, version: int = VERSION) -> None:
+        frames = encode(message, version)
         self._counts(self._peers.get(peer_id))["bytes_down"] += sum(len(frame) for frame in frames)
         self._effects.append(Send(peer_id, frames))
 
@@ -302,6 +362,23 @@ class Edge:
         agent = peer.hello.name if peer else None
         head = {"t_s": self._since_began_s(now_ns), "event": what, "agent": agent, "reason": reason}
         self._effects.append(Record(head | fields))
+
+    def _record_seldom(self, now_ns: int, what: str, peer: Peer | None, reason: str, **fields: Any) -> None:
+        """What a peer can cause at any rate: of each kind and agent only so many a second."""
+        held_back = self._throttle.admit((what, peer.hello.name if peer else None), now_ns)
+        if held_back is not None:
+            more = f" (and {held_back} more since the last line)" if held_back else ""
+            self._record(now_ns, what, peer, f"{reason}{more}", **fields)
+
+    def _refusals(self, peer: Peer | None) -> Refusals:
+        return peer.refusals if peer else self._strangers_refused
+
+    def trouble(self, now_ns: int) -> list[str]:
+        """Who sends messages that are refused again and again: a line each."""
+        found = {f"agent '{peer.hello.name}'": peer.refusals for peer in self._peers.values()}
+        found["peers that have not joined"] = self._strangers_refused
+        lines = {who: refusals.trouble(now_ns) for who, refusals in found.items()}
+        return [f"{who}: {line}" for who, line in lines.items() if line]
 
     def _since_began_s(self, now_ns: int) -> float:
         assert self._began_ns is not None
@@ -318,22 +395,21 @@ class Edge:
 
     def report(self, mapped: dict[str, Any]) -> dict[str, Any]:
         """edge.json: per agent and in all, but for `series`. mapped: the mapper's report, whose `agents` are
-        by run.
-
-        An agent's earlier runs stand under their run's own key.
+        by run. An agent's earlier runs stand under their run's own key.
         """
-        of_agents = mapped.get("agents", {})
+        of_agents, now_ns = mapped.get("agents", {}), self._now_ns
         return {
             "session": self._session,
             "policy": self._config.edge.policy,
             **mapped,
             "agents": {
-                peer.hello.name if self._latest[peer.hello.name] is peer else peer.key: peer.report()
+                peer.hello.name if self._latest[peer.hello.name] is peer else peer.key: peer.report(now_ns)
                 | self._report_of(peer)
                 | of_agents.get(peer.key, {})
                 for peer in self._peers.values()
             },
             "strangers": dict(self._strangers),
+            "internal_errors": self._internal_errors,
             "version": __version__,
             "config": to_mapping(self._config),
         }

@@ -19,10 +19,16 @@ from share.wire.codec import Bytes
 
 @dataclass(frozen=True)
 class Received:
-    """A message, still bytes, from the peer that the transport knows by this id."""
+    """A message, still bytes, from the peer that the transport knows by this id.
+
+    names: of the agents that its key may speak for; None where no keys are used."""
 
     peer: bytes
     frames: Sequence[Bytes]
+    names: frozenset[str] | None = None
+
+    def speaks_for(self, name: str) -> bool:
+        return self.names is None or name in self.names
 
 
 @dataclass(frozen=True)

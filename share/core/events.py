@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from share.errors import ShareError
 from share.types import F64, Candidate, Frame, TrackState, Wait
 from share.wire.codec import Bytes
+from share.wire.messages import Status
 
 # ---------------------------------------------------------------- events
 
@@ -19,7 +20,7 @@ class FrameTracked:
 
     arrived_ns, done_ns: when the frame came in and its pose was known. keyframe: it became one, and
     `KeyframeMade` follows; new_stretch: odometry broke before it. error_cm: expected position error,
-    where somebody estimates it.
+    where somebody estimates it. waits: for what the tracker waits before it tells a pose.
     """
 
     index: int
@@ -31,6 +32,7 @@ class FrameTracked:
     keyframe: bool = False
     new_stretch: bool = False
     error_cm: float | None = None
+    waits: Wait | None = None
 
     @property
     def track_ms(self) -> float:
@@ -74,7 +76,11 @@ class Connected:
 
 @dataclass(frozen=True)
 class Tick:
-    """Time has passed; every 50 ms is often enough."""
+    """Time has passed; every 50 ms is often enough. image_ns: when the newest image came that is not tracked
+    yet, None where none waits. trouble: what is wrong with the sensors, for a person; empty: nothing."""
+
+    image_ns: int | None = None
+    trouble: str = ""
 
 
 @dataclass(frozen=True)
@@ -159,6 +165,16 @@ class FrameDone:
 
 
 @dataclass(frozen=True)
+class StatusSaid:
+    """What the agent says of its own state now, twice a second and where it changes. stamp_ns: of the newest
+    frame, None before the first. idle: no frame was tracked of late, so no FrameDone says so."""
+
+    status: Status
+    stamp_ns: int | None
+    idle: bool
+
+
+@dataclass(frozen=True)
 class Say:
     """One line for a person."""
 
@@ -177,4 +193,15 @@ class Stop:
     """Everything is done: close the link."""
 
 
-AgentEffect = Send | SendFrame | TrackedAfar | Localised | CorrectionApplied | FrameDone | Say | Fail | Stop
+AgentEffect = (
+    Send
+    | SendFrame
+    | TrackedAfar
+    | Localised
+    | CorrectionApplied
+    | FrameDone
+    | StatusSaid
+    | Say
+    | Fail
+    | Stop
+)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from share.types import Keyframe
 from share.wire.messages import MAX_HELD, Ack
 
+MAX_STEP = 1_000_000  # ids that an agent may have dropped since the last: two days alone at 5 Hz
+
 
 class InOrder:
     """Yields each keyframe once, after the one that it follows; holds a bounded number back.
@@ -24,7 +26,11 @@ class InOrder:
         self._waiting: dict[int, Keyframe] = {}
 
     def push(self, keyframe: Keyframe) -> list[Keyframe]:
-        """The keyframes, rising by id, that can be applied now that this one is here."""
+        """The keyframes, rising by id, that can be applied now that this one is here.
+
+        Raises ValueError if its id leaps by more than MAX_STEP."""
+        if keyframe.id > self.next_keyframe + MAX_STEP:
+            raise ValueError(f"keyframe {keyframe.id}: its id leaps; {self.next_keyframe} is expected")
         if keyframe.id < self.next_keyframe:
             self.duplicates += 1
             return []
@@ -45,8 +51,8 @@ class InOrder:
         safe: applied keyframes from this number on are only held yet (default: all are safe).
         """
         safe = self.next_keyframe if safe is None else safe
-        held = (*range(safe, self.next_keyframe), *sorted(self._waiting))
-        return Ack(safe, held[:MAX_HELD])
+        applied = range(safe, min(self.next_keyframe, safe + MAX_HELD))
+        return Ack(safe, (*applied, *sorted(self._waiting))[:MAX_HELD])
 
     def _keep(self, keyframe: Keyframe) -> None:
         known = self._waiting.get(keyframe.id)

@@ -42,6 +42,7 @@ class Ledger:
         self._open: dict[int, Entry] = {}
         self._held: frozenset[int] = frozenset()  # arrived, but waiting at the edge for a gap to close
         self._sent_to = -1  # highest id put on the wire in this life of the edge
+        self._ever_sent_to = -1  # in any life
 
     def __len__(self) -> int:
         return len(self._acknowledged) + len(self._open)
@@ -55,8 +56,22 @@ class Ledger:
     def last_acknowledged(self) -> Entry | None:
         return next(reversed(self._acknowledged.values()), None)
 
+    @property
+    def next_unsent(self) -> int:
+        """No edge can know of a keyframe from here on."""
+        return self._ever_sent_to + 1
+
     def find(self, keyframe: int) -> Entry | None:
         return self._acknowledged.get(keyframe) or self._open.get(keyframe)
+
+    def answered(self, keyframe: int, now_ns: int) -> tuple[Entry | None, float | None]:
+        """A correction came of this keyframe. Its entry, if it is remembered; and ms since its frame arrived,
+        for the first correction only, and not where a restarted edge was given it again."""
+        entry = self.find(keyframe)
+        if entry is None or entry.answered or entry.replayed:
+            return entry, None
+        entry.answered = True
+        return entry, (now_ns - entry.arrived_ns) / 1e6
 
     def add(self, entry: Entry) -> None:
         """Appends the newest keyframe; drops one where that is one too many."""
@@ -75,13 +90,18 @@ class Ledger:
             entry.attempts += 1
             entry.sent_ns = now_ns
             self._sent_to = max(self._sent_to, entry.keyframe.id)
+        self._ever_sent_to = max(self._ever_sent_to, self._sent_to)
         return chosen
 
-    def acknowledge(self, ack: Ack) -> None:
-        """Takes note of what has arrived; gaps below what is held are due again after `gap_s`."""
-        if ack.next_keyframe > self._sent_to + 1:  # says more than was ever sent
+    def acknowledge(self, ack: Ack) -> bool:
+        """Takes note of what has arrived; gaps below what is held are due again after `gap_s`.
+
+        Returns whether it is believed: what says more than was sent in this life of the edge is of an
+        earlier one, or a lie.
+        """
+        if ack.next_keyframe > self._sent_to + 1 or max(ack.held, default=-1) > self._ever_sent_to:
             self.counts["bad_acks"] += 1
-            return
+            return False
         while self._open and (first := next(iter(self._open))) < ack.next_keyframe:
             self._acknowledged[first] = self._open.pop(first)
             self.counts["acknowledged"] += 1
@@ -92,6 +112,7 @@ class Ledger:
         for entry in list(self._open.values())[: self._link.window]:
             if entry.attempts and entry.keyframe.id < top:
                 entry.due_ns = min(entry.due_ns or 0, entry.sent_ns + seconds(self._link.gap_s))
+        return True
 
     def resume(self, welcome: Welcome) -> None:
         """The edge was silent and is back: what was on its way is taken as lost, and due."""

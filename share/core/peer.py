@@ -12,13 +12,19 @@ import numpy as np
 from share.core.finding import Finding, in_map
 from share.core.inorder import InOrder
 from share.core.keeping import Kept, placed
-from share.core.rate import SECOND_NS
+from share.core.peer_status import PeerStatus
+from share.core.rate import SECOND_NS, TokenBucket
 from share.geometry import se3
 from share.merge.join import Key, Loop
-from share.types import Keyframe, TrackState
+from share.types import Keyframe
 from share.wire.messages import Hello
 
 _LEAP_M, _LEAP_M_S = 2.0, 10.0  # further than this, and so much more a second, nobody moves between keyframes
+_AGAIN, _RECENT_S = 10, 10.0  # refused messages that are worth a person's while, and for how long
+# Keyframes of one agent that are taken in: at once what a full ledger sends to a new edge, then more a second
+# than any camera gives. What exceeds it is not applied, and its agent sends it again.
+_KEYFRAME_BURST, _KEYFRAME_HZ = 1000.0, 50.0
+_MAX_UNSAFE = 256  # keyframes that may wait for the disk: an agent has 16 under way
 _MOST_VARIANCE = 100.0  # rad^2, m^2: says nothing; more would only upset the solver
 
 
@@ -48,9 +54,34 @@ class Known:
     finding: Finding | None = None
 
 
+def _keyframe_rate() -> TokenBucket:
+    bucket = TokenBucket(_KEYFRAME_BURST)
+    bucket.hz = _KEYFRAME_HZ
+    return bucket
+
+
+@dataclass
+class Refusals:
+    """Messages of a peer that were not accepted: how many, and why and when the newest was not."""
+
+    n: int = 0
+    reason: str = ""
+    at_ns: int = 0
+
+    def add(self, reason: str, now_ns: int) -> None:
+        self.n, self.reason, self.at_ns = self.n + 1, reason, now_ns
+
+    def trouble(self, now_ns: int) -> str | None:
+        """For a person, while messages are refused again and again."""
+        if self.n < _AGAIN or now_ns - self.at_ns > _RECENT_S * SECOND_NS:
+            return None
+        return f"{self.n} messages refused, the last: {self.reason}"
+
+
 @dataclass
 class Peer:
-    """safe: all its keyframes below this number will be there after a crash, and so are acknowledged."""
+    """safe: all its keyframes below this number will be there after a crash, and so are acknowledged.
+    unsafe: how many are applied and not safe yet."""
 
     hello: Hello
     key: str  # names this run: the name, and some of the run id
@@ -58,12 +89,26 @@ class Peer:
     inorder: InOrder = field(default_factory=InOrder)
     safe: int = 0
     foot: Foot | None = None
-    state: TrackState = TrackState.INITIALISING
+    status: PeerStatus = field(default_factory=PeerStatus)
     counts: Counter[str] = field(default_factory=Counter)
+    refusals: Refusals = field(default_factory=Refusals)
+    keyframe_rate: TokenBucket = field(default_factory=_keyframe_rate)
     revision: int = 0
     gone: bool = False
     newest: Finding | None = None  # the newest correction; who has been away may not have got it
     greeted: bool = True  # in this life of the edge
+    unsafe: int = 0
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether it is gone and never sent a keyframe."""
+        return self.gone and self.inorder.next_keyframe == 0
+
+    def too_many(self, now_ns: int) -> str | None:
+        """Why no other keyframe is applied now; None if one may be."""
+        if self.unsafe >= _MAX_UNSAFE:
+            return f"{self.unsafe} keyframes wait for the disk"
+        return None if self.keyframe_rate.take(now_ns) else "keyframes come faster than they can be taken in"
 
     def place(self, keyframe: Keyframe) -> tuple[Keyframe, str | None]:
         """The next keyframe in order as the map may have it, and what was wrong with it.
@@ -86,14 +131,16 @@ class Peer:
             keyframe = replace(keyframe, cov=keyframe.cov * (_MOST_VARIANCE / most))
         return keyframe, complaint
 
-    def report(self) -> dict[str, Any]:
+    def report(self, now_ns: int) -> dict[str, Any]:
         """edge.json's fields of one run, as far as it was heard."""
         return {
             "kind": str(self.hello.kind),
-            "run_id": self.hello.run_id,
-            "state": str(self.state),
+            "run": self.key,
+            **self.status.report(now_ns, self.heard_ns),
             "gone": self.gone,
             **{name: self.counts[name] for name in _COUNTS},
+            "refused_messages": self.refusals.n,
+            "last_refusal": self.refusals.reason or None,
         }
 
 

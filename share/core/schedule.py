@@ -39,6 +39,11 @@ class Schedule:
         self._policy.forget(agent)
         self._newest.pop(agent, None)
 
+    def drop(self, agent: str) -> None:
+        """Nothing is remembered of that name."""
+        self.begin(agent)
+        self._rated.pop(agent, None)
+
     def evaluated(
         self, agent: str, kind: AgentKind, told: Evaluation, now_ns: int, t_s: float
     ) -> float | None:

@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 
 from share.config import SequencerConfig
+from share.core.imu_check import ImuCheck, ImuRange
 from share.core.measurement import CAM0, CAM1, DEPTH, IMU, LazyImage, Measurement
 from share.core.stamps import StampRepair
 from share.geometry.camera import Rig
 from share.types import ImuBatch
 
+_USUAL = ImuRange()
 _DEAD = 10  # a stream silent for so many times what a frame waits is not waited for any more
 
 
@@ -48,6 +50,8 @@ class SequencerCounters:
     unpaired: int = 0  # dropped: images without a partner within sync_tolerance_ms
     imu_silent: int = 0  # frames without an IMU sample although the rig has an IMU
     imu_dropped: int = 0  # samples longer than max_jump_s before their frame
+    imu_out_of_range: int = 0  # dropped: beyond what the sensor can measure, or not finite
+    imu_spikes: int = 0  # dropped: single samples far from those around them
     wraps: int = 0
     jumps: int = 0
     strays: int = 0
@@ -66,9 +70,11 @@ def sequence(
     config: SequencerConfig,
     counters: SequencerCounters,
     imu_shift_ns: int = 0,
+    imu_range: ImuRange = _USUAL,
 ) -> Iterator[Bundle]:
     """Merge by time. `streams` as `streams_of` gives them; rate_hz: the frame rate, 0 if unknown;
-    imu_shift_ns: IMU time less camera time, by which a frame's IMU samples are later stamped than it.
+    imu_shift_ns: IMU time less camera time, by which a frame's IMU samples are later stamped than it;
+    imu_range: beyond which a sample is none (`share.core.imu_check`).
 
     Every frame has its partner image: cam1, or depth where there is no cam1; depth beside cam1 may be
     missing. A partner that is dead (silent for _DEAD times what a frame waits) is done without where the
@@ -77,7 +83,8 @@ def sequence(
     Streams may be out of step with each other by up to imu_silent_ms, and within themselves by
     reorder_ms: such disorder does not change the bundles. Memory is bounded by these times.
     """
-    repair, merger = StampRepair(config.max_jump_s), _Merger(streams, rate_hz, config, counters, imu_shift_ns)
+    repair = StampRepair(config.max_jump_s)
+    merger = _Merger(streams, rate_hz, config, counters, imu_shift_ns, imu_range)
     for measurement in measurements:
         if measurement.stream in merger.buffers:
             for stamp, usable in repair.feed(measurement):
@@ -143,12 +150,14 @@ class _Merger:
         config: SequencerConfig,
         counters: SequencerCounters,
         imu_shift_ns: int = 0,
+        imu_range: ImuRange = _USUAL,
     ) -> None:
         self.buffers = {name: _Buffer(_ns(config.reorder_ms)) for name in streams}
         self.backward = 0
         self._partners = [self.buffers[name] for name in (CAM1, DEPTH) if name in streams]
         self._images = self.buffers[CAM0]
         self._imu = self.buffers.get(IMU)
+        self._check = ImuCheck(imu_range)
         self._now, self._first = -(2**62), 2**62
         self._last: int | None = None
         self._counters = counters
@@ -254,14 +263,22 @@ class _Merger:
         if self._imu is None:
             return ImuBatch.empty()
         self._counters.imu_dropped += len(self._imu.pop_until(stamp - self._keep))
-        samples = self._imu.pop_until(stamp)
-        self._counters.imu_samples += len(samples)
+        batch = self._measured(self._imu.pop_until(stamp))
+        self._counters.imu_samples += len(batch)
+        self._counters.imu_silent += not len(batch)
+        return batch
+
+    def _measured(self, samples: list[tuple[int, Any]]) -> ImuBatch:
+        """Those that are measurements."""
         if not samples:
-            self._counters.imu_silent += 1
             return ImuBatch.empty()
-        stamps, values = zip(*samples, strict=True)
-        table = np.array(values)
-        return ImuBatch(np.array(stamps, np.int64), table[:, :3], table[:, 3:])
+        stamps, table = np.array([s for s, _ in samples], np.int64), np.array([v for _, v in samples], float)
+        good = self._check.believed(stamps, table)
+        self._counters.imu_out_of_range = self._check.out_of_range
+        self._counters.imu_spikes = self._check.spikes
+        if not good.all():
+            stamps, table = stamps[good], table[good]
+        return ImuBatch(stamps, table[:, :3], table[:, 3:])
 
     def _forget(self) -> None:
         """Drop what no frame can want any more, so that a stream without frames does not fill memory."""

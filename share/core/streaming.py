@@ -69,6 +69,7 @@ class Streaming:
             T_odom_body=answer.T_odom_body,
             keyframe=answer.keyframe,
             new_stretch=answer.new_stretch or broken,
+            waits=answer.waits,
         )
 
     def report(self) -> dict[str, int]:

@@ -6,25 +6,35 @@ It has no map. An agent is welcomed once its tracker is ready, so that its first
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from share.core.afar import Afar
 from share.core.edge import Edge
-from share.core.edge_events import Answered, Event, Lost, Ready, ToTracker
+from share.core.edge_events import Answered, Event, Lost, Ready, Received, ToTracker
 from share.core.peer import Peer
 from share.core.window import Window
 from share.types import Frame
 from share.wire import messages as wire
 
 
+@dataclass(frozen=True)
+class Room:
+    """How many agents can be tracked at a time, and of what that comes, for a person."""
+
+    agents: int
+    why: str
+
+
 class TrackingEdge(Edge):
     """Beside the effects of `Edge`, but for those to the mapper and the keeper: BeginTracking, Track and
-    EndTracking; it is told Ready, Answered and Lost."""
+    EndTracking; it is told Ready, Answered and Lost. room: an agent beyond it is refused."""
 
     tracks: ClassVar[bool] = True
 
-    def __init__(self, *arguments: Any, **named: Any) -> None:
+    def __init__(self, *arguments: Any, room: Room | None = None, **named: Any) -> None:
         super().__init__(*arguments, **named)
+        self._room = room
         self._afar: dict[str, Afar] = {}  # by the key of the run
 
     def _react(self, event: Event, now_ns: int) -> None:
@@ -44,7 +54,7 @@ class TrackingEdge(Edge):
                 afar.is_ready = True
                 self._welcome(peer_id, peer, now_ns)
             case Answered():
-                peer.state = event.answer.state
+                peer.status.posed(event.answer.state, now_ns)
                 self._send(peer_id, event.answer)
                 self._do(afar.answered(event.answer, now_ns))
             case Lost():
@@ -56,6 +66,9 @@ class TrackingEdge(Edge):
                     self._send(peer_id, wire.Refused(f"the process that is to track it {event.how}"))
 
     def _told(self, peer_id: bytes, peer: Peer, message: wire.Message, now_ns: int) -> None:
+        if isinstance(message, wire.Status):
+            peer.status.told(message, now_ns)
+            return
         if not isinstance(message, Frame):
             peer.counts["unexpected"] += 1
             return
@@ -64,10 +77,26 @@ class TrackingEdge(Edge):
         except ValueError as error:
             self._complain(peer, str(error), now_ns)
 
+    def _objection(self, event: Received, hello: wire.Hello, now_ns: int) -> str | None:
+        known = self._peers.get(event.peer)
+        return super()._objection(event, hello, now_ns) or self._full(None if known is None else known.key)
+
+    def _full(self, key: str | None) -> str | None:
+        """Why no tracker can begin for this run, or for a new one, if none can."""
+        running = [other for other, afar in self._afar.items() if afar.is_running and other != key]
+        if self._room is None or len(running) < self._room.agents:
+            return None
+        most = f"{self._room.agents} streamed agent{'' if self._room.agents == 1 else 's'}"
+        return f"this machine can track {most}: {self._room.why}; wait until one leaves"
+
     def _enter(self, peer_id: bytes, peer: Peer) -> None:
         self._know(peer_id, peer)
         window = Window(self._config.stream.window)
         self._afar[peer.key] = Afar(peer.key, peer.hello.rig, window)
+
+    def _forget(self, peer: Peer) -> None:
+        super()._forget(peer)
+        del self._afar[peer.key]
 
     def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
         """Now, or as soon as its tracker is ready."""
@@ -79,7 +108,9 @@ class TrackingEdge(Edge):
     def _heard(self, peer: Peer, now_ns: int) -> None:
         was_gone = peer.gone
         super()._heard(peer, now_ns)
-        if was_gone:
+        if was_gone and (reason := self._full(peer.key)) is not None:
+            self._send(self._by_key[peer.key], wire.Refused(reason))
+        elif was_gone:
             self._do(self._afar[peer.key].begin())
 
     def _gone(self, peer: Peer, what: str, reason: str, now_ns: int) -> None:

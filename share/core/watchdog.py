@@ -72,6 +72,11 @@ class Watchdog:
         """Connections after the first."""
         return max(0, self._connections - 1)
 
+    @property
+    def without(self) -> tuple[str, ...]:
+        """Streams that are done without."""
+        return tuple(name for name in self._heard_ns if name in self._without)
+
     def connected(self, now_ns: int) -> None:
         """The device delivers, or is about to."""
         self.health = Health.OK

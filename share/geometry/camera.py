@@ -14,6 +14,11 @@ import numpy as np
 from share.types import F64, checked_pose
 
 MOST_TIMESHIFT_S = 1.0
+MOST_PIXELS = 10**8  # of an image: beyond any camera's
+_FOCAL_PX = (1.0, 1e5)  # shorter or longer, and what is divided or multiplied by it is noise
+_MOST_PX = 1e6  # the principal point, which may lie outside the image, from its corner
+_MOST_NOISE, _MOST_RATE_HZ = 1e3, 1e5  # of an IMU
+_MOST_DISTORTION = 1e4  # of a coefficient; k3 of a lens with a narrow view is some hundreds
 
 
 def rays(uv: F64) -> F64:
@@ -36,12 +41,21 @@ class Camera:
     def __post_init__(self) -> None:
         if self.width <= 0 or self.height <= 0:
             raise ValueError(f"resolution: {self.width}x{self.height} is not positive")
+        if self.width * self.height > MOST_PIXELS:
+            raise ValueError(f"resolution: {self.width}x{self.height} is more than a camera has")
         if not (self.fx > 0 and self.fy > 0):
             raise ValueError(f"intrinsics: focal lengths {self.fx}, {self.fy} must be positive")
         if len(self.distortion) not in (0, 4, 5):
             raise ValueError(f"distortion: {len(self.distortion)} coefficients, expected 0, 4 or 5")
         if not np.isfinite([self.fx, self.fy, self.cx, self.cy, *self.distortion]).all():
             raise ValueError("intrinsics: has values that are not finite")
+        shortest, longest = _FOCAL_PX
+        if not shortest <= min(self.fx, self.fy) <= max(self.fx, self.fy) <= longest:
+            raise ValueError(f"intrinsics: focal lengths {self.fx:g}, {self.fy:g} px are no camera's")
+        if max(abs(self.cx), abs(self.cy)) > _MOST_PX:
+            raise ValueError(f"intrinsics: principal point {self.cx:g}, {self.cy:g} px is no camera's")
+        if max(map(abs, self.distortion), default=0.0) > _MOST_DISTORTION:
+            raise ValueError(f"distortion: coefficients beyond {_MOST_DISTORTION:g} are no lens's")
 
     @property
     def K(self) -> F64:
@@ -143,6 +157,10 @@ class ImuNoise:
         told = (self.gyro_density, self.accel_density, self.gyro_walk, self.accel_walk, self.rate_hz)
         if not all(0 <= value < np.inf for value in told):
             raise ValueError("IMU: has noise or a rate that is negative or not finite")
+        if max(told[:4]) > _MOST_NOISE or self.rate_hz > _MOST_RATE_HZ:
+            raise ValueError(
+                f"IMU: noise beyond {_MOST_NOISE:g} or a rate beyond {_MOST_RATE_HZ:g} Hz is none"
+            )
 
 
 @dataclass(frozen=True, eq=False)

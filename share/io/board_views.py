@@ -13,7 +13,7 @@ from share.errors import DataError, UsageError
 from share.geometry.camera import Rig
 from share.geometry.target import Target
 from share.io.calibration import Calibration
-from share.io.images import decode_gray
+from share.io.images import decode_gray, read_picture
 from share.io.pool import Pool
 from share.io.source import READERS, calibration_of, open_source
 from share.types import U8
@@ -76,7 +76,7 @@ def _folder(folder: Path, eyes: Sequence[str], said: Calibration | None, alone: 
 
     def read() -> Iterator[tuple[str, tuple[U8, ...]]]:
         for name in names:
-            yield name, tuple(decode_gray(one[name].read_bytes(), str(one[name])) for one in found)
+            yield name, tuple(decode_gray(read_picture(one[name]), str(one[name])) for one in found)
 
     return Pictures(len(names), None if said is None else said.rig, read, said, _only(said))
 

@@ -166,6 +166,8 @@ def _make(
 
 def _resolution(section: Section, key: str) -> tuple[int, int]:
     width, height = section.numbers(key, (2,))
+    if not (width.is_integer() and height.is_integer()):
+        raise ConfigError(f"{section.where}: {key}: expected whole numbers, found {width:g} and {height:g}")
     return int(width), int(height)
 
 
@@ -188,13 +190,16 @@ def imu_noise(section: Section, rate: str) -> ImuNoise:
     def positive(key: str) -> float:
         return section.number(key, positive=True)
 
-    return ImuNoise(
-        gyro_density=positive("gyroscope_noise_density"),
-        accel_density=positive("accelerometer_noise_density"),
-        gyro_walk=positive("gyroscope_random_walk"),
-        accel_walk=positive("accelerometer_random_walk"),
-        rate_hz=positive(rate),
-    )
+    try:
+        return ImuNoise(
+            gyro_density=positive("gyroscope_noise_density"),
+            accel_density=positive("accelerometer_noise_density"),
+            gyro_walk=positive("gyroscope_random_walk"),
+            accel_walk=positive("accelerometer_random_walk"),
+            rate_hz=positive(rate),
+        )
+    except ValueError as error:
+        raise ConfigError(f"{section.where}: {error}") from None
 
 
 def kalibr_T_imu_cam(cam: Section) -> F64:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from share.core.measurement import CAM0, CAM1, IMU, LazyImage, Measurement
-from share.errors import UsageError
+from share.errors import DataError, MisfitError, UsageError
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise
 from share.io.files import atomic_write, check_writable, new_folder
@@ -69,12 +69,23 @@ def to_euroc(source: Source, out: Path, progress: Progress) -> None:
 
 
 def _counted(source: Source, progress: Progress) -> Iterator[Measurement]:
-    """All measurements; the first image of each camera is decoded, to find a wrong size before the end."""
+    """All measurements but images that are damaged; of each camera they are decoded until one is whole, to
+    find a wrong size before the end."""
     tried = set()
     for measurement in source.measurements():
-        if measurement.stream != IMU and measurement.stream not in tried:
-            measurement.payload.load()
-            tried.add(measurement.stream)
+        stream, image = measurement.stream, measurement.payload
+        try:
+            if stream != IMU and stream not in tried:
+                image.load()
+                tried.add(stream)
+            elif isinstance(image, EncodedImage):
+                image.check()
+        except MisfitError:
+            raise
+        except DataError as error:
+            source.losses.add(what := f"images of {stream}", str(measurement.stamp_ns), str(error))
+            source.losses.check(what, source.images_count)
+            continue
         yield measurement
         if measurement.stream == CAM0:
             progress(1)

@@ -27,7 +27,7 @@ def describe(source: Source) -> dict[str, Any]:
         "streams": {name: describe_stream(s) for name, s in stamps.items()},
         "calibration": describe_rig(source.rig),
         "truth": _truth(source),
-        "notes": list(source.notes),
+        "notes": [*source.notes, *source.losses.lines()],
     }
 
 

@@ -11,15 +11,17 @@ from pathlib import Path
 import numpy as np
 
 from share.core.measurement import CAM0, CAM1, LazyImage
-from share.errors import ConfigError, DataError
+from share.errors import ConfigError
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.io import tables
 from share.io.calibration import Calibration, read_euroc
 from share.io.images import file_image
+from share.io.inside import inside
+from share.io.losses import Losses
 from share.io.recording import FolderSource
 from share.io.section import read_yaml
-from share.io.trajectory import Trajectory, poses
+from share.io.trajectory import Trajectory, trajectory_of
 from share.types import F64
 
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
@@ -33,12 +35,15 @@ def open_euroc(path: Path, calibration: Calibration | None, frames: slice | None
     """The recording in `path` (holds mav0, or is it). Raises DataError, ConfigError, UsageError."""
     root = path / "mav0" if (path / "mav0").is_dir() else path
     rig = fit(_own_rig(root) if calibration is None else calibration.rig, root)
-    images: dict[str, list[tuple[int, LazyImage]]] = {CAM0: _images(root / CAM0, rig.cam0)}
+    losses = Losses()
+    images: dict[str, list[tuple[int, LazyImage]]] = {CAM0: _images(root / CAM0, rig.cam0, losses)}
     if rig.cam1:
-        images[CAM1] = _images(root / CAM1, rig.cam1)
-    imu = tables.read_table(root / "imu0" / "data.csv", 7) if rig.imu else None
+        images[CAM1] = _images(root / CAM1, rig.cam1, losses)
+    imu = tables.read_table(root / "imu0" / "data.csv", 7, losses=losses) if rig.imu else None
     name = (path if path.name != "mav0" else path.parent).resolve().name
-    source = FolderSource(name, rig, images, imu, lambda: _truth(root, rig), _notes(root, rig))
+    source = FolderSource(
+        name, rig, images, imu, lambda: _truth(root, rig, losses), _notes(root, rig), losses
+    )
     return source.part(frames)
 
 
@@ -61,37 +66,38 @@ def _own_rig(root: Path) -> Rig:
     return read_euroc(root / CAM0 / "sensor.yaml", sensor(CAM1), sensor("imu0")).rig
 
 
-def _images(folder: Path, camera: Camera) -> list[tuple[int, LazyImage]]:
-    """data.csv's images, all of which must be there."""
-    listing = folder / "data.csv"
-    lines = list(tables.rows(listing, ",", 2))
-    stamps = [tables.parse_ns(fields[0], f"{listing}, line {line}") for line, fields in lines]
-    tables.check_sorted(listing, np.array(stamps, np.int64))
-    names = [fields[1] for _, fields in lines]
-    check_present(folder / "data", names, listing)
-    return [
-        (stamp, file_image(folder / "data" / name, camera)) for stamp, name in zip(stamps, names, strict=True)
-    ]
+def _images(folder: Path, camera: Camera, losses: Losses) -> list[tuple[int, LazyImage]]:
+    """data.csv's images that are there."""
+    listing, data = folder / "data.csv", folder / "data"
+
+    def parse(fields: list[str], where: str) -> tuple[int, str]:
+        inside(data, fields[1], where)
+        return tables.parse_ns(fields[0], where), fields[1]
+
+    _, found = tables.parsed(listing, ",", 2, parse, losses)
+    there = present(data, [name for _, name in found], listing, losses)
+    return [(stamp, file_image(data / name, camera)) for stamp, name in found if name in there]
 
 
-def check_present(folder: Path, names: list[str], listing: Path) -> None:
-    """Raises DataError if files of `names` are not in `folder`: better now than in mid-run."""
+def present(folder: Path, names: list[str], listing: Path, losses: Losses) -> set[str]:
+    """Which of the images `names` are in `folder`: better found now than in mid-run. Raises DataError where
+    more than 5 % are missing."""
     have = set(os.listdir(folder)) if folder.is_dir() else set()
-    missing = [name for name in names if name not in have]
-    if missing:
-        raise DataError(
-            f"{listing}: {len(missing)} of {len(names)} images are missing from {folder} "
-            f"(first: {missing[0]}); copy the recording again"
-        )
+    what = f"images of {listing}"
+    for name in (name for name in names if name not in have):
+        losses.add(what, name, f"{listing}: {name} is missing from {folder}; copy the recording again")
+    losses.check(what, len(names))
+    return have
 
 
-def _truth(root: Path, rig: Rig) -> Trajectory | None:
+def _truth(root: Path, rig: Rig, losses: Losses) -> Trajectory | None:
     folder = next((root / name for name in TRUTHS if (root / name / "data.csv").is_file()), None)
     if folder is None:
         return None
-    stamps, values = tables.read_table(folder / "data.csv", 8)
-    T_world_sensor = poses(values[:, :3], values[:, [4, 5, 6, 3]], folder / "data.csv")
-    return Trajectory(stamps, T_world_sensor @ _T_sensor_body(root, folder, rig))
+    file = folder / "data.csv"
+    stamps, values = tables.read_table(file, 8, losses=losses)
+    truth = trajectory_of(stamps, values[:, :3], values[:, [4, 5, 6, 3]], file, losses)
+    return Trajectory(truth.stamps_ns, truth.T @ _T_sensor_body(root, folder, rig))
 
 
 def _T_sensor_body(root: Path, truth: Path, rig: Rig) -> F64:

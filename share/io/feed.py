@@ -132,6 +132,19 @@ class Feed:
     def health(self) -> Health:
         return self._watchdog.health
 
+    @property
+    def image_ns(self) -> int | None:
+        """When cam0's newest image came, read or not, on the host's monotonic clock; None before any."""
+        return self._heard.get(CAM0)
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the camera now, for a person; empty: nothing."""
+        health = self.health
+        if health is Health.AWAY:
+            return "the camera is away"
+        return "" if health is Health.OK else f"the camera goes without {', '.join(self._watchdog.without)}"
+
     def status(self) -> FeedStatus:
         """For a live line."""
         streams = self.intake.streams

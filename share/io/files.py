@@ -16,15 +16,16 @@ from share.errors import ShareError, UsageError
 def atomic_write(path: Path, data: bytes | str) -> None:
     """Write beside `path`, make it durable, then take its name: `path` is old or new, never between.
 
-    A link is followed, and a device or pipe simply written to. Raises UsageError if the folder cannot
-    be written to, ShareError if the disk is full or fails.
+    A link of that name is replaced, not followed: who can put one into our folder has no say over what else
+    we write. A device or pipe is simply written to. Raises UsageError if the folder cannot be written to,
+    ShareError if the disk is full or fails.
     """
     content = data.encode() if isinstance(data, str) else data
     if is_special(path):
         with writing(path):
             path.write_bytes(content)
         return
-    path = path.resolve() if path.is_symlink() else path
+    path = path.resolve() if _of_system(path) else path
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     except OSError as error:
@@ -76,8 +77,29 @@ def check_writable(path: Path) -> Path:
 
 
 def is_special(path: Path) -> bool:
-    """Whether it is a device or a pipe (/dev/null, /dev/stdout), which must not be replaced by a file."""
+    """Whether it is a device or a pipe (/dev/null, /dev/stdout), which must not be replaced by a file. A link
+    to one is not, but for those of the system."""
+    if path.is_symlink() and not _of_system(path):
+        return False
     return path.exists() and not path.is_file() and not path.is_dir()
+
+
+def _of_system(path: Path) -> bool:
+    """Whether the system made it, as /dev/stdout, which is a link."""
+    return path.absolute().parts[1:2] in (("dev",), ("proc",))
+
+
+def fresh(path: Path) -> IO[bytes]:
+    """A new, empty file in the place of what had that name: neither a link there nor another name of the same
+    file is written through. A device or pipe is opened as it is. Raises OSError."""
+    if is_special(path):
+        return path.open("wb")
+    with contextlib.suppress(FileNotFoundError):
+        path.unlink()
+    return os.fdopen(os.open(path, _FRESH, 0o666), "wb")
+
+
+_FRESH = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 def claim(folder: Path) -> int:

@@ -1,7 +1,8 @@
 """Encoded images to arrays: gray uint8, or depth as float32 metres. Damage is found, never shown.
 
-libjpeg fills a truncated image with gray and goes on, so end markers are looked for first; PNG
-checksums are verified, because a decoder may hand out half a depth map.
+Nothing is decoded before its header says that it is as large as it should be. libjpeg fills a truncated
+image with gray and goes on, so end markers are looked for first; PNG checksums are verified, because a
+decoder may hand out half a depth map.
 """
 
 from __future__ import annotations
@@ -17,12 +18,16 @@ from numpy.typing import NDArray
 
 from share.core.sequencer import Bundle
 from share.errors import DataError, MisfitError
-from share.geometry.camera import Camera
+from share.geometry.camera import MOST_PIXELS, Camera
+from share.io.image_header import ImageHeader, image_header
+from share.io.regular_file import MB, read_bytes
 from share.types import F32, U8, Frame
 
 _MEND = "record or copy it again, or take it out of the list"
 _TAIL = 64  # bytes in which an end marker may be followed by padding
 _PNG = b"\x89PNG\r\n\x1a\n"
+_MOST_BYTES = 16  # of a file for each pixel: four channels of 16 bits, twice
+_MOST_SCANS = 200  # of a JPEG; progressive ones have ten, and each costs as much as a whole image
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what is wrong is said once, by DataError
 
@@ -43,12 +48,21 @@ class EncodedImage:
 
     def read(self) -> bytes:
         """The encoded bytes. Raises DataError if the file is missing or the image is cut short."""
-        data = self.data if isinstance(self.data, bytes) else _read_file(self.data)
+        most = _MOST_BYTES * self.width * self.height + MB
+        data = self.data if isinstance(self.data, bytes) else _read_file(self.data, most)
         check_complete(data, self.where)
         return data
 
+    def check(self) -> None:
+        """Raises DataError unless it is whole and of the calibration's size, as far as that is known without
+        its pixels."""
+        header = _header(self.read(), self.where)
+        check_said(header.width, header.height, self.width, self.height, self.where)
+
     def load(self) -> NDArray[Any]:
         data = self.read()
+        header = _header(data, self.where)
+        check_said(header.width, header.height, self.width, self.height, self.where)
         image = (
             decode_depth(data, self.depth_scale, self.where)
             if self.depth_scale
@@ -87,18 +101,37 @@ def load(bundle: Bundle) -> Frame:
 
 def decode_gray(data: bytes, where: str) -> U8:
     """JPEG or PNG, gray or colour -> (H, W) uint8."""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise DataError(f"{where}: the image cannot be decoded; {_MEND}")
-    return np.asarray(image, np.uint8)
+    return np.asarray(_decoded(data, cv2.IMREAD_GRAYSCALE, where), np.uint8)
 
 
 def decode_depth(data: bytes, depth_scale: float, where: str) -> F32:
     """16-bit PNG -> (H, W) float32 m, 0 = no reading."""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if not _header(data, where).is_depth:
+        raise DataError(f"{where}: depth must have one 16-bit channel and be a PNG; {_MEND}")
+    return depth_metres(_decoded(data, cv2.IMREAD_UNCHANGED, where), depth_scale, where)
+
+
+def _decoded(data: bytes, how: int, where: str) -> NDArray[Any]:
+    header = _header(data, where)
+    if not 0 < header.width * header.height <= MOST_PIXELS or header.scans > _MOST_SCANS:
+        raise DataError(
+            f"{where}: says that it has {header.width}x{header.height} pixels in {header.scans} scans, "
+            f"which no camera takes; {_MEND}"
+        )
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), how)
+    except (cv2.error, MemoryError):
+        image = None
     if image is None:
-        raise DataError(f"{where}: the depth image cannot be decoded; {_MEND}")
-    return depth_metres(np.asarray(image), depth_scale, where)
+        raise DataError(f"{where}: the image cannot be decoded; {_MEND}")
+    return np.asarray(image)
+
+
+def _header(data: bytes, where: str) -> ImageHeader:
+    header = image_header(data)
+    if header is None:
+        raise DataError(f"{where}: the image cannot be decoded: its header is damaged; {_MEND}")
+    return header
 
 
 def depth_metres(raw: NDArray[Any], depth_scale: float, where: str) -> F32:
@@ -125,12 +158,17 @@ def encode_png(image: U8) -> bytes:
 
 def check_size(image: NDArray[Any], width: int, height: int, where: str) -> NDArray[Any]:
     """`image` if it is as large as the calibration says, else MisfitError."""
-    if image.shape != (height, width):
+    check_said(image.shape[1], image.shape[0], width, height, where)
+    return image
+
+
+def check_said(found_width: int, found_height: int, width: int, height: int, where: str) -> None:
+    """Raises MisfitError for an image of another size than the calibration's; its pixels are not touched."""
+    if (found_width, found_height) != (width, height):
         raise MisfitError(
-            f"{where}: is {image.shape[1]}x{image.shape[0]}, but the calibration is for {width}x{height}; "
+            f"{where}: is {found_width}x{found_height}, but the calibration is for {width}x{height}; "
             "give the calibration of this recording with --calib"
         )
-    return image
 
 
 def check_complete(data: bytes, where: str) -> None:
@@ -160,9 +198,14 @@ def _png_sound(data: bytes) -> bool:
     return False
 
 
-def _read_file(path: Path) -> bytes:
+def read_picture(path: Path) -> bytes:
+    """A picture without a calibration that says how large it is. Raises DataError."""
+    return _read_file(path, _MOST_BYTES * MOST_PIXELS)
+
+
+def _read_file(path: Path, most: int) -> bytes:
     try:
-        return path.read_bytes()
+        return read_bytes(path, most)
     except FileNotFoundError:
         raise DataError(f"{path}: the image is listed but missing; {_MEND}") from None
     except OSError as error:

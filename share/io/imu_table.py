@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from share.errors import DataError, UsageError
+from share.errors import UsageError
 from share.io import tables
+from share.io.losses import Losses
 from share.io.session import is_session, read_session
 from share.types import F64, I64, ImuBatch
 
@@ -21,8 +22,8 @@ _KINDS = (
 
 @dataclass(frozen=True, eq=False)
 class ImuTable:
-    """imu: samples in order of time; dropped: such as were not later than the one before; serial: of the
-    device, where it is known."""
+    """imu: samples in order of time; dropped: such as were damaged or not later than the one before; serial:
+    of the device, where it is known."""
 
     name: str
     imu: ImuBatch
@@ -44,7 +45,9 @@ def read_imu(spec: str, told: Callable[[int, int], None] = lambda done, total: N
         return _of_mcap(path.name, read_session(path.parent).recording(path.name), told)
     for csv in imu_tables(path):
         if csv.is_file():
-            return _table(path.stem, *tables.read_table(csv, 7))
+            losses = Losses()
+            stamps, values = tables.read_table(csv, 7, losses=losses)
+            return _table(path.stem, stamps, values, lost=sum(losses.counts.values()))
     if not path.exists():
         raise UsageError(f"SOURCE {path}: no such file or folder")
     raise UsageError(f"{spec}: is no recording of an IMU that SHARE reads: {_KINDS}")
@@ -62,8 +65,9 @@ def _of_mcap(name: str, path: Path, told: Callable[[int, int], None]) -> ImuTabl
     from share.io.mcap.imu import read_imu as read
     from share.io.mcap.reader import own_serial
 
-    file = McapFile(path)
-    return _table(name, *read(file, told), serial=own_serial(file))
+    file, losses = McapFile(path), Losses()
+    stamps, values = read(file, told, losses)
+    return _table(name, stamps, values, own_serial(file), sum(losses.counts.values()))
 
 
 def _of_db3(path: Path, told: Callable[[int, int], None]) -> ImuTable:
@@ -77,10 +81,15 @@ def _of_db3(path: Path, told: Callable[[int, int], None]) -> ImuTable:
     return table
 
 
-def _table(name: str, stamps_ns: I64, values: F64, serial: str | None = None) -> ImuTable:
-    finite = np.isfinite(values).all(axis=1)
-    if not finite.all():
-        raise DataError(f"{name}: IMU sample {int((~finite).argmax()) + 1} is not finite; leave it out")
+def _table(name: str, stamps_ns: I64, values: F64, serial: str | None = None, lost: int = 0) -> ImuTable:
+    """lost: samples that could not even be read. Raises DataError where more than 5 % are damaged."""
+    finite = np.asarray(np.isfinite(values).all(axis=1))
+    losses = Losses()
+    for k in np.flatnonzero(~finite):
+        losses.add("IMU samples", str(k), f"{name}: IMU sample {k + 1} is not finite")
+    losses.check("IMU samples", len(finite))
+    stamps_ns, values = stamps_ns[finite], values[finite]
     later = stamps_ns > np.maximum.accumulate(np.concatenate([[-(2**62)], stamps_ns[:-1]]))
     imu = ImuBatch(stamps_ns[later], values[later, :3], values[later, 3:])
-    return ImuTable(name, imu, int(np.count_nonzero(~later)), serial)
+    dropped = int(np.count_nonzero(~later)) + int(np.count_nonzero(~finite)) + lost
+    return ImuTable(name, imu, dropped, serial)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from share.errors import DataError
+from share.io.regular_file import REPORT, read_text
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -50,7 +51,7 @@ def with_nan(row: dict[str, Any]) -> dict[str, Any]:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text()
+        return read_text(path, REPORT)
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
@@ -62,6 +63,8 @@ def _object(text: str, where: str) -> dict[str, Any]:
         value = json.loads(text)
     except ValueError as error:
         raise DataError(f"{where}: is damaged: {error}") from None
+    except RecursionError:
+        raise DataError(f"{where}: is damaged: lists in lists without end") from None
     if not isinstance(value, dict):
         raise DataError(f"{where}: is damaged: it is no JSON object")
     return value

@@ -1,7 +1,8 @@
 """Who may talk to whom: CurveZMQ key pairs and the list of agents that an edge lets in, as text files.
 
 A folder holds one machine's pair, `NAME.public` and `NAME.secret`, and at an edge `authorized`. All are
-made of lines `share-public-key NAME KEY`, so the list is public keys one after the other. KEY is a
+made of lines `share-public-key NAME KEY`, so the list is public keys one after the other. There, names of
+the agents that may run on that machine can follow; where none do, only the agent called NAME may. KEY is a
 32-byte Curve25519 key in Z85 (RFC 26 CurveZMQ, RFC 32 Z85): 40 characters, none of them a quote.
 """
 
@@ -13,7 +14,7 @@ import re
 import socket
 import stat
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -24,7 +25,7 @@ from share.io.files import atomic_write, writing
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
 _Z85 = r"[0-9a-zA-Z.:+=^!/*?&<>()\[\]{}@%$#-]{40}"
 _LIST = "authorized"
-_LINE = re.compile(rf"share-(public|secret)-key ({_NAME}) ({_Z85})")
+_LINE = re.compile(rf"share-(public|secret)-key ({_NAME}) ({_Z85})((?: {_NAME})*)")
 
 
 @dataclass(frozen=True)
@@ -60,10 +61,22 @@ class AllowList:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._read: tuple[tuple[int, ...], dict[str, str]] = (), {}
+        self._read: tuple[tuple[int, ...], dict[str, Grant]] = (), {}
 
     def names(self) -> dict[str, str]:
         """Name by public key. Raises UsageError if the file cannot be read or has another form."""
+        return {key: grant.name for key, grant in self.grants().items()}
+
+    def agents(self, public: str) -> frozenset[str]:
+        """Names of the agents that this key may speak for; none while the file cannot be read."""
+        try:
+            grant = self.grants().get(public)
+        except UsageError:
+            return frozenset()
+        return frozenset() if grant is None else frozenset(grant.agents)
+
+    def grants(self) -> dict[str, Grant]:
+        """By public key. Raises UsageError if the file cannot be read or has another form."""
         try:
             status = self.path.stat()
         except FileNotFoundError:
@@ -79,20 +92,27 @@ class AllowList:
     def admits(self, public: str) -> bool:
         """Whether that key may connect. Nobody may while the file cannot be read."""
         try:
-            return public in self.names()
+            return public in self.grants()
         except UsageError:
             return False
 
     def trouble(self) -> str | None:
         """Why nobody may connect; None where the file can be read."""
         try:
-            self.names()
+            self.grants()
         except UsageError as error:
             return str(error)
         return None
 
-    def _parsed(self) -> dict[str, str]:
-        return {line.key: line.name for line in _lines(self.path) if line.key}
+    def _parsed(self) -> dict[str, Grant]:
+        return {line.key: Grant(line.name, line.agents) for line in _lines(self.path) if line.key}
+
+
+class Grant(NamedTuple):
+    """What the list says of a key: the name of its machine, and which agents it may speak for."""
+
+    name: str
+    agents: tuple[str, ...]
 
 
 class _Line(NamedTuple):
@@ -101,6 +121,7 @@ class _Line(NamedTuple):
     text: str
     name: str = ""
     key: str = ""
+    agents: tuple[str, ...] = ()
 
 
 def default_folder() -> Path:
@@ -148,7 +169,7 @@ def load(folder: Path) -> KeyPair:
     if path.stat().st_mode & 0o077:
         raise UsageError(f"{path}: others can read this secret; `chmod 600 {path}`, or make a new pair")
     match = _LINE.fullmatch(_text(path).strip())
-    if not match or match[1] != "secret" or not _is_key(match[3]):
+    if not match or match[1] != "secret" or not _is_key(match[3]) or match[4]:
         raise UsageError(
             f"{path}: is not a secret key of SHARE; move it away, then `share keys generate` makes a new pair"
         )
@@ -171,10 +192,12 @@ def allow_list(folder: Path) -> AllowList:
     return AllowList(folder / _LIST)
 
 
-def authorize(folder: Path, name: str, public: str) -> None:
-    """Let the agent machine `name` in. Raises UsageError if the name or the key is taken, or the list is
+def authorize(folder: Path, name: str, public: str, agents: Sequence[str] = ()) -> None:
+    """Let the machine `name` in, to speak for `agents` (default: the one agent called `name`), in place of
+    those it could speak for before. Raises UsageError if the name or the key is taken, or the list is
     damaged."""
-    name = _checked(name)
+    name, agents = _checked(name), [_checked(agent) for agent in agents]
+    line = _line(name, public, agents)
     _make(folder)
     with _locked(folder):
         names = dict(allow_list(folder).names())
@@ -182,8 +205,11 @@ def authorize(folder: Path, name: str, public: str) -> None:
             raise UsageError(f"'{name}': this key is authorized already, as '{names[public]}'")
         if name in names.values() and public not in names:
             raise UsageError(f"'{name}' has another key; `share keys revoke {name}` takes that away first")
+        lines = _lines(folder / _LIST)
         if public not in names:
-            _save(folder, [*_lines(folder / _LIST), _Line(_line(name, public))])
+            _save(folder, [*lines, _Line(line)])
+        elif agents:
+            _save(folder, [old._replace(text=line) if old.key == public else old for old in lines])
 
 
 def revoke(folder: Path, name: str) -> None:
@@ -226,8 +252,16 @@ def _public(line: str, where: str) -> tuple[str, str]:
     return match[2], match[3]
 
 
-def _line(name: str, public: str) -> str:
-    return f"share-public-key {name} {public}\n"
+def _granted(line: str, where: str) -> tuple[str, str, tuple[str, ...]]:
+    """Name, key and agents of a line of the list. Raises UsageError."""
+    name, key = _public(line, where)
+    match = _LINE.fullmatch(line.strip())
+    assert match is not None
+    return name, key, tuple(match[4].split()) or (name,)
+
+
+def _line(name: str, public: str, agents: Sequence[str] = ()) -> str:
+    return " ".join(("share-public-key", name, public, *agents)) + "\n"
 
 
 def _is_key(text: str) -> bool:
@@ -279,8 +313,7 @@ def _lines(path: Path) -> list[_Line]:
     found = []
     for number, text in enumerate(_text(path).splitlines(), 1):
         comment = not text.strip() or text.startswith("#")
-        name_and_key = ("", "") if comment else _public(text, f"{path}, line {number}")
-        found.append(_Line(text + "\n", *name_and_key))
+        found.append(_Line(text + "\n", *(() if comment else _granted(text, f"{path}, line {number}"))))
     return found
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
 from share.errors import ShareError
+from share.io.files import fresh
 
 
 class LineFile:
@@ -24,7 +26,7 @@ class LineFile:
         self._whole_bytes = 0
         self._failure = ""
         try:
-            self._file = path.open("w", buffering=1, encoding="utf-8")
+            self._file = io.TextIOWrapper(fresh(path), "utf-8", line_buffering=True)
         except OSError as error:
             self._fail(error)
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
+from share.core.imu_check import ImuRange
 from share.core.measurement import CAM0, Measurement
 from share.core.whose import as_read, of_another, unused
 from share.errors import UsageError
@@ -38,8 +39,15 @@ class LiveSource(Source):
     Raises UsageError, ShareError or DataError where it cannot be opened, or not with that calibration.
     """
 
-    def __init__(self, feed: Feed, rate_hz: float, calibration: Calibration | None = None) -> None:
-        """rate_hz: of cam0; calibration: in place of the factory's."""
+    def __init__(
+        self,
+        feed: Feed,
+        rate_hz: float,
+        calibration: Calibration | None = None,
+        imu_range: ImuRange | None = None,
+    ) -> None:
+        """rate_hz: of cam0; calibration: in place of the factory's; imu_range: None: unknown."""
+        self.imu_range = imu_range or Source.imu_range
         factory = feed.open()
         self.feed, self._rate_hz = feed, rate_hz
         self.name, self.serial = f"realsense:{feed.serial}", feed.serial
@@ -69,6 +77,21 @@ class LiveSource(Source):
     def arrived_ns(self, stamp_ns: int) -> int:
         """When cam0's image of that stamp came, on the host's monotonic clock."""
         return self.feed.arrived_ns(stamp_ns)
+
+    @property
+    def image_ns(self) -> int | None:
+        """When cam0's newest image came, tracked or not, on the same clock."""
+        return self.feed.image_ns
+
+    @property
+    def images_dropped(self) -> int:
+        """Of cam0, for newer ones, as the tracker was slower."""
+        return self.feed.queue.dropped.get(CAM0, 0)
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the camera now, for a person; empty: nothing."""
+        return self.feed.trouble
 
     def report(self) -> dict[str, Any]:
         return {"camera": self.feed.report()}

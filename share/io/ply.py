@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from share.io.files import writing
+from share.io.files import fresh, writing
 from share.types import F64
 
 Colour = tuple[int, int, int]
@@ -21,7 +21,7 @@ def write_ply(path: Path, clouds: Iterable[tuple[F64, Colour]]) -> int:
 
     The clouds are written as they come, their number into the header in the end.
     """
-    with writing(path), path.open("wb") as file:
+    with writing(path), fresh(path) as file:
         file.write(_header(0))
         count = 0
         for points, colour in clouds:

@@ -8,13 +8,14 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import islice
-from multiprocessing import connection, get_context, parent_process
+from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import TypeVar
 
 from share.errors import ShareError
+from share.spawning import SPAWN
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -28,9 +29,9 @@ class Pool:
     with this process."""
 
     def __init__(self, workers: int, start: Callable[..., None], arguments: tuple[object, ...]) -> None:
-        self._workers, context = workers, get_context("spawn")
-        self._going_on, self._ours = context.Pipe(duplex=False)  # nothing is sent: workers end when it closes
-        self._pool = ProcessPoolExecutor(workers, context, _begin, (self._going_on, start, arguments))
+        self._workers = workers
+        self._going_on, self._ours = SPAWN.Pipe(duplex=False)  # nothing is sent: workers end when it closes
+        self._pool = ProcessPoolExecutor(workers, SPAWN, _begin, (self._going_on, start, arguments))
 
     @property
     def count(self) -> int:
@@ -76,13 +77,9 @@ def _undisturbed() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _begin(
-    going_on: connection.Connection, start: Callable[..., None], arguments: tuple[object, ...]
-) -> None:
+def _begin(going_on: Connection, start: Callable[..., None], arguments: tuple[object, ...]) -> None:
     """The first thing that a process does."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDINGS)  # as they were when it was started
-    threading.Thread(target=_end_with_parent, args=(going_on,), daemon=True).start()
+    threading.Thread(target=_end_with_block, args=(going_on,), daemon=True).start()
     global _failed  # an exception here would be printed, and tell the parent nothing
     try:
         start(*arguments)
@@ -96,8 +93,7 @@ def _do(work: Callable[[Job], Result], job: Job) -> Result:
     return work(job)
 
 
-def _end_with_parent(going_on: connection.Connection) -> None:
-    parent = parent_process()
-    if parent is not None:
-        connection.wait([parent.sentinel, going_on])
-        os._exit(1)
+def _end_with_block(going_on: Connection) -> None:
+    with suppress(OSError):
+        going_on.poll(None)  # nothing is sent: until the other end is closed
+    os._exit(1)

@@ -11,9 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from share.core.imu_check import ImuRange
 from share.core.measurement import CAM0, IMU, LazyImage, Measurement
 from share.errors import DataError, UsageError
 from share.geometry.camera import Rig
+from share.io.losses import Losses
 from share.io.trajectory import Trajectory
 from share.types import F64, I64
 
@@ -26,6 +28,7 @@ class Source(ABC):
     rig: Rig
     notes: tuple[str, ...]
     serial: str | None = None
+    imu_range = ImuRange()  # of the widest usual sensor, where nobody says which it is
 
     @abstractmethod
     def stamps(self) -> dict[str, I64]:
@@ -41,6 +44,11 @@ class Source(ABC):
 
     def stop(self) -> None:  # noqa: B027 -- a recording ends by itself
         """Ask a live camera to end, from any thread or signal handler."""
+
+    @cached_property
+    def losses(self) -> Losses:
+        """What could not be read so far and was left out."""
+        return Losses()
 
     def report(self) -> dict[str, Any]:
         """What a live camera met, for report.json."""
@@ -105,6 +113,7 @@ class FolderSource(Source):
     imu: tuple[I64, F64] | None = None
     read_truth: Callable[[], Trajectory | None] = lambda: None
     notes: tuple[str, ...] = field(default=())
+    losses: Losses = field(default_factory=Losses)
 
     def stamps(self) -> dict[str, I64]:
         out = {
@@ -132,7 +141,7 @@ class FolderSource(Source):
         if imu is not None:
             keep = (imu[0] > span.imu_from) & (imu[0] <= span.imu_to)
             imu = (imu[0][keep], imu[1][keep])
-        return FolderSource(self.name, self.rig, images, imu, self.read_truth, self.notes)
+        return FolderSource(self.name, self.rig, images, imu, self.read_truth, self.notes, self.losses)
 
     def _streams(self) -> Iterator[Iterator[Measurement]]:
         if self.imu is not None:  # first, so that samples precede an image of the same stamp

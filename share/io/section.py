@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from share.errors import ConfigError
+from share.io.regular_file import SETTINGS, read_text
 from share.strict import load_yaml
 from share.types import F64, checked_pose
 
@@ -60,7 +61,8 @@ class Section:
         value = self.get(key)
         if isinstance(value, dict):
             value = value.get("data")
-        flat = [x for row in value for x in (row if isinstance(row, list) else [row])] if value else []
+        rows = value if isinstance(value, list) else []
+        flat = [x for row in rows for x in (row if isinstance(row, list) else [row])]
         if len(flat) != 16:
             raise ConfigError(f"{self.where}: {key}: expected a 4x4 matrix, found {len(flat)} numbers")
         try:
@@ -73,7 +75,7 @@ class Section:
     def _numbers(self, key: str, values: list[Any]) -> list[float]:
         try:
             numbers = [float(value) for value in values]  # PyYAML reads 1e-3 as text
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ConfigError(f"{self.where}: {key}: expected numbers, found {values}") from None
         if not np.isfinite(numbers).all():
             raise ConfigError(f"{self.where}: {key}: has values that are not finite: {values}")
@@ -83,7 +85,7 @@ class Section:
 def read_yaml(path: Path) -> Section:
     """The top mapping of a YAML file, also of one that OpenCV wrote (`%YAML:1.0`, `!!opencv-matrix`)."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, SETTINGS)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give the calibration with --calib") from None
     except UnicodeDecodeError:

@@ -7,17 +7,21 @@ truth/NAME.tum   pose of the body in the world, if known
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from share.errors import ConfigError, UsageError
 from share.io.calibration import Calibration, kalibr, read_calibration
+from share.io.inside import inside
 from share.io.section import Section, read_yaml
 from share.types import AgentKind
 
 SESSION = "session.yaml"
 SCHEMA = 1
+AGENT_NAME = "1 to 64 letters, digits, '_', '-' or '.'"
+_MOST_NS = 2**62  # of a clock's offset
 _KEYS = ("kind", "sensors", "rate_hz", "clock_offset_ns", "calibration")
 
 
@@ -51,6 +55,11 @@ class Session:
         return recording
 
 
+def is_agent_name(text: str) -> bool:
+    """Whether it can be an agent's, and so a file's."""
+    return re.fullmatch(r"[\w.-]{1,64}", text) is not None and not text.startswith(".")
+
+
 def is_session(folder: Path) -> bool:
     return (folder / SESSION).is_file()
 
@@ -68,8 +77,15 @@ def read_session(folder: Path) -> Session:
     if not agents.data:
         raise ConfigError(f"{agents.where}: names nobody")
     provenance = top.section("provenance").data if "provenance" in top else {}
-    found = {str(name): _agent(agents.section(name), folder) for name in agents.data}
+    found = {_name(name, agents.where): _agent(agents.section(name), folder) for name in agents.data}
     return Session(folder, found, provenance)
+
+
+def _name(name: Any, where: str) -> str:
+    """That of an agent, which its files have too. Raises ConfigError."""
+    if not isinstance(name, str | int) or not is_agent_name(str(name)):
+        raise ConfigError(f"{where}: '{name!s:.80}' is no name of an agent: use {AGENT_NAME}")
+    return str(name)
 
 
 def _agent(section: Section, folder: Path) -> SessionAgent:
@@ -80,7 +96,7 @@ def _agent(section: Section, folder: Path) -> SessionAgent:
     if kind not in list(AgentKind):
         raise ConfigError(f"{section.where}: kind '{kind}' is not known; known: {', '.join(AgentKind)}")
     offset = section.data.get("clock_offset_ns", 0)
-    if type(offset) is not int:
+    if type(offset) is not int or abs(offset) >= _MOST_NS:
         raise ConfigError(f"{section.where}: clock_offset_ns: expected whole nanoseconds, found {offset!r}")
     return SessionAgent(
         AgentKind(kind),
@@ -94,6 +110,6 @@ def _agent(section: Section, folder: Path) -> SessionAgent:
 def _calibration(section: Section, folder: Path) -> Calibration:
     """A file or folder below the session's, or Kalibr's chains written out: cam0, cam1, depth, imu0."""
     if isinstance(section.get("calibration"), str):
-        return read_calibration(folder / section.text("calibration"))
+        return read_calibration(inside(folder, section.text("calibration"), section.where))
     chain = section.section("calibration")
     return kalibr(chain, chain.section("imu0") if "imu0" in chain else None)

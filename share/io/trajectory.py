@@ -14,7 +14,11 @@ import numpy as np
 from share.errors import DataError
 from share.geometry import se3
 from share.io import tables
+from share.io.losses import Losses
 from share.types import F64, I64
+
+MOST_M = 1e7  # of a place: a truth by satellite counts from the middle of the earth
+_NEAR_ONE = 0.05  # what the length of a quaternion may be off 1
 
 
 class Trajectory(NamedTuple):
@@ -48,30 +52,46 @@ def format_tum(trajectory: Trajectory) -> str:
     return "".join(f"{t} {_format_numbers(row)}\n" for t, row in zip(stamps, numbers, strict=True))
 
 
-def read_tum(path: Path) -> Trajectory:
-    """Raises DataError naming file and line."""
-    stamps_ns, numbers = read_tum_table(path)
-    return Trajectory(stamps_ns, poses(numbers[:, :3], numbers[:, 3:], path))
+def read_tum(path: Path, losses: Losses | None = None) -> Trajectory:
+    """losses: takes the lines that are damaged. Raises DataError naming file and line, where that is not
+    given or more than 5 % are."""
+    stamps_ns, numbers = read_tum_table(path, losses=losses)
+    return trajectory_of(stamps_ns, numbers[:, :3], numbers[:, 3:], path, losses)
 
 
-def read_tum_table(path: Path, nan: bool = False) -> tuple[I64, F64]:
+def read_tum_table(path: Path, nan: bool = False, losses: Losses | None = None) -> tuple[I64, F64]:
     """Stamps (N,) ns, and x y z qx qy qz qw (N, 7). nan: these may be NaN. Raises DataError likewise."""
-    stamps, values = [], []
-    for number, fields in tables.rows(path, None, 8):
-        where = f"{path}, line {number}"
-        stamps.append(tables.parse_seconds(fields[0], where))
-        values.append([tables.parse_number(field, where, nan) for field in fields[1:8]])
-    stamps_ns = np.array(stamps, np.int64)
-    tables.check_sorted(path, stamps_ns, None)
-    return stamps_ns, np.array(values)
+
+    def parse(fields: list[str], where: str) -> tuple[int, list[float]]:
+        stamp = tables.parse_seconds(fields[0], where)
+        return stamp, [tables.parse_number(field, where, nan) for field in fields[1:8]]
+
+    stamps_ns, found = tables.parsed(path, None, 8, parse, losses)
+    return stamps_ns, np.array([values for _, values in found]).reshape(-1, 7)
+
+
+def trajectory_of(stamps_ns: I64, p: F64, q: F64, path: Path, losses: Losses | None) -> Trajectory:
+    """Poses of rows (N, 3) m and quaternions (N, 4) xyzw; rows that are no pose of a body go to `losses`.
+    Raises DataError likewise."""
+    if losses is None:
+        return Trajectory(stamps_ns, poses(p, q, path))
+    length = np.linalg.norm(q, axis=1)
+    good = (np.abs(length - 1) <= _NEAR_ONE) & (np.abs(p) <= MOST_M).all(1)
+    for i in np.flatnonzero(~good):
+        why = f"quaternion has length {length[i]:.3g}, or it is farther than {MOST_M:g} m"
+        losses.add(f"poses of {path}", str(stamps_ns[i]), f"{path}: pose at {stamps_ns[i]} ns: {why}")
+    losses.check(f"poses of {path}", len(good))
+    return Trajectory(stamps_ns[good], poses(p[good], q[good], path))
 
 
 def poses(p: F64, q: F64, path: Path) -> F64:
     """(N, 3) m and quaternions (N, 4) xyzw -> (N, 4, 4). DataError where a quaternion is no rotation."""
     norm = np.linalg.norm(q, axis=1)
-    bad = np.flatnonzero(np.abs(norm - 1) > 0.05)
+    bad = np.flatnonzero(~(np.abs(norm - 1) <= _NEAR_ONE))
     if len(bad):
         raise DataError(f"{path}: pose {bad[0] + 1}: quaternion has length {norm[bad[0]]:.3g}, expected 1")
+    if (far := np.flatnonzero(~(np.abs(p) <= MOST_M).all(1))).size:
+        raise DataError(f"{path}: pose {far[0] + 1}: is farther than {MOST_M:g} m from the origin")
     return se3.from_quat(p, q)
 
 

@@ -16,8 +16,10 @@ from share.errors import ConfigError, DataError
 from share.geometry.camera import Rig
 from share.io import tables
 from share.io.calibration import Calibration, read_camera_yaml
-from share.io.euroc import check_present
+from share.io.euroc import present
 from share.io.images import file_image
+from share.io.inside import inside
+from share.io.losses import Losses
 from share.io.recording import FolderSource
 from share.io.section import read_yaml
 from share.io.trajectory import Trajectory, read_tum
@@ -45,51 +47,58 @@ def open_tum(path: Path, calibration: Calibration | None, frames: slice | None) 
         raise ConfigError(f"{path}: the calibration has cam1, the recording has not; give another --calib")
     depth = rig.depth
     rig = Rig(cam0=rig.cam0, T_body_cam0=np.eye(4), depth=depth, T_depth_cam0=rig.T_depth_cam0)
-    pairs, note = _pairs(path)
+    losses = Losses()
+    pairs, note = _pairs(path, losses)
     images: dict[str, list[tuple[int, LazyImage]]] = {
         CAM0: [(stamp, file_image(path / colour, rig.cam0)) for stamp, colour, _ in pairs],
         DEPTH: [(stamp, file_image(path / file, depth, scale)) for stamp, _, file in pairs],
     }
-    source = FolderSource(path.resolve().name, rig, images, None, lambda: _truth(path, rig), note)
+    source = FolderSource(
+        path.resolve().name, rig, images, None, lambda: _truth(path, rig, losses), note, losses
+    )
     return source.part(frames)
 
 
-def _pairs(path: Path) -> tuple[list[Pair], tuple[str, ...]]:
+def _pairs(path: Path, losses: Losses) -> tuple[list[Pair], tuple[str, ...]]:
     listing = path / "associations.txt"
     note: tuple[str, ...] = ()
     if listing.is_file():
-        pairs = _associated(listing)
+        pairs = _associated(listing, losses)
     else:
         listing = path / "rgb.txt"
-        colour, depth = _list(listing), _list(path / "depth.txt")
+        colour, depth = _list(listing, losses), _list(path / "depth.txt", losses)
         pairs = _nearest(colour, depth)
         lost = len(colour) - len(pairs)
         if lost:
             note = (f"{lost} of {len(colour)} colour images have no depth image within 20 ms",)
     if not pairs:
         raise DataError(f"{listing}: no colour image has a depth image within 20 ms; are both of one clock?")
-    tables.check_sorted(listing, np.array([stamp for stamp, _, _ in pairs], np.int64), None)
     for column in (1, 2):
-        _check_files(path, [str(pair[column]) for pair in pairs], listing)
+        there = _there(path, [str(pair[column]) for pair in pairs], listing, losses)
+        pairs = [pair for pair in pairs if pair[column] in there]
     return pairs, note
 
 
-def _associated(listing: Path) -> list[Pair]:
+def _associated(listing: Path, losses: Losses) -> list[Pair]:
     """`t colour t depth`, or the other way round (told by the folder's name)."""
-    pairs = []
-    for line, fields in tables.rows(listing, None, 4):
+
+    def parse(fields: list[str], where: str) -> Pair:
         stamp, colour, other, depth = fields[:4]
         if colour.startswith("depth"):
             stamp, colour, depth = other, depth, colour
-        pairs.append((tables.parse_seconds(stamp, f"{listing}, line {line}"), colour, depth))
-    return pairs
+        for name in (colour, depth):
+            inside(listing.parent, name, where)
+        return tables.parse_seconds(stamp, where), colour, depth
+
+    return tables.parsed(listing, None, 4, parse, losses)[1]
 
 
-def _list(listing: Path) -> list[tuple[int, str]]:
-    lines = tables.rows(listing, None, 2)
-    items = [(tables.parse_seconds(f[0], f"{listing}, line {line}"), f[1]) for line, f in lines]
-    tables.check_sorted(listing, np.array([stamp for stamp, _ in items], np.int64), None)
-    return items
+def _list(listing: Path, losses: Losses) -> list[tuple[int, str]]:
+    def parse(fields: list[str], where: str) -> tuple[int, str]:
+        inside(listing.parent, fields[1], where)
+        return tables.parse_seconds(fields[0], where), fields[1]
+
+    return tables.parsed(listing, None, 2, parse, losses)[1]
 
 
 def _nearest(colour: list[tuple[int, str]], depth: list[tuple[int, str]]) -> list[Pair]:
@@ -107,18 +116,19 @@ def _nearest(colour: list[tuple[int, str]], depth: list[tuple[int, str]]) -> lis
     return pairs
 
 
-def _check_files(path: Path, files: list[str], listing: Path) -> None:
+def _there(path: Path, files: list[str], listing: Path, losses: Losses) -> set[str]:
+    """Which of `files` are there. Raises DataError where many are not."""
     by_folder: dict[Path, list[str]] = {}
     for file in files:
         by_folder.setdefault((path / file).parent, []).append(Path(file).name)
-    for folder, names in by_folder.items():
-        check_present(folder, names, listing)
+    have = {folder: present(folder, names, listing, losses) for folder, names in by_folder.items()}
+    return {file for file in files if Path(file).name in have[(path / file).parent]}
 
 
-def _truth(path: Path, rig: Rig) -> Trajectory | None:
+def _truth(path: Path, rig: Rig, losses: Losses) -> Trajectory | None:
     if not (path / "groundtruth.txt").is_file():
         return None
-    stamps, T = read_tum(path / "groundtruth.txt")
+    stamps, T = read_tum(path / "groundtruth.txt", losses)
     return Trajectory(stamps, T @ _T_truth_cam0(path, rig))
 
 

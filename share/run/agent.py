@@ -13,6 +13,7 @@ in the latency, where it belongs. With `agent.late_ms` the loop holds its rate i
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import queue
 import threading
@@ -26,7 +27,8 @@ from share import __version__, config
 from share.core import events as ev
 from share.core.agent import Agent
 from share.core.sequencer import SequencerCounters
-from share.errors import DataError
+from share.errors import DataError, ShareError
+from share.estimator.result import TrackResult
 from share.io.live import LiveSource
 from share.io.pose_feed import PoseFeed
 from share.io.source import Source
@@ -35,30 +37,37 @@ from share.metrics.runlog import RunLog
 from share.run.agent_files import AgentFiles
 from share.run.arrivals import Arrivals, Played, Seen
 from share.run.errors import Errors, Unknown
+from share.run.guard import Guard
 from share.run.late import Late
+from share.run.lateness import Lateness
 from share.run.pipeline import frames_of, tracker_for
 from share.strict import to_mapping
-from share.types import Frame, TrackState, Wait
-from share.wire.messages import Hello
+from share.types import Frame, TrackState
+from share.wire import messages as m
 
 TICK_MS = 50
+_POSTED = 64  # events between tracker and main: policy block, as the camera keeps the newest of what waits
+_AT_ONCE = 64  # messages of the edge in one tick: more wait in the link, so that no flood takes the processor
+_OVERDUE_S = 5.0  # beyond agent.finish_s: the machine should have ended the run
 
 
 @dataclass(frozen=True, eq=False)
 class Status:
-    """For the live line."""
+    """For the live line. idle: no frame was tracked of late."""
 
     frames: int
     state: str
     report: Callable[[], dict[str, Any]]
+    idle: bool = False
 
 
 @dataclass
 class _Shared:
     """What the threads tell each other."""
 
-    inbox: queue.SimpleQueue[ev.AgentEvent] = field(default_factory=queue.SimpleQueue)
+    inbox: queue.Queue[ev.AgentEvent] = field(default_factory=lambda: queue.Queue(_POSTED))
     stop: threading.Event = field(default_factory=threading.Event)
+    closed: threading.Event = field(default_factory=threading.Event)  # nobody takes from the inbox any more
     error: BaseException | None = None  # what ended a thread
 
 
@@ -72,7 +81,7 @@ class AgentRun:
     def __init__(
         self,
         source: Source,
-        hello: Hello,
+        hello: m.Hello,
         settings: config.Config,
         connect: Callable[[], AgentLink],
         out: Path | None,
@@ -85,18 +94,22 @@ class AgentRun:
         """errors: tells how wrong the tracker is. poses: who else is told where this agent is."""
         self._source, self._settings = source, settings
         self._say, self._show, self._verbose = say, show, verbose
+        self._guard = Guard(say)
         self._machine = Agent(hello, settings)
         self._prepare()
         self._files, self._log = AgentFiles(out, say), RunLog()
         self._errors, self._poses = Unknown() if errors is None else errors, poses
         self._late = Late(settings.agent.late_ms)
+        self._lateness = Lateness(say, "the edge" if hello.streams else "this machine")
         self._counters = SequencerCounters()
         self._link = connect()  # last: whatever is wrong with the above has been said by now
         self._shared = _Shared()
         self._arrivals = self._make_arrivals()
         self._damaged = 0
-        self._waits: Wait | None = None  # the tracker, for what
         self._ended = False
+        self._tick_ns = 0  # when the present tick ends
+        self._received = 0  # messages in it
+        self._over_ns: int | None = None  # when the last frame was done
         self.report: dict[str, Any] = {}
         self.trouble: str | None = None  # why the edge does not let this agent in
 
@@ -119,6 +132,7 @@ class AgentRun:
             self._files.finish(self._log, self.report)
         finally:
             self.stop()
+            self._shared.closed.set()
             self._files.release()
             self._link.close()
             if self._poses is not None:
@@ -137,7 +151,7 @@ class AgentRun:
 
     def _decoded(self) -> Iterator[Frame]:
         return frames_of(
-            self._source, self._settings, self._counters, self._skip_damaged, self._log.add_decode
+            self._source, self._settings, self._counters, self._skip_damaged, self._log.add_decode, self._say
         )
 
     def _skip_damaged(self, error: DataError) -> None:
@@ -157,7 +171,7 @@ class AgentRun:
 
     def _track_one(self, frame: Frame, arrived_ns: int) -> None:
         cpu = time.thread_time()
-        result = self._tracker.track(frame)
+        result = self._result(frame)
         tracked = ev.FrameTracked(
             index=frame.index,
             stamp_ns=frame.stamp_ns,
@@ -168,32 +182,71 @@ class AgentRun:
             keyframe=result.keyframe,
             new_stretch=result.new_stretch,
             error_cm=self._errors.after(frame, result),
+            waits=result.waits,
         )
         self._post(tracked)  # the pose goes out before others are served
         self._log.add_result(result.new_stretch, result.sound, result.waits)
-        self._waits = result.waits
         if result.keyframe:
             self._post(ev.KeyframeMade(tracked, self._errors.keyframe(frame, self._tracker)))
             self._tracker.settle()
         self._log.cpu_s += time.thread_time() - cpu
 
+    def _result(self, frame: Frame) -> TrackResult:
+        """Of a tracker that fails, LOST; the next frame begins a new one, since nothing is known of this."""
+        try:
+            return self._tracker.track(frame)
+        except ShareError:
+            raise
+        except Exception as error:
+            self._guard.note("tracking a frame", error)
+            self._tracker = tracker_for(self._source, self._settings)
+            return TrackResult(TrackState.LOST, None)
+
     def _post(self, event: ev.AgentEvent) -> None:
-        self._shared.inbox.put(event)
+        """Waits for room, as long as anybody takes what is posted."""
+        while not self._shared.closed.is_set():
+            try:
+                self._shared.inbox.put(event, timeout=0.1)
+                break
+            except queue.Full:
+                continue
         self._link.wake()
 
     # ------------------------------------------------------------------ main
 
     def _loop(self) -> None:
-        while not self._ended:
-            frames = self._link.receive(TICK_MS)
-            self._say_trouble()
-            if self._link.connected():
-                self._handle(ev.Connected())
-            if frames is not None:
-                self._handle(ev.Received(frames))
+        while not self._ended and not self._is_overdue():
+            self._listen()
             while not self._shared.inbox.empty():
-                self._handle(self._shared.inbox.get())
-            self._handle(ev.Tick())
+                self._take(self._shared.inbox.get())
+            self._handle(self._arrivals.tick())
+
+    def _listen(self) -> None:
+        """One message of the edge, or what the tracker posts, or the end of the tick."""
+        now_ns = time.monotonic_ns()
+        if now_ns >= self._tick_ns:
+            self._tick_ns, self._received = now_ns + TICK_MS * 1_000_000, 0
+        if self._received >= _AT_ONCE:
+            with contextlib.suppress(queue.Empty):
+                self._take(self._shared.inbox.get(timeout=(self._tick_ns - now_ns) * 1e-9))
+            return
+        frames = self._link.receive(TICK_MS)
+        self._say_trouble()
+        if self._link.connected():
+            self._handle(ev.Connected())
+        if frames is not None:
+            self._received += 1
+            self._handle(ev.Received(frames))
+
+    def _take(self, event: ev.AgentEvent) -> None:
+        if isinstance(event, ev.Finished):
+            self._over_ns = time.monotonic_ns()
+        self._handle(event)
+
+    def _is_overdue(self) -> bool:
+        """Whether the machine should have ended the run long ago."""
+        patience_s = self._settings.agent.finish_s + _OVERDUE_S
+        return self._over_ns is not None and time.monotonic_ns() - self._over_ns > patience_s * 1e9
 
     def _say_trouble(self) -> None:
         if (trouble := self._link.trouble()) != self.trouble:
@@ -202,8 +255,15 @@ class AgentRun:
                 self._say(f"not let in: {trouble}")
 
     def _handle(self, event: ev.AgentEvent) -> None:
-        for effect in self._machine.handle(event, time.monotonic_ns()):
-            self._carry_out(effect)
+        """One guarded step: what fails costs this event, and never the run."""
+        try:
+            effects = self._machine.handle(event, time.monotonic_ns())
+        except Exception as error:
+            self._guard.note(f"handling {type(event).__name__}", error)
+            effects = self._machine.unfinished()
+        for effect in effects:
+            with self._guard.step(f"carrying out {type(effect).__name__}"):
+                self._carry_out(effect)
 
     def _carry_out(self, effect: ev.AgentEffect) -> None:
         match effect:
@@ -214,8 +274,11 @@ class AgentRun:
             case ev.FrameDone():
                 if self._poses is not None and not effect.state.has_pose:
                     self._poses.tell(effect.stamp_ns, effect.state)
+                self._lateness.done(effect.track_ms)
                 self._log.add(effect.stamp_ns, effect.track_ms, effect.state, effect.keyframe, effect.sent)
-                self._show(Status(len(self._log), self._state(effect.state), self._machine.report))
+                self._show_status(self._machine.status(time.monotonic_ns()))
+            case ev.StatusSaid() if effect.idle:
+                self._say_idle(effect)
             case ev.CorrectionApplied():
                 if effect.stamp_ns is not None and effect.corrected_ms is not None:
                     self._log.mark_corrected(effect.stamp_ns, effect.corrected_ms)
@@ -238,9 +301,15 @@ class AgentRun:
         if T_map_body is not None and at.map_id is not None:
             self._files.map(at.stamp_ns, T_map_body, at.map_id)
 
-    def _state(self, state: TrackState) -> str:
-        waits = self._waits if state is TrackState.INITIALISING else None
-        return str(state) if waits is None else f"{state}, waits for {waits.words},"
+    def _say_idle(self, said: ev.StatusSaid) -> None:
+        """No frame says it: the pose that was told last is not where the agent is now."""
+        if self._poses is not None and said.stamp_ns is not None:
+            self._poses.tell(said.stamp_ns, said.status.state, said.status.pose_age_ms)
+        self._show_status(said.status, idle=True)
+
+    def _show_status(self, status: m.Status, idle: bool = False) -> None:
+        state = f"{status.state}, {status.reason}," if status.reason else str(status.state)
+        self._show(Status(len(self._log), state, self._machine.report, idle))
 
     def _report(self) -> dict[str, Any]:
         protocol = self._machine.report()
@@ -251,7 +320,10 @@ class AgentRun:
             "bytes_up": protocol["bytes_up"],
             "bytes_down": protocol["bytes_down"],
             "damaged_images": self._damaged,
+            "failed_steps": self._guard.failed,
+            "left_out": self._source.losses.counts,
             "drop_late": self._late.dropped,
+            **self._lateness.report(),
             **self._source.report(),
             **self._errors.report(),
             "sequencer": dataclasses.asdict(self._counters),

@@ -8,12 +8,15 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
+from share.core.events import Tick
 from share.io.live import LiveSource
 from share.run.late import Late
 from share.types import Frame
 
 READ_AHEAD = 30  # frames decoded before they are due
 _WAIT_S = 0.1
+_DROPS_S = 2.0  # so long images that were left out are spoken of
+_TOO_SLOW = "too slow for the camera: images are left out"
 
 Frames = Callable[[], Iterator[Frame]]  # begins to decode
 
@@ -24,6 +27,10 @@ class Arrivals(Protocol):
     def each(self) -> Iterator[tuple[Frame, int]]: ...
 
     def stop(self) -> None: ...
+
+    def tick(self) -> Tick:
+        """What is known now of images that are not tracked yet, and of the sensors."""
+        ...
 
 
 class Played:
@@ -37,6 +44,10 @@ class Played:
         self._queue: queue.Queue[Frame | None] = queue.Queue(READ_AHEAD)
         self._stop = threading.Event()
         self._error: BaseException | None = None
+        self._in_hand = False  # a frame that was given is worked on
+
+    def tick(self) -> Tick:
+        return Tick(time.monotonic_ns() if self._in_hand else None)
 
     def stop(self) -> None:
         self._stop.set()
@@ -68,7 +79,9 @@ class Played:
                 return
             behind_ns, another = time.monotonic_ns() - due, not self._queue.empty()
             if (taken := self._late.take(frame, behind_ns, another)) is not None:
+                self._in_hand = True
                 yield taken, due
+                self._in_hand = False
 
     def _read(self) -> None:
         try:
@@ -97,6 +110,15 @@ class Seen:
 
     def __init__(self, frames: Frames, camera: LiveSource) -> None:
         self._frames, self._camera = frames, camera
+        self._dropped = 0
+        self._dropped_at = -_DROPS_S  # when it last grew
+
+    def tick(self) -> Tick:
+        now, dropped = time.monotonic(), self._camera.images_dropped
+        if dropped > self._dropped:
+            self._dropped, self._dropped_at = dropped, now
+        slow = _TOO_SLOW if now - self._dropped_at < _DROPS_S else ""
+        return Tick(self._camera.image_ns, "; ".join(filter(None, (self._camera.trouble, slow))))
 
     def stop(self) -> None:
         self._camera.stop()

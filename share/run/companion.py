@@ -7,11 +7,11 @@ import queue
 import signal
 import threading
 from collections.abc import Callable
-from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import Any
 
 from share import process
+from share.spawning import SPAWN
 
 Inbox = queue.SimpleQueue[Any]
 Work = Callable[..., None]  # (inbox, answer, *arguments); ends when it takes END from the inbox
@@ -23,7 +23,8 @@ class Companion:
     """Runs `work(inbox, answer, *arguments)` in a spawned process.
 
     `send` never waits. Answers go to `heard`, from a thread; `lost` is called once, from that thread, if
-    the process ends without being asked to. It ends with this one, however this one ends.
+    the process ends without being asked to. It ends with this one, however this one ends. after_s: it is
+    started so much later, and gets then what was sent meanwhile (`share.core.backoff`).
     """
 
     def __init__(
@@ -33,40 +34,59 @@ class Companion:
         arguments: tuple[Any, ...],
         heard: Callable[[Any], None],
         lost: Callable[[str], None],
+        after_s: float = 0.0,
     ) -> None:
         self.name = name
         self._heard, self._lost = heard, lost
-        self._closing = False
+        self._closing = threading.Event()
+        self._starting = threading.Lock()
+        self._obstacle: str | None = None  # why it could not be started
         self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        context = get_context("spawn")
-        self._ours, theirs = context.Pipe()
-        self._process = context.Process(target=_begin, args=(theirs, work, arguments), name=name)
-        self._process.start()
-        theirs.close()
-        self._threads = [threading.Thread(target=run, daemon=True) for run in (self._give, self._take)]
+        self._ours, self._theirs = SPAWN.Pipe()
+        self._process = SPAWN.Process(target=_begin, args=(self._theirs, work, arguments), name=name)
+        if after_s <= 0.0:
+            self._start()
+        giving = threading.Thread(target=self._give, args=(after_s,), daemon=True)
+        self._threads = [giving, threading.Thread(target=self._take, daemon=True)]
         for thread in self._threads:
             thread.start()
 
     @property
     def pid(self) -> int | None:
+        """None before it is started."""
         return self._process.pid
+
+    def _start(self) -> None:
+        """Unless it was closed before it began."""
+        with self._starting:
+            if not self._closing.is_set():
+                try:
+                    self._process.start()
+                except OSError as error:  # no memory, too many processes
+                    self._obstacle = error.strerror or str(error)
+            self._theirs.close()
 
     def send(self, message: Any) -> None:
         self._outbox.put(message)
 
     def close(self) -> None:
         """Everything sent is worked on first, but not for longer than a few seconds."""
-        self._closing = True
+        with self._starting:
+            self._closing.set()
         self._outbox.put(END)
-        self._process.join(_PATIENCE_S)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
+        if self._process.pid is not None:
+            self._process.join(_PATIENCE_S)
+            if self._process.is_alive():
+                self._process.kill()
+                self._process.join()
         for thread in self._threads:
             thread.join(_PATIENCE_S)
         self._ours.close()
 
-    def _give(self) -> None:
+    def _give(self, after_s: float) -> None:
+        if after_s > 0.0:
+            self._closing.wait(after_s)
+            self._start()
         while True:
             message = self._outbox.get()
             try:
@@ -80,22 +100,24 @@ class Companion:
         with contextlib.suppress(EOFError, OSError):
             while True:
                 self._heard(self._ours.recv())
-        if not self._closing:
-            self._process.join(_PATIENCE_S)
+        if not self._closing.is_set():
             self._outbox.put(END)
-            self._lost(_how(self._process.exitcode))
+            self._lost(self._how())
 
-
-def _how(code: int | None) -> str:
-    if code is not None and code < 0:
-        return f"was ended by {signal.Signals(-code).name}"
-    return f"ended with exit code {code}"
+    def _how(self) -> str:
+        if self._obstacle is not None:
+            return f"could not be started: {self._obstacle}"
+        self._process.join(_PATIENCE_S)
+        code = self._process.exitcode
+        if code is not None and code < 0:
+            return f"was ended by {signal.Signals(-code).name}"
+        return f"ended with exit code {code}"
 
 
 def _begin(line: Connection, work: Work, arguments: tuple[Any, ...]) -> None:
     """The first thing that the process does."""
     process.prepare()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # systemd sends it to all: the parent ends us in order
     inbox: Inbox = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(line, inbox), daemon=True).start()
     with contextlib.suppress(BrokenPipeError):  # the parent is gone

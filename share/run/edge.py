@@ -42,19 +42,20 @@ from share.core.edge_events import (
     Tick,
     Track,
 )
-from share.core.peer import known_runs
 from share.core.tracking_edge import TrackingEdge
+from share.errors import StoreError
 from share.io.files import atomic_write, check_writable, claim
 from share.io.line_file import LineFile
 from share.io.map_store import MapStore
 from share.io.transport import EdgeLink
 from share.run.companion import Companion
 from share.run.keeper import Keeper
-from share.run.mapping import Mapped, Restore, map_all
-from share.run.tracking import Trackers
+from share.run.mapping import Mapped, Restore, Restored, SolverLost, map_all
+from share.run.restarts import Restarts
+from share.run.tracking import Trackers, room
 
 TICK_MS = 50
-_REPORT_S = 1.0
+_REPORT_S = 0.2  # so that what is shown of agents is true within a second
 _UNWELL_S = 10.0  # how long a death is trouble
 REFUSALS_SAID = 64  # strangers at the door; more are only counted
 _AT_ONCE = 64  # messages, before anything else is looked after
@@ -86,7 +87,9 @@ class EdgeRun:
         tell: Callable[[dict[str, Any]], None],
         store: MapStore | None = None,
     ) -> None:
-        self._settings, self._link, self._tell, self._store = settings, link, tell, store
+        self._settings, self._link, self._tell = settings, link, tell
+        self._restarts = Restarts(store, settings.merge.enter_m, lambda text: self._say("map", text))
+        self._begin_at: float | None = None  # a life that waits for the disk
         self._inbox: queue.SimpleQueue[object] = queue.SimpleQueue()
         self._out = out
         self._claim: int | None = None
@@ -115,38 +118,47 @@ class EdgeRun:
             while not self._stopping:
                 self._step()
         finally:
-            if self._mapping is not None:
-                self._mapping.close()
-            self._take_answers()
-            self._trackers.close()
-            if self._keeper is not None:
-                self._keeper.close()
-            self._link.close()
+            self.close()
             self._note()
             self._report["series"] = self._machine.series()
             self._finish(self._report)
         return self._report
 
+    def close(self) -> None:
+        """Ends the processes and threads it has started, also where it never came to `go`."""
+        self._stopping = True
+        if self._mapping is not None:
+            self._mapping.close()
+        self._take_answers()
+        self._trackers.close()
+        if self._keeper is not None:
+            self._keeper.close()
+        self._link.close()
+
     def report(self) -> dict[str, Any]:
-        """As edge.json, a second old at most, and `trouble`: what is wrong now. From any thread."""
+        """As edge.json, 0.2 s old, and `trouble`: what is wrong now. From any thread."""
         return self._report
 
     def _note(self) -> None:
         """A report, and when the next is due."""
         now = time.monotonic()
         self._report_at = now + _REPORT_S
-        failing = self._keeper is not None and self._keeper.failing
+        kept = None if self._keeper is None else self._keeper.trouble
         trouble = [text for text, until in self._trouble.items() if now < until]
+        trouble += self._machine.trouble(time.monotonic_ns())
         self._report = {
             **self._machine.report(self._mapped),
             "refused_handshakes": self._refused.total(),
-            "trouble": [*trouble, *(["the map cannot be written"] if failing else [])],
+            "trouble": [*trouble, *([] if kept is None else [kept])],
             "uptime_s": round((time.monotonic_ns() - self._began_ns) * 1e-9, 3),
             **({} if self._solved_at is None else {"last_solve_s": round(now - self._solved_at, 3)}),
         }
 
-    def _begin(self) -> None:
-        """A new life: agents notice by its number, and send again what it lacks."""
+    def _begin(self, after_s: float = 0.0) -> None:
+        """A new life: agents notice by its number, and send again what it lacks.
+
+        after_s: its mapper begins then. Raises StoreError if the map's file cannot be read.
+        """
         self._mapped: dict[str, Any] = {}
         self._solved_at: float | None = None
         self._mapping: Companion | None = None
@@ -154,20 +166,22 @@ class EdgeRun:
         self._trackers = Trackers(self._settings, self._answered)
         self._machine: Edge
         if POLICIES[self._settings.edge.policy].raw:
-            self._machine = TrackingEdge(self._settings, secrets.randbits(63), began_ns=self._began_ns)
+            self._machine = TrackingEdge(
+                self._settings, secrets.randbits(63), began_ns=self._began_ns, room=room()
+            )
         else:
-            self._begin_mapping()
+            self._begin_mapping(after_s)
 
-    def _begin_mapping(self) -> None:
-        kept = None if self._store is None else self._store.load()
-        writable = self._store is not None and self._store.writable
-        known = () if kept is None else known_runs(kept, self._settings.merge.enter_m)
+    def _begin_mapping(self, after_s: float) -> None:
+        kept, known = self._restarts.found()
+        store, writable = self._restarts.store, self._restarts.writable
         self._machine = Edge(self._settings, secrets.randbits(63), writable, known, self._began_ns)
-        self._mapping = Companion("mapping", map_all, (self._settings,), self._answered, self._mapping_lost)
+        about = (self._settings,)
+        self._mapping = Companion("mapping", map_all, about, self._answered, self._mapping_lost, after_s)
         if kept is not None:
             self._mapping.send(Restore(kept))
-        if self._store is not None and writable:
-            self._keeper = Keeper(self._store, self._answered, self._map_said)
+        if store is not None and writable:
+            self._keeper = Keeper(store, self._answered, self._map_said)
 
     def _finish(self, report: dict[str, Any]) -> None:
         if self._out is None or self._events is None or self._claim is None:
@@ -180,16 +194,17 @@ class EdgeRun:
     # ------------------------------------------------------------------ the loop
 
     def _step(self) -> None:
-        message = self._link.receive(TICK_MS)
-        for _ in range(_AT_ONCE):
+        for i in range(_AT_ONCE):
+            message = self._link.receive(0 if i else TICK_MS)
             if message is None:
                 break
-            self._handle(Received(*message))
-            message = self._link.receive(0)
+            self._handle(Received(message.peer, message.frames, self._link.names(message.key)))
         for line in self._link.refusals():
             self._refuse(line)
         self._take_answers()
         self._handle(Tick())
+        if self._begin_at is not None and time.monotonic() >= self._begin_at:
+            self._begin_anew("the map's file could not be read")
         if time.monotonic() >= self._report_at:
             self._note()
 
@@ -209,18 +224,38 @@ class EdgeRun:
                     self._mapped = mapped.report
                 case _Said() as said:
                     self._say(said.event, said.text)
+                case Restored():
+                    self._restarts.restored()
+                case SolverLost() as solver:
+                    self._say("solver lost", solver.text)
+                    self._trouble[f"the solver: {solver.text}"] = time.monotonic() + _UNWELL_S
                 case _MapperLost() as gone if not self._stopping:
-                    self._begin_anew(gone.how)
+                    self._begin_anew(f"its process {gone.how}")
 
     def _begin_anew(self, how: str) -> None:
         """The mapper has died: as if the whole edge had been restarted, to its agents too."""
-        self._say("mapper lost", f"its process {how}; agents are asked for what is not in the map's file")
-        self._trouble[f"the mapper's process {how}"] = time.monotonic() + _UNWELL_S
+        pause_s = self._restarts.died()
+        text = f"{how}; a new one begins in {pause_s:g} s; agents are asked for what is not in the map's file"
+        self._say("mapper lost", text)
+        self._trouble[f"the mapper: {text}"] = time.monotonic() + pause_s + _UNWELL_S
         if self._mapping is not None:
             self._mapping.close()
         if self._keeper is not None:
             self._keeper.drain()
-        self._begin()
+        self._forget_answers()
+        try:
+            self._begin(pause_s)
+            self._begin_at = None
+        except StoreError as error:  # nothing is taken in or acknowledged until it can be read
+            self._say("map", f"{error}; tried again in {pause_s:g} s")
+            self._begin_at = time.monotonic() + pause_s
+
+    def _forget_answers(self) -> None:
+        """Those of the mapper and keeper of a life that is over are no answers to the next."""
+        while not self._inbox.empty():
+            match self._inbox.get():
+                case _Said() as said:
+                    self._say(said.event, said.text)
 
     def _handle(self, event: Event) -> None:
         for effect in self._machine.handle(event, time.monotonic_ns()):

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import secrets
 import time
+from collections.abc import Sequence
 from contextlib import closing
 
 from share.core.checkup import Finding, fail, ok
-from share.errors import WireError
+from share.core.versions import EdgeVersion
+from share.errors import VersionError, WireError
 from share.io.keys import AgentKeys
 from share.io.transport import AgentLink, connect
-from share.wire.codec import decode, encode
-from share.wire.messages import Ping, Pong
+from share.wire.codec import Bytes, decode, encode
+from share.wire.messages import Message, Ping, Pong
 
 _PATIENCE_S = 4.0
 
@@ -34,12 +36,26 @@ def probe(address: str, keys: AgentKeys | None, patience_s: float = _PATIENCE_S)
 
 def _round_trip(link: AgentLink, until_s: float) -> float | None:
     """Of the quickest answer to several pings, s; None where none came."""
-    sent = 0
+    sent, edge = 0, EdgeVersion()
+    edge.reached()
     took: list[float] = []
     while time.monotonic() < until_s and len(took) < 5:
         sent += link.send(encode(Ping(sent, time.monotonic_ns())))
+        if not took:
+            for ping in edge.pings(time.monotonic_ns()):
+                link.send(ping)
         frames = link.receive(100)
-        message = None if frames is None else decode(frames)
+        message = None if frames is None else _decoded(frames, edge)
         if isinstance(message, Pong):
             took.append((time.monotonic_ns() - message.sent_ns) / 1e9)
     return min(took, default=None)
+
+
+def _decoded(frames: Sequence[Bytes], edge: EdgeVersion) -> Message | None:
+    """Raises WireError, which says of an older edge that it is one."""
+    try:
+        return decode(frames)
+    except VersionError as error:
+        if (line := edge.heard(frames, error)) is None:
+            return None
+        raise WireError(line) from None

@@ -4,46 +4,65 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 
 from share.core.edge_events import Keep, Kept
+from share.core.keeping import KeepPoses
 from share.errors import StoreError
 from share.io.map_store import MapStore
 
-_AGAIN_S = 5.0  # after a write that failed
-_MOST = 4000  # changes that are held back for a disk that is full; then the oldest are lost
+_AGAIN_S = 1.0  # after a write that failed
+_SLOW_S = 5.0  # for one write: from then on it is said
 _AT_ONCE = 64  # in one commit
+_NOT_ACKNOWLEDGED = "keyframes are not acknowledged"
 
 
 class Keeper:
     """`keep` what is to be safe; `done` is told once it is, `said` what goes wrong, from the thread.
 
-    Where the file cannot be written, nobody is kept waiting: it is said once, changes are held in memory
-    and tried again, and counted as kept meanwhile; agents still hold what was acknowledged last.
+    Only what is in the file is `Kept`. While it cannot be written, that is said, changes are held in memory
+    and tried again. They are few: an agent sends no more than its window without an acknowledgement, the edge
+    takes in a bounded number (`share.core.edge`), loops come of keyframes alone, and of solutions only the
+    newest is held.
     """
 
     def __init__(self, store: MapStore, done: Callable[[Kept], None], said: Callable[[str], None]) -> None:
         self._store, self._done, self._said = store, done, said
         self._new: queue.SimpleQueue[Keep | None] = queue.SimpleQueue()
         self._held: deque[Keep] = deque()
-        self._failing = False
-        self._lost = 0
+        self._failing: str | None = None
+        self._writing_since: float | None = None
         self._thread = threading.Thread(target=self._work, name="keeper", daemon=True)
         self._thread.start()
 
     @property
-    def failing(self) -> bool:
-        """Whether the file cannot be written at the moment."""
-        return self._failing
+    def trouble(self) -> str | None:
+        """Why nothing is kept at the moment, if so. From any thread."""
+        if self._failing is not None:
+            return f"{self._failing}; {_NOT_ACKNOWLEDGED}"
+        since = self._writing_since
+        took_s = 0.0 if since is None else time.monotonic() - since
+        if took_s < _SLOW_S:
+            return None
+        return f"the map's disk has been writing for {took_s:.0f} s; {_NOT_ACKNOWLEDGED}"
+
+    @property
+    def held(self) -> int:
+        """Changes that wait because the file cannot be written."""
+        return sum(len(keep.changes) for keep in tuple(self._held))
 
     def keep(self, keep: Keep) -> None:
         self._new.put(keep)
 
     def drain(self) -> None:
-        """Writes what is left, tries once more what could not be written, and ends."""
+        """Writes what is left, tries once more what could not be written, says what is not kept, and ends."""
         self._new.put(None)
         self._thread.join()
+        if left := self.held:
+            self._said(f"{left} changes are not in the map's file; none of their keyframes was acknowledged")
 
     def close(self) -> None:
         """The same, and closes the file."""
@@ -59,40 +78,59 @@ class Keeper:
 
     def _take(self) -> bool:
         """What has come, into `_held`; waits for it, or until it is time to try again. Whether all has."""
-        try:
-            keep = self._new.get(timeout=_AGAIN_S if self._failing else None)
-            while keep is not None:
-                self._held.append(keep)
-                keep = self._new.get_nowait()
-        except queue.Empty:
-            return False
-        return True
+        failing, until = self._failing is not None, time.monotonic() + _AGAIN_S
+        while True:
+            wait = failing or not self._held
+            try:
+                keep = self._new.get(wait, max(0.0, until - time.monotonic()) if failing else None)
+            except queue.Empty:
+                return False
+            if keep is None:
+                return True
+            self._held.append(keep)
 
     def _write(self, most: int = _AT_ONCE) -> bool:
         """A batch; whether it is done with now."""
+        if self._failing is not None:
+            self._held = newest_poses_only(self._held)
         batch = [self._held[i] for i in range(min(most, len(self._held)))]
+        self._writing_since = time.monotonic()
         try:
             self._store.write([change for keep in batch for change in keep.changes])
         except StoreError as error:
             self._fail(str(error))
             return False
-        except ValueError as error:  # what it hangs on was lost while the disk was full
+        except Exception as error:  # not the disk's fault but a change's: it alone is left out
             if len(batch) > 1:
                 return self._write(most=1)
-            self._said(f"not kept: {error}")
+            self._said(f"a change cannot be kept and is left out: {type(error).__name__}: {error}")
+        finally:
+            self._writing_since = None
         for _ in batch:
             self._held.popleft()
-        if self._failing:
-            self._failing = False
-            self._said("the map is kept again" + (f"; {self._lost} changes were lost" if self._lost else ""))
+        if self._failing is not None:
+            self._failing = None
+            self._said("the map is kept again")
         self._done(Kept(batch[-1].ticket))
         return True
 
     def _fail(self, reason: str) -> None:
-        if not self._failing:
-            self._failing = True
-            self._said(f"{reason}; the edge goes on without it and tries again")
-        while len(self._held) > _MOST:
-            self._held.popleft()
-            self._lost += 1
-        self._done(Kept(self._held[-1].ticket))
+        if self._failing != reason:
+            self._failing = reason
+            self._said(f"{reason}; {_NOT_ACKNOWLEDGED} until it can")
+
+
+def newest_poses_only(held: deque[Keep]) -> deque[Keep]:
+    """The same changes but for solutions that a later one takes the place of. Tickets stay."""
+    out: deque[Keep] = deque()
+    found = False
+    for keep in reversed(held):
+        changes = []
+        for change in reversed(keep.changes):
+            if isinstance(change, KeepPoses):
+                if found:
+                    continue
+                found = True
+            changes.append(change)
+        out.appendleft(replace(keep, changes=tuple(reversed(changes))))
+    return out

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 from share.config import Config, GraphConfig
+from share.core.backoff import Backoff
 from share.core.edge_events import Add, Found, Join, Present
 from share.core.finding import Finding
 from share.core.keeping import Kept
@@ -37,6 +38,18 @@ class Mapped:
 
 
 @dataclass(frozen=True)
+class Restored:
+    """Everything of `Restore` has been taken in: it was not what is in the file that a later death is of."""
+
+
+@dataclass(frozen=True)
+class SolverLost:
+    """For a person: how it ended, and when the next begins."""
+
+    text: str
+
+
+@dataclass(frozen=True)
 class _Lost:
     """The solver's process has died."""
 
@@ -50,7 +63,8 @@ class _Solved:
 
 
 def map_all(inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
-    """For a `Companion`: takes Restore, Join, Present and Add, answers Found and Mapped, until END."""
+    """For a `Companion`: takes Restore, Join, Present and Add, until END; answers Found, Mapped, Restored
+    and SolverLost."""
     _Mapping(inbox, answer, settings).go()
 
 
@@ -58,7 +72,9 @@ class _Mapping:
     def __init__(self, inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
         self._inbox, self._answer, self._settings = inbox, answer, settings
         self._mapper = Mapper(settings)
-        self._solver = self._new_solver()
+        self._backoff = Backoff(time.monotonic_ns())
+        self._solver = self._new_solver(0.0)
+        self._is_restoring = False
         self._solving: Solve | None = None
         self._findings: list[Finding] = []
         self._report_at = self._poses_at = 0.0
@@ -81,6 +97,9 @@ class _Mapping:
             self._give_solver()
             self._tell()
             look = self._mapper.next_look()
+            if self._is_restoring:  # the views have been gone through by now
+                self._is_restoring = False
+                self._answer(Restored())
             if look is not None:
                 self._findings += self._mapper.done(look, *_timed(look.run))
 
@@ -97,6 +116,7 @@ class _Mapping:
         match message:
             case Restore():
                 self._mapper.restore(message.kept)
+                self._is_restoring = True
             case Join():
                 self._mapper.join(message.key, message.hello)
             case Present():
@@ -122,8 +142,9 @@ class _Mapping:
         if step is not None:
             self._findings += self._mapper.done(step, result, ms)
 
-    def _new_solver(self) -> Companion:
-        return Companion("solver", solve_all, (self._settings.graph,), self._inbox.put, self._solver_lost)
+    def _new_solver(self, after_s: float) -> Companion:
+        about = (self._settings.graph,)
+        return Companion("solver", solve_all, about, self._inbox.put, self._solver_lost, after_s)
 
     def _solver_lost(self, how: str) -> None:
         """From another thread."""
@@ -132,7 +153,9 @@ class _Mapping:
     def _replace_solver(self, how: str) -> None:
         """It costs the solution that it was at, and telling it all again."""
         self._solver.close()
-        self._solver = self._new_solver()
+        pause_s = self._backoff.died(time.monotonic_ns())
+        self._answer(SolverLost(f"its process {how}; a new one begins in {pause_s:g} s"))
+        self._solver = self._new_solver(pause_s)
         self._mapper.solver_lost()
         self._solved(RuntimeError(f"the solver {how}"), 0.0)
 

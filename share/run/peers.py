@@ -19,6 +19,7 @@ from share.core.sequencer import SequencerCounters
 from share.errors import DataError, UsageError
 from share.geometry import se3
 from share.geometry.camera import Camera
+from share.io.files import fresh
 from share.io.source import Source
 from share.io.trajectory import Trajectory
 from share.peers import Peer
@@ -80,7 +81,7 @@ def theirs(
     """Every frame in turn through a process that speaks as `peer_wire` says, at its own pace. log: a file for
     what else it says. Raises DataError if it fails, UsageError where the rig is not stereo with an IMU."""
     run, told = TrackerRun(), calibration(source)
-    err = None if log is None else log.open("wb")
+    err = None if log is None else fresh(log)
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=err) as peer:
         assert peer.stdin and peer.stdout
         try:

@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
 
 from share.config import Config
-from share.core.sequencer import SequencerCounters, sequence, streams_of
+from share.core.sequencer import Bundle, SequencerCounters, sequence, streams_of
 from share.errors import DataError, MisfitError, UsageError
 from share.estimator.inertial.tracker import InertialTracker
 from share.estimator.visual import VisualTracker
 from share.geometry.camera import Rig
 from share.io.images import load
 from share.io.source import Source
-from share.types import Frame
+from share.types import Frame, ImuBatch
+
+_MISFITS = 10  # images of a wrong size before any of the right one: the calibration is another recording's
+_REMEMBERED = 600  # frames that are left out one after the other, whose IMU samples are kept
+
+_NO_MEASUREMENTS = {
+    "imu_out_of_range": "the IMU gave samples beyond {0.gyro:.3g} rad/s or {0.accel:.3g} m/s^2, or no "
+    "numbers; such are left out (sequencer.imu_out_of_range in the report)",
+    "imu_spikes": "the IMU gave single samples far from those before and after them; such are left out "
+    "(sequencer.imu_spikes in the report); look at its cable and supply",
+}
 
 
 def frames_of(
@@ -22,28 +35,88 @@ def frames_of(
     counters: SequencerCounters,
     on_bad: Callable[[DataError], None] | None = None,
     spent: Callable[[float], None] = lambda cpu_s: None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> Iterator[Frame]:
-    """Decoded frames in order. A damaged image raises DataError, or goes to `on_bad` and is left out.
+    """Decoded frames in order. One with a damaged image is left out: the next one has its IMU samples too,
+    and `on_bad` is told, or the source's losses are. Raises MisfitError where the first ten images, or all of
+    them, are of another size than the calibration's.
 
-    Images of another size than the calibration's always raise: all of them will be.
-
-    `spent` is told the CPU time of each frame's decoding on this thread.
+    `spent` is told the CPU time of each frame's decoding on this thread; `say`, once, that the IMU gave what
+    is no measurement.
     """
     rig = source.rig
     bundles = sequence(
-        source.measurements(), streams_of(rig), source.rate_hz, config.sequencer, counters, rig.timeshift_ns
+        source.measurements(),
+        streams_of(rig),
+        source.rate_hz,
+        config.sequencer,
+        counters,
+        rig.timeshift_ns,
+        source.imu_range,
     )
+    left_out, silent = _LeftOut(on_bad or partial(_lose, source)), set(_NO_MEASUREMENTS)
     for bundle in bundles:
+        for name in [name for name in silent if getattr(counters, name)]:
+            silent.remove(name)
+            say(_NO_MEASUREMENTS[name].format(source.imu_range))
         began = time.thread_time()
         try:
-            frame = load(bundle)
+            frame = load(left_out.before(bundle))
         except DataError as error:
-            if on_bad is None or isinstance(error, MisfitError):
-                raise
-            on_bad(error)
+            left_out.add(bundle, error)
             continue
+        left_out.clear()
         spent(time.thread_time() - began)
         yield frame
+    left_out.end()
+
+
+def _lose(source: Source, error: DataError) -> None:
+    source.losses.add("frames", str(error), str(error))
+
+
+class _LeftOut:
+    """Frames since the last good one that cannot be decoded."""
+
+    def __init__(self, on_bad: Callable[[DataError], None]) -> None:
+        self._on_bad = on_bad
+        self._imu: deque[ImuBatch] = deque(maxlen=_REMEMBERED)
+        self._gap_ns = 0
+        self._misfits: list[MisfitError] = []  # until there is a good one
+        self._any_good = False
+
+    def add(self, bundle: Bundle, error: DataError) -> None:
+        """Raises `error` if it is about the recording, not about this image."""
+        self._imu.append(bundle.imu)
+        self._gap_ns += bundle.gap_ns
+        if isinstance(error, MisfitError) and not self._any_good:
+            self._misfits.append(error)
+            if len(self._misfits) >= _MISFITS:
+                raise error
+        else:
+            self._on_bad(error)
+
+    def before(self, bundle: Bundle) -> Bundle:
+        """`bundle` with what those before it carried."""
+        if not self._imu:
+            return bundle
+        imu = ImuBatch.empty().join(*self._imu, bundle.imu)
+        return replace(bundle, imu=imu, gap_ns=self._gap_ns + bundle.gap_ns)
+
+    def clear(self) -> None:
+        """There was a good one."""
+        if self._any_good and not self._imu:
+            return
+        for error in self._misfits:
+            self._on_bad(error)
+        self._any_good = True
+        self._misfits.clear()
+        self._imu.clear()
+        self._gap_ns = 0
+
+    def end(self) -> None:
+        if self._misfits:
+            raise self._misfits[0]
 
 
 def tracker_for(source: Source, config: Config) -> VisualTracker | InertialTracker:

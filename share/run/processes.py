@@ -10,6 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
+from share import children
+from share.io.files import fresh
+
 
 def command(*arguments: str) -> list[str]:
     """The command line that runs `share ARGUMENTS` with this very program."""
@@ -20,8 +23,10 @@ def command(*arguments: str) -> list[str]:
 
 @contextlib.contextmanager
 def child(log: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
-    """`share ARGUMENTS` with its output in `log`; asked to end, then made to, when the block is left."""
-    with log.open("wb") as sink:
+    """`share ARGUMENTS` with its output in `log`; asked to end, then made to, when the block is left.
+
+    It ends with this process, however this one ends."""
+    with fresh(log) as sink:
         process = _start(sink, arguments)
         try:
             yield process
@@ -30,8 +35,14 @@ def child(log: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def _start(sink: IO[bytes], arguments: tuple[str, ...]) -> subprocess.Popen[bytes]:
+    """In a group of its own: Ctrl-C in a terminal is for the parent, which ends its children in order."""
     return subprocess.Popen(
-        command(*arguments), stdin=subprocess.DEVNULL, stdout=sink, stderr=subprocess.STDOUT
+        command(*arguments),
+        stdin=subprocess.DEVNULL,
+        stdout=sink,
+        stderr=subprocess.STDOUT,
+        env=children.environment(),
+        process_group=0,
     )
 
 

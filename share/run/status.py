@@ -13,7 +13,7 @@ from share.run import status_metrics
 from share.run.status_page import PAGE
 from share.run.web import Answer, WebServer, line
 
-KEPT_S = 0.2  # an answer is given again so long: however many ask, the edge is asked five times a second
+KEPT_S = 0.1  # an answer is given again so long: however many ask, the edge is asked ten times a second
 
 
 class StatusServer:

@@ -23,6 +23,7 @@ class Row:
     path: str
     over: str = ""
     labels: tuple[str, ...] = ()
+    scale: float = 1.0  # to the unit in its name
 
 
 _AGENT = ("agents", ("agent", "kind"))
@@ -38,6 +39,8 @@ ROWS = (
     Row("share_edge_loops", "Loops in the maps.", "loops.in_map"),
     Row("share_edge_loops_waiting", "Loops that wait for a witness.", "loops.waiting"),
     Row("share_edge_agent_gone", "1 where the agent said bye or is silent.", "gone", *_AGENT),
+    Row("share_edge_pose_age_seconds", "Age of the newest pose.", "pose_age_ms", *_AGENT, scale=1e-3),
+    Row("share_edge_heard_age_seconds", "Time since the agent was heard.", "heard_s", *_AGENT),
     Row("share_edge_keyframes_total", "Keyframes applied.", "keyframes", *_AGENT),
     Row("share_edge_poses_total", "Poses received.", "poses", *_AGENT),
     Row("share_edge_evaluations_total", "Evaluations received.", "evaluations", *_AGENT),
@@ -91,7 +94,7 @@ def _samples(report: dict[str, Any], row: Row) -> Iterator[tuple[list[str], floa
     for name, entry in _entries(report, row.over):
         number = _number(_at(entry, row.path))
         if number is not None:
-            yield [name, *_labels(entry, row.labels[1:])][: len(row.labels)], number
+            yield [name, *_labels(entry, row.labels[1:])][: len(row.labels)], number * row.scale
 
 
 def _info(report: dict[str, Any]) -> Metric:

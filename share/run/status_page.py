@@ -1,4 +1,4 @@
-"""The page for people: asks for /snapshot.json each second and shows it. Needs nothing from elsewhere."""
+"""The page for people: asks for /snapshot.json thrice a second and shows it. Needs nothing from elsewhere."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PAGE = """<!doctype html>
 <title>SHARE edge</title>
 <style>
 :root { color-scheme: light dark; --line: #8884; --dim: #888; --bad: #d22; --good: #293 }
-body { font: 15px/1.45 system-ui, sans-serif; margin: 0 auto; max-width: 62rem; padding: 1rem }
+body { font: 15px/1.45 system-ui, sans-serif; margin: 0 auto; max-width: 72rem; padding: 1rem }
 header { display: flex; flex-wrap: wrap; align-items: baseline; gap: .2rem 1rem }
 h1 { font-size: 1.25rem; margin: 0 }
 h2 { font-size: 1rem; margin: 1.4rem 0 .3rem }
@@ -23,10 +23,11 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums }
 th, td { padding: .25rem .75rem .25rem 0; text-align: right; white-space: nowrap }
 th { color: var(--dim); font-weight: 500; border-bottom: 1px solid var(--line) }
 td { border-bottom: 1px solid var(--line) }
-.words th:nth-child(-n+3), .words td:nth-child(-n+3), th:first-child, td:first-child { text-align: left }
+.words th:nth-child(-n+5), .words td:nth-child(-n+5), th:first-child, td:first-child { text-align: left }
 td:first-child { max-width: 14rem; overflow: hidden; text-overflow: ellipsis }
 #maps th:last-child, #maps td:last-child { text-align: left; white-space: normal }
 tr.gone { color: var(--dim) }
+#agents td:nth-child(4) { white-space: normal; min-width: 9rem; max-width: 18rem; overflow-wrap: anywhere }
 .stale { opacity: .45 }
 @media (max-width: 40rem) {
   body { font-size: 13px; padding: .7rem }
@@ -74,12 +75,22 @@ function lasted(s) {
   return h ? `${h} h ${m} min` : m ? `${m} min ${Math.floor(s) % 60} s` : `${Math.floor(s)} s`;
 }
 
-let before = null;
+const lost = a => !a.gone && ["LOST", "SILENT"].includes(a.state);
+const late = a => !a.gone && a.state !== "INITIALISING" && a.pose_age_ms > 1000;
+const aged = ms => typeof ms === "number" ? `${fixed(ms / 1000, 1)} s` : "–";
+
+let before = null, rates = {};
 function rate(name, agent, now) {
   const old = before?.agents[name];
-  if (!old || old.run_id !== agent.run_id || before.session !== now.session) return "–";
+  if (!old || old.run !== agent.run || before.session !== now.session) return NaN;
   const bytes = agent.bytes_up + agent.bytes_down - old.bytes_up - old.bytes_down;
-  return fixed(bytes / (now.uptime_s - before.uptime_s) / 1000, 1);
+  return bytes / (now.uptime_s - before.uptime_s) / 1000;
+}
+
+function measure(now) {
+  if (before?.session === now.session && now.uptime_s - before.uptime_s < 1) return;
+  rates = Object.fromEntries(entries(now.agents).map(([name, a]) => [name, rate(name, a, now)]));
+  before = now;
 }
 
 function mark(text, bad) {
@@ -88,8 +99,11 @@ function mark(text, bad) {
 }
 
 function show(now) {
+  measure(now);
   const trouble = now.trouble ?? [];
-  mark(trouble.length ? "trouble" : "ok", trouble.length);
+  const unwell = entries(now.agents).filter(([, a]) => lost(a) || late(a)).length;
+  const without = `${unwell} agent${unwell === 1 ? "" : "s"} without a current pose`;
+  mark(trouble.length ? "trouble" : unwell ? without : "ok", trouble.length || unwell);
   at("trouble").replaceChildren(...trouble.map(t => node("li", t)));
   const about = [`up ${lasted(now.uptime_s)}`];
   if (now.waiting !== undefined) about.push(`waiting ${shown(now.waiting)}`);
@@ -97,10 +111,12 @@ function show(now) {
   if (now.failed_jobs) about.push(`failed jobs ${now.failed_jobs}`);
   at("about").textContent = [...about, now.policy, now.version].filter(Boolean).join(" · ");
   const agents = entries(now.agents).sort(([a, x], [b, y]) => x.gone - y.gone || (a < b ? -1 : 1));
-  table("agents", ["name", "kind", "state", "keyframes", "corrections", "map", "kB/s", "loops"],
+  table("agents",
+    ["name", "state", "pose age", "why", "kind", "keyframes", "corrections", "map", "kB/s", "loops"],
     agents.map(([name, a]) => ({kind: a.gone ? "gone" : "", cells: [
-      name, a.kind, node("td", a.gone ? "gone" : shown(a.state), !a.gone && a.state === "LOST" ? "bad" : ""),
-      a.keyframes, a.corrections, a.map_id, a.gone ? "–" : rate(name, a, now),
+      name, node("td", a.gone ? "gone" : shown(a.state), lost(a) ? "bad" : ""),
+      node("td", a.gone ? "–" : aged(a.pose_age_ms), late(a) ? "bad" : ""),
+      a.reason, a.kind, a.keyframes, a.corrections, a.map_id, a.gone ? "–" : fixed(rates[name], 1),
       `${shown(a.loops?.accepted)} of ${shown(a.loops?.tried)}`]})));
   table("maps", ["map", "keyframes", "agents"], entries(now.maps).map(([id, count]) => ({cells: [
     id, typeof count === "object" ? count?.keyframes : count,
@@ -111,7 +127,6 @@ function show(now) {
   table("times", ["step", "p50", "p95", "max", "times"],
     entries(now).filter(([k, t]) => k.endsWith("_ms") && t && "p50" in t).map(([k, t]) => ({cells: [
       k.slice(0, -3), fixed(t.p50, 1), fixed(t.p95, 1), fixed(t.max, 1), t.n]})));
-  before = now;
 }
 
 async function refresh() {
@@ -124,7 +139,7 @@ async function refresh() {
     mark(error instanceof TypeError || error.name === "TimeoutError" ? "no answer" : error.message, true);
     document.querySelector("main").className = "stale";
   }
-  setTimeout(refresh, 1000);
+  setTimeout(refresh, 300);
 }
 refresh();
 </script>

@@ -65,7 +65,6 @@ class StreamRun(AgentRun):
                     self._handle(ev.NotTaken(effect))
             case ev.TrackedAfar():
                 self._log.add_result(effect.frame.new_stretch, effect.sound, effect.waits)
-                self._waits = effect.waits
             case _:
                 super()._carry_out(effect)
 

@@ -20,7 +20,7 @@ from share.metrics.comparison import MEASURES
 from share.metrics.figures import RunFigures
 from share.run.campaign import Planned, check_names
 from share.run.play import Terms
-from share.strict import from_mapping, to_mapping
+from share.strict import from_mapping, load_yaml, to_mapping
 
 _SEED = 20261123
 Point = tuple[str, ...]  # a value of each axis, as YAML has it
@@ -87,13 +87,11 @@ def drawn(axes: Sequence[Axis], count: int, seed: int) -> list[Point]:
 
 def at(config: Config, axes: Sequence[Axis], point: Point) -> Config:
     """`config` but for the settings of `point`. Raises ConfigError naming the one that is wrong."""
-    import yaml
-
     mapping: dict[str, Any] = to_mapping(config)
     for axis, value in zip(axes, point, strict=True):
         for name in axis.names:
             section, key = name.split(".")
-            mapping.setdefault(section, {})[key] = yaml.safe_load(value)
+            mapping.setdefault(section, {})[key] = load_yaml(value, "--set")
     return from_mapping(Config, mapping, "--set")
 
 

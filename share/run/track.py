@@ -49,7 +49,8 @@ def track(source: Source, settings: config.Config, told: Callable[[TrackResult],
             poses.append(result.T_odom_body)
         told(result)
     trajectory = Trajectory(np.array(stamps, np.int64), np.array(poses).reshape(-1, 4, 4))
-    return TrackRun(trajectory, report_of(log, counters, settings) | source.report())
+    report = report_of(log, counters, settings) | {"left_out": source.losses.counts}
+    return TrackRun(trajectory, report | source.report())
 
 
 def report_of(log: RunLog, counters: SequencerCounters, settings: config.Config) -> dict[str, Any]:

@@ -4,18 +4,33 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 
 from share.config import Config
+from share.core.backoff import Backoff
 from share.core.edge_events import Answered, BeginTracking, EndTracking, FromTracker, Lost, Ready, Track
+from share.core.tracking_edge import Room
 from share.estimator.result import TrackResult
 from share.geometry.camera import Rig
+from share.io.machine import cores, free_bytes
 from share.run.companion import END, Companion, Inbox
 from share.run.pipeline import tracker_of
 from share.types import Frame
 from share.wire.messages import Tracked
 
 _PATIENCE_S = 6.0  # for one to end
+_A_CORE = 2  # at 15 frames a second each; a frame takes 15 to 30 ms
+_TRACKER_BYTES = 150_000_000  # 112 MB after 5 s at 640x480
+
+
+def room() -> Room:
+    """For trackers, on this machine as it is now."""
+    free = free_bytes()
+    by_memory = [] if free is None else [free // _TRACKER_BYTES]
+    told = "" if free is None else f", {free / 1e9:.1f} GB free"
+    most = max(1, min(_A_CORE * cores(), *by_memory))
+    return Room(most, f"{cores()} core{'' if cores() == 1 else 's'}{told}")
 
 
 class Trackers:
@@ -25,6 +40,8 @@ class Trackers:
         self._settings, self._heard = settings, heard
         self._running: dict[str, Companion] = {}
         self._ending: list[threading.Thread] = []
+        self._backoffs: dict[str, Backoff] = {}
+        self._pauses: dict[str, float] = {}  # of those that died, until the next begins
 
     def do(self, what: BeginTracking | Track | EndTracking) -> None:
         match what:
@@ -45,12 +62,21 @@ class Trackers:
 
     def _begin(self, what: BeginTracking) -> Companion:
         key, life = what.key, what.life
+        backoff = self._backoffs.setdefault(key, Backoff(time.monotonic_ns()))
 
         def lost(how: str) -> None:
-            self._heard(Lost(key, life, how))
+            self._pauses[key] = pause_s = backoff.died(time.monotonic_ns())
+            self._heard(Lost(key, life, f"{how}; the next one begins in {pause_s:g} s"))
 
         about = (self._settings, what.rig, key, life)
-        return Companion(f"tracking {key}", track_all, about, self._heard, lost)
+        return Companion(f"tracking {key}", track_all, about, self._heard, lost, self._pause_s(key))
+
+    def _pause_s(self, key: str) -> float:
+        """After a death; also while as many as there is room for are ending, or agents that come and go would
+        fill the machine with them."""
+        pause_s = self._pauses.pop(key, 0.0)
+        ending = sum(thread.is_alive() for thread in self._ending)
+        return pause_s if ending < _A_CORE * cores() else max(pause_s, _PATIENCE_S)
 
     def _end(self, key: str) -> None:
         if (companion := self._running.pop(key, None)) is not None:

@@ -1,6 +1,7 @@
 """A small web server for a few readers, on one thread: no client can hold up the process that it serves.
 
-A connection is one request without a body, GET or HEAD, and its answer (RFC 9110, 9112).
+A connection is one request without a body, GET or HEAD, and its answer (RFC 9110, 9112). Whatever clients
+do, the thread computes for a fifth of the time at most: it sleeps four times as long as it has worked.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ CONNECTIONS = 16  # at a time; one more closes the oldest
 REQUEST_BYTES = 8192
 PATIENCE_S = 5.0  # to ask, and again to take the answer
 _LEAVE_S = 1.0  # what is still sent after the answer is read so long, else the answer would be lost with it
-_BREATHER_S = 0.1  # where the machine has no socket left
+_BREATHER_S = 0.1  # where the machine has no socket left, and the longest sleep after work
+_SLEEP = 4.0  # times as long as it worked
 
 _REQUEST = re.compile(r"([A-Z]+) (\S+) HTTP/1\.[01]")
-_HOST = re.compile(r"^host:[ \t]*(\S*?)(?::\d+)?[ \t]*$", re.IGNORECASE | re.MULTILINE)
 _HEADERS = (
     "Cache-Control: no-store",
     "Connection: close",
@@ -79,6 +80,7 @@ class WebServer:
         self._selector.register(self._listener, selectors.EVENT_READ)
         self._selector.register(self._woken, selectors.EVENT_READ)
         self._clients: list[_Client] = []  # oldest first
+        self._worked_s = 0.0  # CPU time of the thread so far
         self._thread = threading.Thread(target=self._serve, name="web", daemon=True)
         self.endpoint = str(Address(self._target.host, self._listener.getsockname()[1])).removeprefix(
             "tcp://"
@@ -95,13 +97,17 @@ class WebServer:
     def _serve(self) -> None:
         try:
             while self._step():
-                pass
+                self._breathe()
         finally:
             for client in list(self._clients):
                 self._drop(client)
             self._selector.close()
             self._listener.close()
             self._woken.close()
+
+    def _breathe(self) -> None:
+        worked_s, self._worked_s = time.thread_time() - self._worked_s, time.thread_time()
+        time.sleep(min(_SLEEP * worked_s, _BREATHER_S))
 
     def _step(self) -> bool:
         """Waits for somebody and goes on with them. False once closed."""
@@ -136,7 +142,7 @@ class WebServer:
     def _go_on(self, client: _Client) -> None:
         try:
             events = client.go_on(self._respond)
-        except OSError:
+        except Exception:  # gone; or whatever it said that nobody thought of costs it its own connection
             events = 0
         if events:
             self._selector.modify(client.socket, events, client)
@@ -221,8 +227,15 @@ def _listen(target: Address) -> socket.socket:
 def _names_this_machine(headers: str) -> bool:
     """Whether a request means a name that only this machine has. A web page whose own name was made to lead
     here (DNS rebinding) would ask for that."""
-    host = _HOST.search(headers)
-    if host is None:
-        return True
-    name = host[1].strip("[]").lower()
+    for field_ in headers.split("\n"):
+        name, _, value = field_.partition(":")
+        if name.lower() == "host":
+            return _is_this_machine(value.strip(" \t"))
+    return True
+
+
+def _is_this_machine(host: str) -> bool:
+    """host: a name or an address, perhaps with a port. In time that rises with its length, no faster."""
+    before, colon, port = host.rpartition(":")
+    name = (before if colon and port.isdecimal() else host).strip("[]").lower()
     return name == "localhost" or Address(name, 0).local

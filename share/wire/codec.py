@@ -19,7 +19,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from share.errors import WireError
+from share.errors import VersionError, WireError
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.types import (
     DESCRIPTOR_BYTES,
@@ -27,6 +27,9 @@ from share.types import (
     F64,
     I64,
     MAX_KEYPOINTS,
+    MAX_MAP_ID,
+    MAX_NAME,
+    MAX_STAMP_NS,
     AgentKind,
     Correction,
     Frame,
@@ -35,10 +38,13 @@ from share.types import (
     TrackState,
     View,
     Wait,
+    checked_id,
+    checked_stamp,
 )
 from share.wire import messages as m
 
-VERSION = 4
+VERSION = 5
+OLDEST = 2  # from which on messages that tell versions, those of FROZEN, are what they are now
 MAX_HEADER_BYTES = 4096
 MAX_ARRAYS = 8
 MAX_FRAME_BYTES = MAX_KEYPOINTS * DESCRIPTOR_BYTES  # the largest array of any message but Frame
@@ -48,15 +54,18 @@ Bytes = bytes | memoryview
 Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Ids = Annotated[tuple[Int64, ...], Meta(max_length=m.MAX_HELD)]
 Text = Annotated[str, Meta(max_length=m.MAX_TEXT)]
-Name = Annotated[str, Meta(max_length=64)]
+Reason = Annotated[str, Meta(max_length=m.MAX_REASON)]
+Name = Annotated[str, Meta(max_length=MAX_NAME)]
+MapId = Annotated[str, Meta(max_length=MAX_MAP_ID)]
 
 _DTYPES = {code: np.dtype(code) for code in ("<f8", "<f4", "<i8", "|u1")}
 
 
-class _Version(msgspec.Struct, array_like=True):
-    """The head of every header, of this and of all other versions."""
+class _Head(msgspec.Struct, array_like=True):
+    """The beginning of every header, of this and of all other versions."""
 
     version: int
+    code: Any = None
 
 
 class _Header(msgspec.Struct, array_like=True):
@@ -67,7 +76,7 @@ class _Header(msgspec.Struct, array_like=True):
 
 
 _encoder = msgspec.msgpack.Encoder(enc_hook=lambda scalar: scalar.item())  # numpy scalars
-_read_version = msgspec.msgpack.Decoder(_Version).decode
+_read_head = msgspec.msgpack.Decoder(_Head).decode
 _read_header = msgspec.msgpack.Decoder(_Header).decode
 
 
@@ -160,6 +169,11 @@ def _samples(path: str, dtype: str, *shape: int) -> _Array:
 
 
 def _frame(*, stamps_ns: I64, gyro: F64, accel: F64, **fields: Any) -> Frame:
+    checked_id("index", fields["index"])
+    for name in ("stamp_ns", "gap_ns"):
+        checked_stamp(name, fields[name])
+    if len(stamps_ns) and not -MAX_STAMP_NS <= stamps_ns.min() <= stamps_ns.max() <= MAX_STAMP_NS:
+        raise ValueError("stamps_ns: are beyond any clock")
     depth: F32 | None = fields["depth"]
     if depth is not None and not (np.isfinite(depth) & (depth >= 0)).all():
         raise ValueError("depth: has values that are negative or not finite")
@@ -248,13 +262,14 @@ _LAYOUTS: dict[type, _Layout] = {
             _samples("imu.accel", "<f8", 3),
         ),
     ),
+    m.Status: _Layout(8, m.Status, _Scalars.of(state=TrackState, pose_age_ms=float, reason=Reason)),
     m.Welcome: _Layout(16, m.Welcome, _Scalars.of(session=Int64, next_keyframe=Int64)),
     m.Refused: _Layout(17, m.Refused, _Scalars.of(reason=Text)),
     m.Ack: _Layout(18, m.Ack, _Scalars.of(next_keyframe=Int64, held=Ids)),
     Correction: _Layout(
         19,
         Correction,
-        _Scalars.of(map_id=Name, revision=Int64, about=Int64, answers=Int64),
+        _Scalars.of(map_id=MapId, revision=Int64, about=Int64, answers=Int64),
         (_pose("T_map_odom"), _Array("cov", "<f8", (6, 6))),
     ),
     m.Rate: _Layout(20, m.Rate, _Scalars.of(hz=float)),
@@ -279,16 +294,19 @@ _LAYOUTS: dict[type, _Layout] = {
     ),
 }
 _BY_CODE = {layout.code: (cls, layout) for cls, layout in _LAYOUTS.items()}
+FROZEN = (m.Ping, m.Pong, m.Refused)  # the same in all versions, so that two of them can tell each other
 
 # Everything that msgspec, numpy and the validation of our own types raise on bad bytes.
 _BAD = (msgspec.MsgspecError, ValueError, OverflowError, RecursionError)
 
 
-def encode(message: m.Message) -> list[Bytes]:
-    """Frames of a message; array frames are views on its (read-only) arrays.
+def encode(message: m.Message, version: int = VERSION) -> list[Bytes]:
+    """Frames of a message; array frames are views on its (read-only) arrays. version: another one for a
+    message of FROZEN.
 
     Raises WireError if a field does not fit the wire, so that what is sent can always be decoded.
     """
+    assert version == VERSION or isinstance(message, FROZEN)
     layout = _LAYOUTS[type(message)]
     arrays = [spec.get(message) for spec in layout.arrays]
     table = [(spec.dtype, array.shape) for spec, array in zip(layout.arrays, arrays, strict=True)]
@@ -296,19 +314,19 @@ def encode(message: m.Message) -> list[Bytes]:
         scalars = msgspec.Raw(layout.scalars.encode(message))
     except _BAD as error:
         raise _wire_error(type(message).__name__, error) from None
-    header = _encoder.encode((VERSION, layout.code, scalars, table))
+    header = _encoder.encode((version, layout.code, scalars, table))
     return [header, *(array.data.cast("B") if array.size else b"" for array in arrays)]
 
 
 def decode(frames: Sequence[Bytes], versions: Sequence[int] = (VERSION,)) -> m.Message:
     """The message in `frames`; its arrays may be read-only views on them. versions: for what was kept, those
-    in which its kind has not changed. Raises WireError only."""
+    in which its kind has not changed. Raises WireError only, VersionError for any other version."""
     if not frames:
         raise WireError("empty message")
     if memoryview(frames[0]).nbytes > MAX_HEADER_BYTES:
         raise WireError(f"header of {memoryview(frames[0]).nbytes} bytes, at most {MAX_HEADER_BYTES}")
     try:
-        _check_version(_read_version(frames[0]).version, versions)
+        _check_version(_read_head(frames[0]), versions)
         header = _read_header(frames[0])
     except _BAD as error:
         raise _wire_error("header", error) from None
@@ -332,9 +350,14 @@ def _wire_error(where: str, error: Exception) -> WireError:
     return WireError(line[:200])
 
 
-def _check_version(version: int, versions: Sequence[int]) -> None:
-    if version not in versions:
-        raise ValueError(f"peer speaks version {version}, this is {VERSION}; update the older one")
+def _check_version(head: _Head, versions: Sequence[int]) -> None:
+    if head.version not in versions:
+        raise VersionError(head.version, head.code if isinstance(head.code, int) else None, VERSION)
+
+
+def code_of(kind: type[m.Message]) -> int:
+    """By which a header says that its message is of this kind."""
+    return _LAYOUTS[kind].code
 
 
 def _arrays(layout: _Layout, header: _Header, frames: Sequence[Bytes]) -> dict[str, NDArray[Any] | None]:

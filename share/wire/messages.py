@@ -6,33 +6,49 @@ so no message repeats who sent it.
 
 from __future__ import annotations
 
-import math
+import hashlib
 from dataclasses import dataclass
 
 from share.geometry.camera import Camera, Rig
-from share.types import F64, AgentKind, Correction, Frame, Keyframe, TrackState, Wait, checked_pose
+from share.types import (
+    F64,
+    MAX_NAME,
+    AgentKind,
+    Correction,
+    Frame,
+    Keyframe,
+    TrackState,
+    Wait,
+    checked_id,
+    checked_pose,
+    checked_stamp,
+)
 
 MAX_RATE_HZ = 1000.0
 MAX_HELD = 256  # ids in one Ack: the most keyframes that may wait at the edge for a gap to close
 MAX_TEXT = 512  # characters of anything a person reads
+MAX_REASON = 120  # characters of why an agent is in its state
+MAX_AGE_MS = 1e9  # 11 days
 MAX_SIDE = 8192  # px, of an image
 MAX_SAMPLES = 20_000  # of an IMU, in one frame
+MAX_DELAY_MS = 1e7  # three hours
+MAX_ERROR_CM = 1e7  # 100 km, as far as a pose may be
 PEER_BYTES = 8
 
 
 def peer_id(run_id: int) -> bytes:
-    """The PEER_BYTES by which the transport of the edge knows the agent of this run."""
+    """The PEER_BYTES by which the transport of the edge knows the agent of this run.
+
+    Whoever knows them can speak for the run, so they are random and shown to nobody but the edge."""
     return run_id.to_bytes(PEER_BYTES, "big", signed=True)
 
 
-def _check_ids(*ids: int) -> None:
-    if min(ids) < 0:
-        raise ValueError(f"keyframe ids: {min(ids)} is negative")
+def public_tag(run_id: int) -> str:
+    """16 hexadecimal digits that name a run to everybody and do not tell its `run_id`."""
+    return hashlib.sha256(peer_id(run_id)).hexdigest()[:16]
 
 
 def _check_camera(camera: Camera) -> None:
-    if not 1.0 <= min(camera.fx, camera.fy) <= max(camera.fx, camera.fy) <= 1e5:
-        raise ValueError(f"focal: {camera.fx}, {camera.fy} px are outside 1 .. 1e5")
     if max(camera.width, camera.height) > MAX_SIDE:
         raise ValueError(f"image: {camera.width}x{camera.height} px is more than {MAX_SIDE} a side")
 
@@ -42,8 +58,11 @@ def _check_camera(camera: Camera) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Hello:
-    """First message of a run, repeated until welcomed. rig: the agent's calibration, by which the edge knows
-    what it sees. streams: it does not track itself but sends what its sensors see."""
+    """First message of a run, repeated until welcomed.
+
+    run_id: 64 random bits, the run's secret: they are its `peer_id` too, and only the edge learns them.
+    rig: the agent's calibration, by which the edge knows what it sees. streams: it does not track itself but
+    sends what its sensors see."""
 
     name: str
     kind: AgentKind
@@ -52,8 +71,8 @@ class Hello:
     streams: bool = False
 
     def __post_init__(self) -> None:
-        if not (0 < len(self.name) <= 64 and self.name.isprintable() and "/" not in self.name):
-            raise ValueError("name: 1 to 64 printable characters without '/'")
+        if not (0 < len(self.name) <= MAX_NAME and self.name.isprintable() and "/" not in self.name):
+            raise ValueError(f"name: 1 to {MAX_NAME} printable characters without '/'")
         for camera in (self.rig.cam0, self.rig.cam1, self.rig.depth):
             if camera is not None:
                 _check_camera(camera)
@@ -69,6 +88,8 @@ class PoseUpdate:
     T_keyframe_body: F64
 
     def __post_init__(self) -> None:
+        checked_stamp("stamp_ns", self.stamp_ns)
+        checked_id("keyframe", self.keyframe, least=-1)
         object.__setattr__(self, "T_keyframe_body", checked_pose("T_keyframe_body", self.T_keyframe_body))
 
 
@@ -81,16 +102,36 @@ class Evaluation:
     error_cm: float | None
 
     def __post_init__(self) -> None:
-        if not all(math.isfinite(x) and x >= 0 for x in (self.delay_ms, self.error_cm or 0.0)):
-            raise ValueError(
-                f"evaluation: {self.delay_ms} ms, {self.error_cm} cm must be finite, not negative"
-            )
+        checked_id("keyframe", self.keyframe)
+        if not 0 <= self.delay_ms <= MAX_DELAY_MS:
+            raise ValueError(f"delay_ms: {self.delay_ms} is outside 0 .. {MAX_DELAY_MS:g}")
+        if self.error_cm is not None and not 0 <= self.error_cm <= MAX_ERROR_CM:
+            raise ValueError(f"error_cm: {self.error_cm} is outside 0 .. {MAX_ERROR_CM:g}")
+
+
+@dataclass(frozen=True)
+class Status:
+    """Twice a second, and at once where it changes, also while no frame comes. pose_age_ms: since the newest
+    frame with a pose arrived, or the run began. reason: why it is so, for a person; empty: all is well."""
+
+    state: TrackState
+    pose_age_ms: float
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.pose_age_ms <= MAX_AGE_MS:
+            raise ValueError(f"pose_age_ms: {self.pose_age_ms} is outside 0 .. {MAX_AGE_MS:g}")
+        if len(self.reason) > MAX_REASON or not self.reason.isprintable():
+            raise ValueError(f"reason: at most {MAX_REASON} printable characters")
 
 
 @dataclass(frozen=True)
 class Ping:
     sequence: int
     sent_ns: int
+
+    def __post_init__(self) -> None:
+        checked_stamp("sent_ns", self.sent_ns)
 
 
 @dataclass(frozen=True)
@@ -109,7 +150,7 @@ class Welcome:
     next_keyframe: int
 
     def __post_init__(self) -> None:
-        _check_ids(self.next_keyframe)
+        checked_id("next_keyframe", self.next_keyframe)
 
 
 @dataclass(frozen=True)
@@ -134,7 +175,8 @@ class Ack:
     held: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        _check_ids(self.next_keyframe, *self.held)
+        for id_ in (self.next_keyframe, *self.held):
+            checked_id("keyframe ids", id_)
         if len(self.held) > MAX_HELD:
             raise ValueError(f"held: {len(self.held)} ids, at most {MAX_HELD}")
 
@@ -163,6 +205,10 @@ class Pong:
     replied_ns: int
     session: int
 
+    def __post_init__(self) -> None:
+        for name in ("sent_ns", "received_ns", "replied_ns"):
+            checked_stamp(name, getattr(self, name))
+
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
@@ -179,12 +225,14 @@ class Tracked:
     waits: Wait | None = None
 
     def __post_init__(self) -> None:
+        checked_id("index", self.index)
+        checked_stamp("stamp_ns", self.stamp_ns)
         if (self.T_odom_body is not None) != self.state.has_pose:
             raise ValueError(f"T_odom_body: goes with a state that has a pose, not with {self.state}")
         if self.T_odom_body is not None:
             object.__setattr__(self, "T_odom_body", checked_pose("T_odom_body", self.T_odom_body))
 
 
-Up = Hello | PoseUpdate | Keyframe | Evaluation | Ping | Bye | Frame
+Up = Hello | PoseUpdate | Keyframe | Evaluation | Status | Ping | Bye | Frame
 Down = Welcome | Refused | Ack | Correction | Rate | Pong | Tracked
 Message = Up | Down

@@ -71,7 +71,7 @@ def test_says_hello_until_welcomed() -> None:
     effects = tell(agent, m.Welcome(SESSION, 0), 1100 * MS)
     assert said(effects) == ["connected to the edge"]
     later = [x for t in range(12, 30) for x in sent(handle(agent, ev.Tick(), t * 100 * MS))]
-    assert {type(x) for x in later} == {m.Ping}
+    assert {type(x) for x in later} == {m.Ping, m.Status}
 
 
 def test_an_edge_that_never_answers_is_said_once() -> None:
@@ -125,7 +125,7 @@ def test_another_wire_version_is_said_in_words() -> None:
     newer = b"\x94\x09\x01\x90\x90"
     assert said(handle(agent, ev.Received([newer]), 0)) == [
         "a message from the edge is not understood: "
-        f"header: peer speaks version 9, this is {VERSION}; update the older one"
+        f"header: peer speaks wire 9, this SHARE wire {VERSION}: upgrade the older one"
     ]
 
 
@@ -423,6 +423,7 @@ def test_the_delay_is_until_the_keyframe_is_made_and_does_not_jump() -> None:
 
 def test_a_correction_for_a_replayed_keyframe_is_not_a_latency() -> None:
     agent = corrected_agent()
+    handle(agent, ev.Connected(), 60 * S)
     tell(agent, m.Welcome(SESSION + 1, 0), 60 * S)
     tell(agent, m.Ack(1), 60 * S)
     [applied] = only(ev.CorrectionApplied, tell(agent, correction(pose(1), 1, answers=0), 60 * S))

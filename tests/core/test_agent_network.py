@@ -141,7 +141,7 @@ def test_restarted_edges_get_what_they_lack(
         check_applied(edge.applied, walk, edge.next_keyframe)
     assert run.agent.report()["open"] == 0
     if (
-        run.agent._session == lives[-1].session and lives[-1].applied
+        run.agent._lives.session == lives[-1].session and lives[-1].applied
     ):  # else the end came before it was noticed
         assert lives[-1].applied[-1].id == run.agent.report()["keyframes"] - 1
 

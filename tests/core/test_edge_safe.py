@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hellos import hello_of
 
@@ -119,3 +121,27 @@ def test_a_runs_number_is_not_shared_by_two_names() -> None:
     (refused,) = [decode([bytes(f) for f in e.frames]) for e in of(effects, ed.Send)]
     assert isinstance(refused, m.Refused)
     assert "'ann'" in refused.reason
+
+
+def test_what_waits_for_the_disk_is_bounded(monkeypatch) -> None:
+    """An agent that does not wait for acknowledgements is not taken in beyond a bound, and loses nothing."""
+    monkeypatch.setattr("share.core.peer._MAX_UNSAFE", 5)
+    edge = Edge(Config(), 7, keeps=True)
+    tell(edge, HELLO)
+    keeps = [keep for k in range(20) for keep in of(tell(edge, keyframe(k, k - 1)), ed.Keep)]
+    assert len(keeps) == 5
+    effects = tell(edge, keyframe(0, -1))  # again: it is answered, and held no second time
+    assert not of(effects, ed.Keep)
+    assert acks(effects) == [m.Ack(0, tuple(range(5)))]
+    assert acks(edge.handle(ed.Kept(keeps[-1].ticket), 0)) == [m.Ack(5)]
+    assert len([keep for k in range(5, 8) for keep in of(tell(edge, keyframe(k, k - 1)), ed.Keep)]) == 3
+
+
+def test_a_keyframe_that_is_refused_waits_for_no_disk() -> None:
+    edge = Edge(Config(), 7, keeps=True)
+    tell(edge, HELLO)
+    keeps = [of(tell(edge, keyframe(k, k - 1)), ed.Keep)[0] for k in range(2)]
+    edge.handle(ed.Kept(keeps[-1].ticket), 0)
+    effects = tell(edge, replace(keyframe(2, 0), follows=0))  # refers to one that is not the last
+    assert not of(effects, ed.Add)
+    assert acks(effects) == [m.Ack(3)]

@@ -14,12 +14,12 @@ from share.core import edge_events as ed
 from share.core import events as ev
 from share.core.agent import Agent
 from share.core.edge import Edge
-from share.core.tracking_edge import TrackingEdge
+from share.core.tracking_edge import Room, TrackingEdge
 from share.errors import UsageError
 from share.geometry import se3
 from share.types import F64, Frame, ImuBatch, TrackState
 from share.wire import messages as m
-from share.wire.codec import encode
+from share.wire.codec import decode, encode
 
 MS = 1_000_000
 CONFIG = Config(edge=EdgeConfig(policy="streamed"), stream=StreamConfig(window=3))
@@ -295,3 +295,28 @@ def test_a_stream_that_is_none_of_ours_changes_nothing() -> None:
 
 def encoded(message: m.Message) -> list[bytes]:
     return [bytes(part) for part in encode(message)]
+
+
+# ------------------------------------------------------------------ how many
+
+
+def greeted(edge: Edge, number: int, now_ms: int = 0) -> tuple[list[m.Message], list[ed.Effect]]:
+    """What agent `number` is told when it says hello, and all else that follows."""
+    hello = replace(hello_of(f"agent{number}", 100 + number), streams=True)
+    effects = edge.handle(ed.Received(m.peer_id(100 + number), encode(hello)), now_ms * MS)
+    down = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.Send)]
+    return down, effects
+
+
+def test_no_more_are_tracked_than_there_is_room_for():
+    edge = TrackingEdge(CONFIG, 1, room=Room(4, "2 cores, 3.1 GB free"))
+    begun = [e for k in range(12) for e in greeted(edge, k)[1] if isinstance(e, ed.BeginTracking)]
+    assert len(begun) == 4
+    why = "this machine can track 4 streamed agents: 2 cores, 3.1 GB free; wait until one leaves"
+    assert greeted(edge, 5)[0] == [m.Refused(why)]
+    assert greeted(edge, 0)[0] == []  # one that is tracked is no other
+    edge.handle(ed.Received(m.peer_id(101), encode(m.Bye())), 0)
+    assert [type(e) for e in greeted(edge, 5)[1]].count(ed.BeginTracking) == 1
+    down, effects = greeted(edge, 1)  # back, but its place is taken
+    assert set(down) == {m.Refused(why)}
+    assert not [e for e in effects if isinstance(e, ed.BeginTracking)]

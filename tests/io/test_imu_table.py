@@ -11,6 +11,7 @@ from share.core.stamps import WRAP_NS
 from share.errors import DataError, UsageError
 from share.io.convert import to_mcap
 from share.io.imu_table import read_imu
+from share.io.losses import Losses
 from share.io.mcap import imu as fast
 from share.io.mcap import types as ros
 from share.io.mcap.recorder import Recorder
@@ -69,11 +70,15 @@ def test_messages_are_read_as_rosbags_writes_them(frame):
         linear_acceleration=other,
         linear_acceleration_covariance=covariances[2],
     )
-    stamps, values = fast._unpacked([ros.encode(message)] * 2, "here")
+    stamps, values = fast._unpacked([ros.encode(message)] * 2)
     assert stamps.tolist() == [12_000_000_345] * 2
     assert values[1].tolist() == [getattr(v, k) for v in (vector, other) for k in "xyz"]
+    losses = Losses()
+    assert len(fast._readable([ros.encode(message)[:-8], ros.encode(message)], "here", losses)) == 1
+    losses.check("IMU messages", 2)
+    assert not fast._readable([ros.encode(message)[:-8]], "here", losses)
     with pytest.raises(DataError, match="here: a message is no sensor_msgs/Imu"):
-        fast._unpacked([ros.encode(message)[:-8]], "here")
+        losses.check("IMU messages", 3)
 
 
 def test_a_counter_that_wraps_goes_on(tmp_path):
@@ -103,8 +108,11 @@ def test_what_has_no_imu_is_refused(tmp_path):
         read_imu(str(tmp_path / "tum.mcap"))
 
 
-def test_a_sample_that_is_no_number_is_refused(tmp_path):
+def test_a_sample_that_is_no_number_is_left_out_and_counted_but_not_many(tmp_path):
     values = np.ones((5, 6))
     values[3, 2] = np.nan
-    with pytest.raises(DataError, match="sample 4 is not finite"):
-        read_imu(str(recorded(tmp_path / "a.mcap", list(range(5)), values)))
+    table = read_imu(str(recorded(tmp_path / "a.mcap", list(range(5)), values)))
+    assert (len(table.imu), table.dropped) == (4, 1)
+    values[2, 2] = np.nan
+    with pytest.raises(DataError, match=r"sample 3 is not finite \(2 of 5 IMU samples are damaged: too many"):
+        read_imu(str(recorded(tmp_path / "b.mcap", list(range(5)), values)))

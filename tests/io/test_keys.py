@@ -280,7 +280,7 @@ class House:
         while True:
             assert time.monotonic() < end, "did not get in"
             agent.send([b"hello"])
-            if (heard := self.edge.receive(10)) is not None and heard[0] == peer_id(run_id):
+            if (heard := self.edge.receive(10)) is not None and heard.peer == peer_id(run_id):
                 self.edge.send(peer_id(run_id), [b"welcome"])
             if agent.receive(10) == [b"welcome"]:
                 return
@@ -393,7 +393,7 @@ def test_a_stranger_with_a_free_hand_stays_outside(house: House) -> None:
     count, strangers = 0, []
     while count < 20 and time.monotonic() < end:
         message = house.edge.receive(10)
-        if message is not None and message[1] != [b"hello"]:  # ann may have had to say it twice
+        if message is not None and message.frames != [b"hello"]:  # ann may have had to say it twice
             strangers.append(message)
         count += len(house.edge.refusals())
     for rogue in sockets:

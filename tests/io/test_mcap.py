@@ -166,7 +166,7 @@ def test_the_rigs_timeshift_is_recorded_with_it():
 
 def test_the_rig_survives_as_ros_messages():
     """CameraInfo and /tf_static tell the same rig as our own record, but for rounding."""
-    tree = ros_rig.FrameTree([ros_rig.to_tf(RIG, 0)])
+    tree = ros_rig.FrameTree([ros_rig.to_tf(RIG, 0)], "here")
     np.testing.assert_allclose(tree.find("body", "cam0"), RIG.T_body_cam0, atol=1e-12)
     np.testing.assert_allclose(tree.find("depth", "cam0"), RIG.T_depth_cam0, atol=1e-12)
     assert tree.find("cam0", "moon") is None

@@ -1,5 +1,6 @@
 """EuRoC and TUM folders: what they hold comes out, what is wrong with them is said."""
 
+import re
 import shutil
 
 import cv2
@@ -151,21 +152,31 @@ def _edit(name, old, new):
     return edit
 
 
+def _nan_stamps(root):
+    file = root / "mav0" / "cam0" / "data.csv"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join([lines[0], *("nan" + line[19:] for line in lines[1:3]), *lines[3:]]))
+
+
+def _names_lead_out(root):
+    file = root / "mav0" / "cam0" / "data.csv"
+    file.write_text(file.read_text().replace(",", ",../../x.png,"))
+
+
 DAMAGE = {
-    "line of IMU cut": (
-        _cut_csv,
+    "unsorted": (
+        _unsorted,
         DataError,
-        r"imu0/data\.csv, line 72: 6 of 7 columns; the line is cut short",
+        r"cam1/data\.csv, line .* earlier than the line before.*; sort.*5 of 6",
     ),
-    "unsorted": (_unsorted, DataError, r"cam1/data\.csv, line 3: .* earlier than the line before; sort"),
-    "NaN stamp": (_edit("cam0/data.csv", str(START_NS), "nan"), DataError, r"line 2: stamp 'nan'"),
+    "NaN stamps": (_nan_stamps, DataError, r"line 2: stamp 'nan'.*2 of 6 lines of .* too many to leave out"),
+    "names lead out": (_names_lead_out, DataError, r"line 2: '\.\./\.\./x\.png' is no name of a file below"),
     "no list": (lambda r: (r / "mav0/cam0/data.csv").unlink(), DataError, r"data\.csv: no such file"),
     "empty list": (lambda r: (r / "mav0/cam0/data.csv").write_text(""), DataError, "has no data"),
-    "no images": (lambda r: shutil.rmtree(r / "mav0/cam0/data"), DataError, "6 of 6 images are missing"),
-    "one image gone": (
-        lambda r: (r / f"mav0/cam1/data/{START_NS}.png").unlink(),
+    "no images": (
+        lambda r: shutil.rmtree(r / "mav0/cam0/data"),
         DataError,
-        f"1 of 6 images are missing from .*first: {START_NS}",
+        "is missing from .*6 of 6 images",
     ),
     "no sensor.yaml": (lambda r: (r / "mav0/cam0/sensor.yaml").unlink(), ConfigError, "give .* --calib"),
     "no extrinsics": (_edit("cam1/sensor.yaml", "T_BS", "T"), ConfigError, "cam1.*: key 'T_BS' is missing"),
@@ -176,6 +187,52 @@ DAMAGE = {
         r"png: is 64x48, but the calibration is for 32x24.*--calib",
     ),
 }
+
+
+def _gone(root):
+    (root / f"mav0/cam1/data/{START_NS}.png").unlink()
+
+
+ONE = {
+    "line of IMU cut": (_cut_csv, 6, 70, r"1 lines of .*imu0/data\.csv, line 72: 6 of 7 columns; the line is cut short"),  # noqa: E501
+    "NaN in the IMU": (_edit("imu0/data.csv", ",0", ",nan"), 6, 70, r"1 lines of .*line \d+: 'nan.*' is not "),  # noqa: E501
+    "NaN stamp": (_edit("cam0/data.csv", str(START_NS), "nan"), 5, 71, r"1 lines of .*cam0/data.csv, line 2: stamp 'nan'"),  # noqa: E501
+    "stamp far ahead": (_edit("imu0/data.csv", "14037152", "24037152"), 6, 70, "line 2: stamp .* later than those after"),  # noqa: E501
+    "one image gone": (_gone, 5, 71, rf"1 images of .*cam1/data.csv.*: {START_NS}\.png is missing"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ONE)
+def test_one_damaged_line_or_image_costs_itself_and_is_said(euroc, case):
+    damage, images, samples, said = ONE[case]
+    damage(euroc)
+    source = open_source(str(euroc))
+    assert min(len(stamps) for name, stamps in source.stamps().items() if name != "imu") == images
+    assert len(source.stamps()["imu"]) == samples
+    (line,) = source.losses.lines()
+    assert re.search(said, line) and "\n" not in line
+
+
+@pytest.mark.parametrize("file", ["state_groundtruth_estimate0/data.csv", "groundtruth.txt"])
+def test_one_damaged_line_of_a_truth_costs_itself(request, file):
+    root = request.getfixturevalue("tum" if file.endswith("txt") else "euroc")
+    path = root / file if file.endswith("txt") else root / "mav0" / file
+    whole = open_source(str(root)).truth()
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:-1], lines[-1].replace("0.", "nan", 1)]))
+    source = open_source(str(root))
+    truth = source.truth()
+    np.testing.assert_array_equal(truth.T, whole.T[:-1])
+    (said,) = source.losses.lines()
+    assert said.startswith(f"1 lines of {path} could not be read")
+
+
+def test_files_that_a_list_names_stay_in_its_folder(tum):
+    (tum / "rgb.txt").write_text("10.0 ../../../etc/passwd\n10.033333 /etc/passwd\n10.066667 rgb/2.jpg\n")
+    with pytest.raises(
+        DataError, match=r"rgb\.txt, line 1: '\.\./\.\./\.\./etc/passwd' is no name of a file below"
+    ):
+        open_source(str(tum))
 
 
 @pytest.mark.parametrize("case", DAMAGE)

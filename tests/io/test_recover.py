@@ -69,12 +69,16 @@ def test_a_flipped_bit_costs_one_chunk(tmp_path):
     data[len(data) // 2] ^= 0xFF
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(data)
-    with pytest.raises(DataError, match="recover"):
-        list(open_source(str(broken)).measurements())
+    source = open_source(str(broken))
+    read = list(source.measurements())
+    (said,) = source.losses.lines()
+    assert said.startswith(f"1 chunks of {broken} could not be read and were left out")
+    assert "share dataset recover" in said
     result = recover(broken, tmp_path / "good.mcap")
     assert result.reason
     left = open_source(str(tmp_path / "good.mcap")).images_count
     assert 60 < left < 100
+    assert sum(m.stream == "cam0" for m in read) == left
 
 
 @pytest.mark.parametrize(
@@ -94,7 +98,9 @@ def test_a_disk_that_cannot_be_read_to_its_end_costs_what_is_behind(tmp_path, mo
                 raise error
             return super().readinto(buffer)
 
-    monkeypatch.setattr("builtins.open", lambda name, mode: io.BufferedReader(Worn(name, mode)))
+    monkeypatch.setattr(
+        "share.io.mcap.recover.open_regular", lambda name: io.BufferedReader(Worn(name, "rb"))
+    )
     result = recover(path, tmp_path / "good.mcap")
     monkeypatch.undo()
     assert says in result.reason
@@ -107,10 +113,10 @@ def test_a_chunk_that_takes_more_memory_than_there_is_is_left_out(tmp_path, monk
 
     path, opened, chunks = record(tmp_path / "whole.mcap", 100), stream_reader.breakup_chunk, iter(range(99))
 
-    def greedy(chunk, validate_crc):
+    def greedy(chunk):
         if next(chunks) == 3:
             raise MemoryError
-        return opened(chunk, validate_crc)
+        return opened(chunk)
 
     monkeypatch.setattr(stream_reader, "breakup_chunk", greedy)
     assert recover(path, tmp_path / "good.mcap").reason == "damaged: MemoryError"
@@ -173,9 +179,9 @@ def test_sigkill_leaves_a_file_that_can_be_recovered(tmp_path):
 
 def test_an_error_while_converting_leaves_nothing(tmp_path):
     folder = make_tum(tmp_path / "walk")
-    image = folder / "rgb" / "3.jpg"
-    image.write_bytes(image.read_bytes()[:-100])
+    for image in (folder / "rgb" / "2.jpg", folder / "rgb" / "3.jpg"):
+        image.write_bytes(image.read_bytes()[:-100])
     out = tmp_path / "out"
-    with pytest.raises(DataError, match=r"3\.jpg: the image is cut short"):
+    with pytest.raises(DataError, match=r"2\.jpg: the image is cut short.*2 of 5 images of cam0 are damaged"):
         to_mcap(open_source(str(folder)), out / "x.mcap", None, nothing)
     assert os.listdir(out) == []

@@ -31,7 +31,7 @@ def test_table_keeps_nanoseconds(tmp_path):
         (GOOD + "99999999999999999999,1,2\n", "line 4: stamp 9+ is out of range"),
         (GOOD + "1503715273272142848,x,2\n", "line 4: 'x' is not a number"),
         (GOOD + "1503715273272142848,nan,2\n", "line 4: 'nan' is not finite"),
-        (GOOD + "\n1403715273262142976,1,2\n", "line 5: .* is earlier than the line before; sort"),
+        (GOOD + "\n1403715273262142976,1,2\n", "line 5: .* is earlier than the line before.*; sort"),
         ("", "has no data"),
         ("#t,a,b\n\n", "has no data"),
     ],

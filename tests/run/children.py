@@ -9,17 +9,23 @@ import sys
 import time
 from pathlib import Path
 
+from share.children import environment
+
 SHARE = [sys.executable, "-m", "share"]
 
 
 class Child:
-    """A running `share …`; its stderr goes to a file."""
+    """A running `share …`, which ends with this process at the latest; its stderr goes to a file."""
 
     def __init__(self, log: Path, *arguments: str) -> None:
         self.log = log
         with log.open("ab") as sink:
             self.process = subprocess.Popen(
-                [*SHARE, *arguments], stdin=subprocess.DEVNULL, stdout=sink, stderr=sink
+                [*SHARE, *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=sink,
+                stderr=sink,
+                env=environment(),
             )
 
     @property

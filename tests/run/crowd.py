@@ -109,7 +109,7 @@ class Walker(threading.Thread):
             self._handle(link, ev.KeyframeMade(frame, candidate))
 
     def _handle(self, link: AgentLink, event: ev.AgentEvent) -> None:
-        session = self.machine._session
+        session = self.machine._lives.session
         for effect in self.machine.handle(event, time.monotonic_ns()):
             match effect:
                 case ev.Send():
@@ -126,7 +126,7 @@ class Walker(threading.Thread):
                     raise effect.error
                 case ev.Stop():
                     self._ended = True
-        if self.machine._session != session:
+        if self.machine._lives.session != session:
             self.lives.append(Life(time.monotonic()))
 
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import resource
+import shutil
+import subprocess
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -81,7 +85,7 @@ def test_a_map_in_use(path, tmp_path):
 
 
 def test_a_disk_that_is_full_for_a_while(tmp_path):
-    """Nobody is kept waiting; what came meanwhile is in the file once there is space again."""
+    """What is not in the file is not acknowledged; all of it is there once there is space again."""
     child = edge(tmp_path)
     address = child.wait_for(r"listening on (tcp://\S+?),")[1]
     limits = resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))
@@ -89,7 +93,8 @@ def test_a_disk_that_is_full_for_a_while(tmp_path):
     ann.start()
     child.wait_for("the map cannot be written")
     time.sleep(1.5)
-    assert ann.machine.report()["open"] <= 2  # acknowledged all the same
+    assert ann.machine.report()["open"] > 2
+    assert "keyframes are not acknowledged" in child.said
     resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, limits)
     child.wait_for("the map is kept again")
     ann.finish()
@@ -101,3 +106,79 @@ def test_a_disk_that_is_full_for_a_while(tmp_path):
         numbers = [k.at.id for k in store.load().keyframes]
     assert numbers == list(range(ann.machine.report()["keyframes"]))
     assert len(numbers) > 5
+
+
+@pytest.fixture
+def small_disk(tmp_path) -> Iterator[Path]:
+    """A file system of 4 MB of its own, 3 of them taken by the file `ballast`."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", str(disk)]
+    if os.getuid() != 0 or subprocess.run(mount, capture_output=True).returncode != 0:
+        pytest.skip("a file system can only be mounted by root")
+    (disk / "ballast").write_bytes(bytes(3_000_000))
+    yield disk
+    subprocess.run(["umount", "--lazy", str(disk)], check=True)
+
+
+def kept_ids(path: Path, to: Path) -> list[int]:
+    """Of a map as it is on the disk now, read from a copy."""
+    to.mkdir()
+    for file in path.parent.glob("room.sqlite*"):
+        shutil.copyfile(file, to / file.name)
+    with MapStore.open(to / path.name) as store:
+        return [k.at.id for k in store.load().keyframes]
+
+
+def test_a_full_disk_stops_acknowledgements(small_disk, tmp_path):
+    """Killed while the disk is full, the edge has in its file exactly what it has acknowledged."""
+    child = Child(
+        tmp_path / "edge.log", "edge", "--bind", "tcp://127.0.0.1:0", "--map", str(small_disk / "room.sqlite")
+    )
+    address = child.wait_for(r"listening on (tcp://\S+?),")[1]
+    (ann,) = crowd(("ann",), address, frames=500)
+    ann.start()
+    child.wait_for("the map cannot be written: No space left on device; keyframes are not acknowledged")
+    time.sleep(2.0)
+    acknowledged, waiting = (ann.machine.report()[name] for name in ("acknowledged", "open"))
+    assert waiting > 3
+    assert ann.machine.report()["acknowledged"] == acknowledged
+    child.kill()
+    assert kept_ids(small_disk / "room.sqlite", tmp_path / "full") == list(range(acknowledged))
+    child = Child(tmp_path / "again.log", "edge", "--bind", address, "--map", str(small_disk / "room.sqlite"))
+    child.wait_for("keyframes are not acknowledged")
+    (small_disk / "ballast").unlink()
+    child.wait_for("the map is kept again")
+    deadline = time.monotonic() + 20
+    while ann.machine.report()["open"] > 1 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    ann.finish()
+    ann.join(20)
+    assert ann.error is None
+    assert child.interrupt() == 0
+    ids = kept_ids(small_disk / "room.sqlite", tmp_path / "well")
+    assert ids == list(range(ann.machine.report()["keyframes"]))
+    assert ann.machine.report()["open"] == 0
+
+
+@pytest.mark.parametrize("how", ["removed", "replaced"])
+def test_a_file_that_is_taken_away_from_under_the_edge(tmp_path, how):
+    child = edge(tmp_path)
+    address = child.wait_for(r"listening on (tcp://\S+?),")[1]
+    (ann,) = crowd(("ann",), address, frames=120)
+    path = tmp_path / "room.sqlite"
+    path.rename(tmp_path / "elsewhere")
+    if how == "replaced":
+        path.write_bytes(b"")
+    ann.start()
+    child.wait_for(f"room.sqlite was {how} while the edge ran; put it back, or start the edge again")
+    time.sleep(0.5)
+    assert ann.machine.report()["acknowledged"] == 0
+    (tmp_path / "elsewhere").rename(path)
+    child.wait_for("the map is kept again")
+    ann.finish()
+    ann.join(20)
+    assert child.interrupt() == 0
+    with MapStore.open(path) as store:
+        numbers = [k.at.id for k in store.load().keyframes]
+    assert numbers == list(range(ann.machine.report()["keyframes"]))

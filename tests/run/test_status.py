@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import http.client
 import json
+import os
+import random
 import re
+import resource
 import socket
 import threading
 import time
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -27,7 +30,7 @@ from share.wire.messages import peer_id
 
 AGENT = {
     "kind": "ar",
-    "run_id": 7,
+    "run": "ann-1234",
     "state": "OK",
     "gone": False,
     "keyframes": 12,
@@ -158,7 +161,11 @@ def test_all_that_an_edge_reports_is_in_a_metric():
     names = {name for name, _ in metrics(body)}
     absent = {row.name for row in status_metrics.ROWS} - names
     by_others = {"share_edge_last_solve_age_seconds", "share_edge_refused_handshakes_total"}
-    not_yet = {"share_edge_map_keyframes", "share_edge_stranger_bad_messages_total"}
+    not_yet = {
+        "share_edge_map_keyframes",
+        "share_edge_pose_age_seconds",
+        "share_edge_stranger_bad_messages_total",
+    }
     assert absent <= by_others | not_yet
 
 
@@ -362,6 +369,116 @@ def test_a_page_from_elsewhere_cannot_ask_this_machine():
         assert get(server, "/health", headers={"Host": "evil.example:80"})[0] == 403
         for host in ("localhost", "LocalHost:80", "127.0.0.1:1", "[::1]:80"):
             assert get(server, "/health", headers={"Host": host})[0] == 200
+
+
+# ---------------------------------------------------------------- what an attacker sends
+
+
+@pytest.mark.parametrize(
+    "header", [b"host:" + b" " * 8000 + b"x y", b"host:" + b" \t" * 4000 + b"\x0b", b"Host:" + b":1" * 4000]
+)
+def test_no_header_takes_long_to_read(header):
+    """A pattern that backtracks took 2 s, in which nothing else of the process could run."""
+    with serving() as server:
+        began = time.thread_time(), time.process_time()
+        assert said(server, b"GET /health HTTP/1.1\r\n" + header + b"\r\n\r\n").startswith(b"HTTP/1.1 ")
+        assert time.process_time() - began[1] < 0.3
+
+
+@contextmanager
+def attackers(server, attack, count=3):
+    """So many threads that do `attack(address)` again and again."""
+    host, _, port = server.endpoint.rpartition(":")
+    over = threading.Event()
+
+    def go():
+        while not over.is_set():
+            with suppress(OSError):
+                attack((host, int(port)))
+
+    threads = [threading.Thread(target=go) for _ in range(count)]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join(10)
+
+
+def connect_and_go(address):
+    socket.create_connection(address, timeout=1).close()
+
+
+def connect_and_stay(address):
+    with ExitStack() as stack:
+        for _ in range(20):
+            stack.enter_context(socket.create_connection(address, timeout=1))
+        time.sleep(0.05)
+
+
+def byte_by_byte(address):
+    with socket.create_connection(address, timeout=1) as client:
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        for _ in range(9000):
+            client.send(b"G")
+
+
+def endless_body(address):
+    with socket.create_connection(address, timeout=1) as client:
+        client.sendall(b"POST /health HTTP/1.1\r\nContent-Length: 999999999\r\n\r\n")
+        while client.send(bytes(65536)):
+            pass
+
+
+def pipelined(address):
+    with socket.create_connection(address, timeout=1) as client:
+        client.sendall(b"GET /snapshot.json HTTP/1.1\r\nConnection: keep-alive\r\n\r\n" * 100)
+        while client.recv(65536):
+            pass
+
+
+def noise(address):
+    with socket.create_connection(address, timeout=1) as client:
+        client.sendall(random.randbytes(random.randrange(1, 20_000)) + b"\r\n\r\n")
+        client.recv(65536)
+
+
+@pytest.mark.parametrize(
+    "attack", [connect_and_go, connect_and_stay, byte_by_byte, endless_body, pipelined, noise]
+)
+def test_whatever_clients_do_the_server_takes_little_and_goes_on(attack):
+    with serving() as server:
+        (web_thread,) = [thread for thread in threading.enumerate() if thread.name == "web"]
+        clock = time.pthread_getcpuclockid(web_thread.ident)
+        threads, files = threading.active_count(), len(os.listdir("/proc/self/fd"))
+        memory = resident_bytes()
+        with attackers(server, attack):
+            began, worked = time.monotonic(), time.clock_gettime(clock)
+            time.sleep(1.0)
+            share = (time.clock_gettime(clock) - worked) / (time.monotonic() - began)
+        assert share < 0.35
+        assert get(server, "/health")[0] == 200
+        assert threading.active_count() == threads
+        assert len(os.listdir("/proc/self/fd")) <= files + 2 * web.CONNECTIONS
+        assert resident_bytes() - memory < 20e6
+
+
+def resident_bytes():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+
+def test_an_answer_that_fails_costs_one_connection():
+    def fails(path):
+        raise RuntimeError(path)
+
+    server = web.WebServer("0", fails)
+    try:
+        for _ in range(3):
+            assert said(server, b"GET / HTTP/1.1\r\n\r\n") == b""
+    finally:
+        server.close()
 
 
 def test_closed_it_is_gone_and_its_port_free():

@@ -8,21 +8,36 @@ from hypothesis.extra import numpy as hnp
 
 from share.geometry import se3
 from share.geometry.camera import MOST_TIMESHIFT_S, Camera, ImuNoise, Rig
-from share.types import AgentKind, Correction, Frame, ImuBatch, Keyframe, TrackState, View, Wait
+from share.types import (
+    MAX_ID,
+    MAX_M,
+    MAX_STAMP_NS,
+    AgentKind,
+    Correction,
+    Frame,
+    ImuBatch,
+    Keyframe,
+    TrackState,
+    View,
+    Wait,
+)
 from share.wire import messages as m
 
 int64 = st.integers(-(2**63), 2**63 - 1)
-ids = st.integers(0, 2**63 - 1)
+stamps = st.integers(-MAX_STAMP_NS, MAX_STAMP_NS)
+ids = st.integers(0, MAX_ID)
+ids_or_none = st.integers(-1, MAX_ID)
+near = st.floats(-MAX_M, MAX_M)
 finite = st.floats(-1e6, 1e6)
 names = st.text(st.characters(categories=["L", "N"]), min_size=1, max_size=64)
 covs = hnp.arrays(np.float64, (6, 6), elements=st.floats(-1e4, 1e4)).map(lambda A: A @ A.T)
-ups = hnp.arrays(np.float64, 3, elements=finite)
+ups = st.sampled_from([(0, 0, 0), (0, 0, 1), (0.6, 0, -0.8)]).map(lambda up: np.array(up, float))
 
 
 @st.composite
 def poses(draw: st.DrawFn) -> np.ndarray:
     rotation = draw(hnp.arrays(np.float64, 3, elements=st.floats(-3, 3)))
-    position = draw(hnp.arrays(np.float64, 3, elements=finite))
+    position = draw(hnp.arrays(np.float64, 3, elements=near))
     return se3.compose(se3.so3_exp(rotation), position)
 
 
@@ -44,15 +59,18 @@ def keyframes(draw: st.DrawFn) -> Keyframe:
     follows = draw(st.integers(reference, id_ - 1))
     motion = draw(poses()), draw(covs), draw(poses())
     return Keyframe(
-        id_, reference, draw(int64), *motion, draw(ups), draw(st.floats(0, 10)), draw(views()), follows
+        id_, reference, draw(stamps), *motion, draw(ups), draw(st.floats(0, 10)), draw(views()), follows
     )
 
 
 focals, sides = st.floats(1, 1e5), st.integers(1, m.MAX_SIDE)
-distortions = st.sampled_from([0, 4, 5]).flatmap(lambda n: st.tuples(*[finite] * n))
+coefficients = st.floats(-1e4, 1e4)
+distortions = st.sampled_from([0, 4, 5]).flatmap(lambda n: st.tuples(*[coefficients] * n))
 cameras = st.builds(Camera, sides, sides, focals, focals, finite, finite, distortions)
 amount = st.floats(0, 1e9)
-imus = st.builds(ImuNoise, amount, amount, amount, amount, amount)
+late = st.floats(0, min(m.MAX_DELAY_MS, m.MAX_ERROR_CM))
+noise = st.floats(0, 1e3)
+imus = st.builds(ImuNoise, noise, noise, noise, noise, st.floats(0, 1e5))
 
 
 @st.composite
@@ -61,9 +79,10 @@ def frames(draw: st.DrawFn) -> Frame:
     (h, w, n), deep = draw(st.tuples(*[st.integers(0, 40)] * 3)), draw(st.integers(0, 2))
     image0, image1 = rng.integers(0, 256, (2, h, w)).astype(np.uint8)
     depth = rng.uniform(0, 9, (w, h)).astype(np.float32)
-    imu = ImuBatch(rng.integers(-(2**63), 2**63 - 1, n), rng.normal(size=(n, 3)), rng.normal(size=(n, 3)))
+    stamps_ns = rng.integers(-MAX_STAMP_NS, MAX_STAMP_NS, n)
+    imu = ImuBatch(stamps_ns, rng.normal(size=(n, 3)), rng.normal(size=(n, 3)))
     seen = [(None, None), (image1, None), (None, depth)][deep]
-    return Frame(draw(int64), draw(int64), image0, *seen, imu, draw(int64))
+    return Frame(draw(stamps), draw(ids), image0, *seen, imu, draw(stamps))
 
 
 @st.composite
@@ -71,7 +90,7 @@ def tracked(draw: st.DrawFn) -> m.Tracked:
     state = draw(st.sampled_from(TrackState))
     T = draw(poses()) if state.has_pose else None
     flags = draw(st.tuples(st.booleans(), st.booleans(), st.booleans(), st.none() | st.sampled_from(Wait)))
-    return m.Tracked(draw(int64), draw(int64), state, T, *flags)
+    return m.Tracked(draw(ids), draw(stamps), state, T, *flags)
 
 
 @st.composite
@@ -83,17 +102,23 @@ def rigs(draw: st.DrawFn) -> Rig:
 
 messages = st.one_of(
     st.builds(m.Hello, names, st.sampled_from(AgentKind), int64, rigs(), st.booleans()),
-    st.builds(m.PoseUpdate, int64, st.sampled_from(TrackState), int64, poses()),
+    st.builds(m.PoseUpdate, stamps, st.sampled_from(TrackState), ids_or_none, poses()),
     keyframes(),
-    st.builds(m.Evaluation, int64, amount, st.none() | amount),
-    st.builds(m.Ping, int64, int64),
+    st.builds(m.Evaluation, ids, late, st.none() | late),
+    st.builds(
+        m.Status,
+        st.sampled_from(TrackState),
+        st.floats(0, m.MAX_AGE_MS),
+        st.text(st.characters(categories=["L", "N"]), max_size=m.MAX_REASON),
+    ),
+    st.builds(m.Ping, int64, stamps),
     st.just(m.Bye()),
     st.builds(m.Welcome, int64, ids),
     st.builds(m.Refused, st.text(st.characters(codec="utf-8"), max_size=m.MAX_TEXT)),
     st.builds(m.Ack, ids, st.lists(ids, max_size=m.MAX_HELD).map(tuple)),
-    st.builds(Correction, poses(), covs, names, int64, int64, int64),
+    st.builds(Correction, poses(), covs, names, ids, ids, ids_or_none),
     st.builds(m.Rate, st.floats(0, m.MAX_RATE_HZ)),
-    st.builds(m.Pong, int64, int64, int64, int64, int64),
+    st.builds(m.Pong, int64, stamps, stamps, stamps, int64),
     frames(),
     tracked(),
 )

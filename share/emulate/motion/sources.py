@@ -138,10 +138,7 @@ def _read_imu(path: Path) -> ImuBatch:
 
 def _read_stamps(path: Path) -> I64:
     """First column of a list of images."""
-    lines = tables.rows(path, ",", 1)
-    stamps = np.array([tables.parse_ns(fields[0], f"{path}, line {n}") for n, fields in lines], np.int64)
-    tables.check_sorted(path, stamps)
-    return stamps
+    return tables.parsed(path, ",", 1, lambda fields, where: (tables.parse_ns(fields[0], where),))[0]
 
 
 def _span(folder: Path, imu: ImuBatch, mocap: Mocap, start: float, seconds: float | None) -> tuple[int, int]:

@@ -5,18 +5,23 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import quote
 
 from share.errors import StoreError, UsageError
 from share.io.map_store.schema import PAGE_BYTES, first_page
+from share.io.regular_file import open_regular
 
 BUSY_S = 5.0  # how long a commit waits for a reader of another process
 WAL_PAGES = 512  # after as many (4 MiB) the log is moved into the file
 MAGIC = b"SQLite format 3\0"
 _HEADER_BYTES = 100
 _FIXED = (*range(18), *range(20, 24), *range(44, 48), *range(52, 60))  # sqlite.org/fileformat.html, 1.3
+_MOST_BYTES = 256 * 1024**2  # of a row: poses of a million keyframes are 128 MB
+_PATIENCE_S, _BYTES_A_SECOND = 10.0, 1e6
+_STEPS = 10_000  # of SQLite's machine between two looks at the clock: some 0.1 ms
 _OURS = b"CREATE TABLE keyframe(", b"CREATE TABLE run_copy("  # one survives a flipped byte
 
 # The world's troubles; whatever else SQLite says of a file, the file is damaged.
@@ -41,6 +46,7 @@ class DamageError(StoreError):
 def for_writing(path: Path, power_cut: bool) -> sqlite3.Connection:
     """The one writer. power_cut: a commit waits for the disk, so that not even that costs one."""
     connection = sqlite3.connect(path, BUSY_S, isolation_level=None, check_same_thread=False)
+    _distrust(connection)
     connection.execute(f"PRAGMA page_size = {PAGE_BYTES}")
     connection.execute("PRAGMA journal_mode = WAL")
     connection.execute(f"PRAGMA synchronous = {'FULL' if power_cut else 'NORMAL'}")
@@ -53,7 +59,23 @@ def for_reading(path: Path) -> sqlite3.Connection:
     """Beside a living writer too. Without a log nobody writes, and no file beside it is needed."""
     mode = "mode=ro" if log_of(path).exists() else "immutable=1"
     uri = f"file:{quote(str(path.resolve()))}?{mode}"
-    return sqlite3.connect(uri, BUSY_S, uri=True, isolation_level=None, check_same_thread=False)
+    connection = sqlite3.connect(uri, BUSY_S, uri=True, isolation_level=None, check_same_thread=False)
+    return for_so_long(connection, path)
+
+
+def for_so_long(connection: sqlite3.Connection, path: Path) -> sqlite3.Connection:
+    """`connection` to a file from anywhere: after the time that reading so large a file takes on a slow disk,
+    whatever it does ends with an error."""
+    _distrust(connection)
+    until = time.monotonic() + _PATIENCE_S + path.stat().st_size / _BYTES_A_SECOND
+    connection.set_progress_handler(lambda: time.monotonic() > until, _STEPS)
+    return connection
+
+
+def _distrust(connection: sqlite3.Connection) -> None:
+    connection.execute("PRAGMA trusted_schema = OFF")
+    connection.execute("PRAGMA cell_size_check = ON")
+    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MOST_BYTES)
 
 
 def log_of(path: Path) -> Path:
@@ -82,7 +104,9 @@ def check_is_map(path: Path) -> bool:
     A writer killed before its first commit leaves nothing or a bare first page; what follows is in the log.
     """
     try:
-        with path.open("rb") as file:
+        if log_of(path).is_symlink():
+            raise UsageError(f"{log_of(path)}: is a link; the log of a map lies beside it")
+        with open_regular(path) as file:
             head = file.read(PAGE_BYTES)
     except FileNotFoundError:
         return False
@@ -103,7 +127,7 @@ def is_bare(path: Path) -> bool:
 
 def check_header(path: Path) -> None:
     """Raises DamageError if a byte is wrong by which SQLite would take it for another kind of file."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         head, expected = file.read(_HEADER_BYTES), first_page()
     kinds = set(head[18:20])  # of file, for writing and reading: 1 without a log, 2 with one
     if not is_bare(path) and (any(head[at] != expected[at] for at in _FIXED) or kinds - {1, 2}):

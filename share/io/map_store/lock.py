@@ -28,7 +28,11 @@ def take(path: Path) -> int:
     """A handle; closing it gives the map free. Raises StoreError while another edge has it."""
     import fcntl
 
-    handle = os.open(path.with_name(path.name + ".lock"), os.O_RDWR | os.O_CREAT, 0o666)
+    name = path.with_name(path.name + ".lock")
+    try:
+        handle = os.open(name, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    except OSError as error:
+        raise StoreError(f"{name}: cannot be locked: {error.strerror}; remove it") from None
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:

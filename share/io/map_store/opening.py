@@ -10,11 +10,12 @@ from pathlib import Path
 
 from share.core.keeping import Kept
 from share.errors import StoreError, UsageError
-from share.io.files import writing
+from share.io.files import fresh, writing
 from share.io.map_store import connect, reading, schema
 from share.io.map_store.connect import DamageError, complaints
 from share.io.map_store.salvage import copied, finish, salvage, whole_of
 from share.io.map_store.scan import whole_rows, with_copies
+from share.io.regular_file import open_regular
 
 
 def examine(path: Path) -> Kept:
@@ -99,8 +100,9 @@ def _bring_up_to_date(path: Path, found: int) -> None:
     """In place, after a copy was made."""
     with complaints(path, "opened"), contextlib.closing(connect.for_writing(path, True)) as connection:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    with writing(path):
-        shutil.copyfile(path, path.with_name(f"{path.name}.schema-{found}"))
+    copy = path.with_name(f"{path.name}.schema-{found}")
+    with writing(path), open_regular(path) as old, fresh(copy) as new:
+        shutil.copyfileobj(old, new)
     _migrate(path, found)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from share.core.keeping import KeepPoses, Kept, KeptKeyframe
 from share.core.mending import mended
-from share.errors import WireError
+from share.errors import StoreError, WireError
 from share.io.map_store import rows
 from share.io.map_store.rows import Row
 from share.io.map_store.scan import Found
@@ -63,6 +63,7 @@ def _counted(found: Found, table: str, lost: int, what: str) -> str:
 def _values(found: Found, table: str, value: Callable[[Row], Any]) -> tuple[list[Any], int]:
     """Values of a table's rows, and how many are lost. Takes the rows out, to save memory."""
     out, lost, numbered = [], found.lost[table], found.tables[table]
+    of_another: StoreError | None = None
     numbered.reverse()
     while numbered:
         _, row = numbered.pop()
@@ -70,6 +71,11 @@ def _values(found: Found, table: str, value: Callable[[Row], Any]) -> tuple[list
             out.append(value(row))
         except (ValueError, WireError):  # written by something that was wrong already
             lost += 1
+        except StoreError as error:  # of another version, as all the others, or as nothing that we wrote
+            of_another = error
+            lost += 1
+    if of_another is not None and not out:
+        raise of_another
     return out, lost
 
 

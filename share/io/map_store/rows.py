@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 import zlib
 from typing import Any, TypeVar
@@ -12,7 +13,7 @@ import numpy as np
 from share.core.keeping import KeepKeyframe, KeepLink, KeepPoses, KeepRun, KeptKeyframe
 from share.errors import StoreError
 from share.merge.join import Key, Loop
-from share.types import F64, Keyframe
+from share.types import F64, Keyframe, checked_cov, checked_id, checked_pose
 from share.wire import codec, messages
 
 M = TypeVar("M")
@@ -29,7 +30,7 @@ COLUMNS = {
     "poses": ("keys", "T_map_body"),
 }
 
-_READABLE = (3, codec.VERSION)  # wire versions in which a Hello and a Keyframe are what they are now
+_READABLE = (3, 4, codec.VERSION)  # wire versions in which a Hello and a Keyframe are what they are now
 _pack = msgspec.msgpack.encode
 _frames = msgspec.msgpack.Decoder(list[bytes]).decode
 _placed = msgspec.msgpack.Decoder(list[tuple[str, int, str]]).decode
@@ -88,16 +89,19 @@ def of_poses(poses: KeepPoses) -> Row:
 
 
 def run(row: Row) -> KeepRun:
-    key, _, version, hello = row
-    return KeepRun(key, _decoded(messages.Hello, version, hello))
+    key, following, version, hello = row
+    checked_id("next", _whole(following))
+    return KeepRun(_text(key), _decoded(messages.Hello, version, hello))
 
 
 def keyframe(row: Row) -> KeptKeyframe:
     agent, id, stretch, ordinal, version, message = row
+    for name, number in (("id", id), ("stretch", stretch), ("ordinal", ordinal)):
+        checked_id(name, _whole(number))
     own = _decoded(Keyframe, version, message)
     if own.id != id:
         raise ValueError(f"keyframe {agent}:{id} says that it is {own.id}")
-    return KeptKeyframe(agent, own, stretch_name(agent, stretch), ordinal)
+    return KeptKeyframe(_text(agent), own, stretch_name(agent, stretch), ordinal)
 
 
 def stretch_name(run: str, nth: int) -> str:
@@ -107,18 +111,23 @@ def stretch_name(run: str, nth: int) -> str:
 
 def link(row: Row) -> KeepLink:
     agent, id, reference, T, cov = row
-    return KeepLink(Key(agent, id), reference, _array(T, 4, 4), _array(cov, 6, 6))
+    checked_id("reference", _whole(reference), -1)
+    return KeepLink(_key(agent, id), reference, _pose(T), _cov(cov))
 
 
 def loop(row: Row) -> Loop:
     a, a_id, b, b_id, T, cov, inliers, found = row
-    return Loop(Key(a, a_id), Key(b, b_id), _array(T, 4, 4), _array(cov, 6, 6), inliers, found)
+    if not (_whole(inliers) >= 0 and isinstance(found, float | None) and math.isfinite(found or 0.0)):
+        raise ValueError(f"a loop with {inliers} inliers, found at {found}")
+    return Loop(_key(a, a_id), _key(b, b_id), _pose(T), _cov(cov), inliers, found)
 
 
 def poses(row: Row) -> KeepPoses:
     keys = _placed(row[0])
     T = _array(row[1], len(keys), 4, 4)
-    return KeepPoses(tuple(Key(a, i) for a, i, _ in keys), T, tuple(name for *_, name in keys))
+    for pose in T:
+        checked_pose("pose", pose)
+    return KeepPoses(tuple(_key(a, i) for a, i, _ in keys), T, tuple(name for *_, name in keys))
 
 
 def _message(message: messages.Message) -> bytes:
@@ -132,10 +141,36 @@ def _decoded(kind: type[M], version: int, data: bytes) -> M:
             f"keyframes in it are of wire version {version}, this SHARE reads {codec.VERSION}: "
             "use the SHARE that wrote it"
         )
+    if not isinstance(data, bytes):
+        raise ValueError(f"expected bytes, found {type(data).__name__}")
     message = codec.decode(_frames(data), _READABLE)
     if not isinstance(message, kind):
         raise ValueError(f"is a {type(message).__name__}")
     return message
+
+
+def _key(agent: Any, id: Any) -> Key:
+    return Key(_text(agent), checked_id("id", _whole(id)))
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError(f"expected text, found {type(value).__name__}")
+    return value
+
+
+def _whole(value: Any) -> int:
+    if type(value) is not int:
+        raise ValueError(f"expected a whole number, found {type(value).__name__}")
+    return value
+
+
+def _pose(data: bytes) -> F64:
+    return checked_pose("pose", _array(data, 4, 4))
+
+
+def _cov(data: bytes) -> F64:
+    return checked_cov("covariance", _array(data, 6, 6))
 
 
 def _bytes(array: F64) -> bytes:
@@ -143,4 +178,6 @@ def _bytes(array: F64) -> bytes:
 
 
 def _array(data: bytes, *shape: int) -> F64:
+    if not isinstance(data, bytes):
+        raise ValueError(f"expected bytes, found {type(data).__name__}")
     return np.frombuffer(data, "<f8").reshape(shape)

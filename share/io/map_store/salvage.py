@@ -74,14 +74,21 @@ def finish(path: Path) -> Path:
     """The last steps, each of which may be done already; `path` itself if there is nothing to finish."""
     if not _finished(path).exists():
         return path
+    with writing(path):
+        kept = set_aside(path)
+        _finished(path).replace(path)
+    sync_folder(path.parent)
+    return kept
+
+
+def set_aside(path: Path) -> Path:
+    """A map that nobody has open, and its log, get another name, which is answered. Raises ShareError."""
     kept = _free_name(path)
     with writing(path):
         for old, new in ((connect.log_of(path), connect.log_of(kept)), (path, kept)):
             if old.exists():
                 old.replace(new)
         path.with_name(path.name + "-shm").unlink(missing_ok=True)
-        _finished(path).replace(path)
-    sync_folder(path.parent)
     return kept
 
 
@@ -97,7 +104,8 @@ def _free_name(path: Path) -> Path:
 
 
 def _found(copy: Path) -> Found:
-    with contextlib.closing(sqlite3.connect(copy, isolation_level=None)) as connection:
+    bare = sqlite3.connect(copy, isolation_level=None)
+    with contextlib.closing(connect.for_so_long(bare, copy)) as connection:
         with contextlib.suppress(*BROKEN):  # moves the log into the file, as far as that is whole
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         return whole_rows(connection)

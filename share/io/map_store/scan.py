@@ -8,8 +8,10 @@ from dataclasses import dataclass, field
 
 from share.io.map_store.connect import BROKEN
 from share.io.map_store.rows import COLUMNS, Row, is_whole
+from share.io.map_store.schema import PAGE_BYTES, own_tables
 
-PROBES = 100_000  # numbers looked up one by one between two parts of a damaged table
+PROBES = 100_000  # numbers looked up one by one between two parts of a damaged table, and no more than
+_ROW_BYTES = 32  # rows of so many bytes that the file has room for
 
 
 @dataclass
@@ -29,13 +31,13 @@ class Found:
 
 
 def whole_rows(connection: sqlite3.Connection) -> Found:
-    """Every row of every table that can be read and whose CRC is right."""
-    found = Found()
+    """Every row of every table of our making that can be read and whose CRC is right."""
+    found, own = Found(), _own(connection)
     for table in COLUMNS:
-        everything, all_read = _everything(connection, table)
+        everything, all_read = _everything(connection, table) if table in own else ({}, False)
         good = {n: row for n, row in everything.items() if is_whole(table, n, row)}
         found.tables[table] = [(n, row[:-1]) for n, row in sorted(good.items())]
-        count = _count(connection, table)
+        count = _count(connection, table) if table in own else None
         found.lost[table] = max(count or 0, len(everything)) - len(good)
         if count is None and not all_read:
             found.uncounted.add(table)
@@ -54,6 +56,13 @@ def with_copies(found: Found) -> Found:
     return Found(found.tables | {"run": both, "run_copy": both}, lost, uncounted)
 
 
+def _own(connection: sqlite3.Connection) -> set[str]:
+    try:
+        return own_tables(connection)
+    except BROKEN:
+        return set()
+
+
 def _everything(connection: sqlite3.Connection, table: str) -> tuple[dict[int, Row], bool]:
     """Rows by number, and whether that is all. From the front; where that breaks, from the back; and in
     between number by number."""
@@ -66,9 +75,19 @@ def _everything(connection: sqlite3.Connection, table: str) -> tuple[dict[int, R
     low = next(reversed(rows), 0)
     _read(connection, f"{select} WHERE number > ? ORDER BY number DESC", (low,), rows)
     high = next(reversed(rows), 0)
-    for number in range(low + 1, min(high if high > low else low + PROBES, low + PROBES)):
+    probes = min(PROBES, _room(connection))
+    for number in range(low + 1, min(high if high > low else low + probes, low + probes)):
         _read(connection, f"{select} WHERE number = ?", (number,), rows)
     return rows, False
+
+
+def _room(connection: sqlite3.Connection) -> int:
+    """For how many rows a file has room."""
+    try:
+        (pages,) = connection.execute("PRAGMA page_count").fetchone()
+    except BROKEN:
+        return PROBES
+    return int(pages) * PAGE_BYTES // _ROW_BYTES
 
 
 def _read(connection: sqlite3.Connection, query: str, values: tuple[int, ...], rows: dict[int, Row]) -> bool:

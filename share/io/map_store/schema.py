@@ -47,9 +47,11 @@ def create(connection: sqlite3.Connection) -> None:
 
 def version(connection: sqlite3.Connection) -> int | None:
     """The file's schema; None if the row that says so is not whole. Raises sqlite3.Error."""
+    if "about" not in own_tables(connection):
+        return None
     found = connection.execute("SELECT number, name, value, crc FROM about NOT INDEXED").fetchall()
     whole = (row for number, *row in found if is_whole("about", number, tuple(row)))
-    return next((int(value) for name, value, _ in whole if name == "schema"), None)
+    return next((int(value) for name, value, _ in whole if name == "schema" and str(value).isdecimal()), None)
 
 
 def migrate(connection: sqlite3.Connection, found: int, steps: Mapping[int, tuple[str, ...]]) -> None:
@@ -70,6 +72,12 @@ def migrate(connection: sqlite3.Connection, found: int, steps: Mapping[int, tupl
 def is_ours(connection: sqlite3.Connection) -> bool:
     """Whether tables and indexes are those of this schema, to the letter."""
     return _objects(connection) == _objects(_template())
+
+
+def own_tables(connection: sqlite3.Connection) -> set[str]:
+    """Tables that were made as ours are, to the letter. Nothing else of a file is read: a view or a virtual
+    table may compute for ever, a generated column may be of any size. Raises sqlite3.Error."""
+    return {name for kind, name, _, _ in _objects(connection) & _objects(_template()) if kind == "table"}
 
 
 def is_empty(connection: sqlite3.Connection) -> bool:

@@ -11,7 +11,9 @@ from pathlib import Path
 from share.core.keeping import Change, Kept
 from share.errors import StoreError, UsageError
 from share.io.map_store import changes, lock, reading, schema
+from share.io.map_store.connect import log_of
 from share.io.map_store.opening import examine, look, make
+from share.io.map_store.salvage import set_aside
 from share.io.map_store.scan import whole_rows
 
 
@@ -25,7 +27,9 @@ class MapStore:
         self.path, self.schema, self.reason = path, schema, reason
         self._kept: Kept | None = kept
         self._db: sqlite3.Connection | None = None
+        self._files: dict[Path, tuple[int, int]] = {}  # those of the map, and which they are
         self._lock: int | None = None
+        self._power_cut = False
 
     @property
     def writable(self) -> bool:
@@ -53,6 +57,7 @@ class MapStore:
         try:
             store = MapStore(path, examine(path), schema.SCHEMA, "")
             store._db, store._lock = make(path, power_cut), held
+            store._files, store._power_cut = _which(path), power_cut
             return store
         except BaseException:
             os.close(held)
@@ -69,6 +74,7 @@ class MapStore:
         Raises StoreError if the disk is full or fails: then none was kept, and it may be tried again.
         """
         db = self._writer()
+        self._check_in_place()
         self._kept = None  # of before
         try:
             db.execute("BEGIN IMMEDIATE")
@@ -79,8 +85,9 @@ class MapStore:
             with contextlib.suppress(sqlite3.Error):  # a full disk has rolled back by itself
                 db.execute("ROLLBACK")
             if isinstance(error, sqlite3.Error):
-                raise StoreError(f"{self.path}: the map cannot be written: {error}") from None
+                raise StoreError(f"{self.path}: the map cannot be written: {_words(error)}") from None
             raise
+        self._check_in_place()
 
     def peek(self) -> Kept:
         """What `open` has read, before anything is written or loaded."""
@@ -94,6 +101,19 @@ class MapStore:
         if self._db is None:
             return look(self.path)[0]
         return reading.kept(whole_rows(self._db))
+
+    def set_aside(self) -> Path:
+        """A fresh map in place of this one, which is kept beside; its new name.
+
+        Raises ShareError where that cannot be: then the map is as it was.
+        """
+        self._writer().close()
+        try:
+            return set_aside(self.path)
+        finally:
+            self._kept = None
+            self._db = make(self.path, self._power_cut)
+            self._files = _which(self.path)
 
     def close(self) -> None:
         """Moves the log into the file and gives it free."""
@@ -110,7 +130,34 @@ class MapStore:
     def __exit__(self, *error: object) -> None:
         self.close()
 
+    def _check_in_place(self) -> None:
+        """SQLite would go on writing to a file that has lost its name, and nobody would find it there."""
+        now = _which(self.path)
+        for path, which in self._files.items():
+            if now.get(path) != which:
+                what = "removed" if path not in now else "replaced"
+                raise StoreError(
+                    f"{self.path}: the map cannot be written: {path.name} was {what} while the edge ran; "
+                    "put it back, or start the edge again"
+                )
+
     def _writer(self) -> sqlite3.Connection:
         if self._db is None:
             raise StoreError(f"{self.path}: the map cannot be written: {self.reason or 'it was closed'}")
         return self._db
+
+
+def _which(path: Path) -> dict[Path, tuple[int, int]]:
+    """Device and inode of the map and its log, of those that are there."""
+    out = {}
+    for file in (path, log_of(path)):
+        with contextlib.suppress(FileNotFoundError):
+            found = file.stat()
+            out[file] = found.st_dev, found.st_ino
+    return out
+
+
+def _words(error: sqlite3.Error) -> str:
+    """As a person knows them."""
+    full = getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL
+    return "No space left on device" if full else str(error)

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from share.errors import DataError
 from share.geometry.camera import Camera
-from share.io.images import EncodedImage, check_size, depth_metres, image_format
+from share.io.images import EncodedImage, check_said, depth_metres, image_format
 from share.io.mcap import types as ros
 from share.types import F32
 
 MILLIMETRES = 1000.0  # 16UC1 depth is in mm, 32FC1 in m: ROS REP 118
 _CONFIG_HEADER = 12  # bytes of compressed_depth_image_transport's ConfigHeader before the PNG
+_FAR_M = 1e4  # m; no depth camera reads as far
 _TO_GRAY = {
     "bgr8": cv2.COLOR_BGR2GRAY,
     "8UC3": cv2.COLOR_BGR2GRAY,
@@ -39,8 +40,9 @@ class RawImage:
     is_depth: bool
 
     def load(self) -> NDArray[Any]:
-        image = self._depth() if self.is_depth else self._gray()
-        return check_size(image, self.camera.width, self.camera.height, self.where)
+        said, camera = self.message, self.camera
+        check_said(said.width, said.height, camera.width, camera.height, self.where)
+        return self._depth() if self.is_depth else self._gray()
 
     def _gray(self) -> NDArray[Any]:
         encoding = self.message.encoding
@@ -64,7 +66,8 @@ class RawImage:
         pixels = self._pixels(order + _DEPTH_TYPES[encoding], 1)[..., 0]
         if encoding != "32FC1":
             return depth_metres(pixels.astype(np.uint16), MILLIMETRES, self.where)
-        return np.nan_to_num(pixels.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+        metres = pixels.astype(np.float32)
+        return np.where((metres > 0) & (metres < _FAR_M), metres, np.float32(0))
 
     def _pixels(self, dtype: str, channels: int) -> NDArray[Any]:
         """(H, W, channels) without the padding at the end of rows. DataError if data is missing."""

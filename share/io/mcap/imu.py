@@ -11,6 +11,7 @@ import numpy as np
 from share.core.measurement import IMU
 from share.core.stamps import WRAP_NS
 from share.errors import DataError
+from share.io.losses import Losses
 from share.io.mcap import types as ros
 from share.io.mcap.file import McapFile
 from share.io.mcap.reader import guess_topic
@@ -20,22 +21,26 @@ _LITTLE_ENDIAN = 1  # in byte 1 of the encapsulation header (OMG DDSI-RTPS 10.2)
 _NUMBERS = 4 + 9 + 3 + 9 + 3 + 9  # doubles: orientation, rate, force, each with its covariance
 _RATE, _FORCE = slice(13, 16), slice(25, 28)
 _BATCH = 20_000
+_LOST = "IMU messages"
 
 
-def read_imu(file: McapFile, told: Callable[[int, int], None]) -> tuple[I64, F64]:
+def read_imu(file: McapFile, told: Callable[[int, int], None], losses: Losses) -> tuple[I64, F64]:
     """Stamps (N,) ns, unwrapped, in the order of the log, and values (N, 6): rad/s, m/s^2. told: samples
-    read, of how many. Raises DataError where there are none."""
+    read, of how many. Raises DataError where there are none, or more than 5 % cannot be read."""
     having = [n for n, t in file.topics.items() if t.kind == ros.IMU_MSG and len(file.log_times[n])]
     topic = guess_topic(IMU, having)
     if topic is None:
         raise DataError(f"{file.path}: has no IMU samples; its topics: {', '.join(file.topics) or 'none'}")
     total, stamps, values = len(file.log_times[topic]), [], []
-    messages = (data for _, _, data in file.messages([topic]))
+    messages = (data for _, _, data in file.messages([topic], losses=losses))
     for batch in _batches(messages):
-        one, numbers = _unpacked(batch, f"{file.path}: {topic}")
+        one, numbers = _unpacked(_readable(batch, f"{file.path}: {topic}", losses))
         stamps.append(one)
         values.append(numbers)
         told(sum(map(len, stamps)), total)
+    losses.check(_LOST, total)
+    if not stamps:
+        raise DataError(f"{file.path}: {topic}: has no sample that can be read")
     return unwrapped(np.concatenate(stamps)), np.concatenate(values)
 
 
@@ -50,11 +55,21 @@ def _batches(messages: Iterator[bytes]) -> Iterator[list[bytes]]:
         yield batch
 
 
-def _unpacked(batch: list[bytes], where: str) -> tuple[I64, F64]:
-    """sensor_msgs/Imu in CDR: stamp first, then the frame's name, of any length, then doubles to the end."""
-    for data in batch:
-        if len(data) < 16 or data[1] & 1 != _LITTLE_ENDIAN or len(data) != _size(data):
-            raise DataError(f"{where}: a message is no sensor_msgs/Imu in little-endian CDR; record it anew")
+def _readable(batch: list[bytes], where: str, losses: Losses) -> list[bytes]:
+    """Those that are sensor_msgs/Imu in little-endian CDR: stamp first, then the frame's name, of any length,
+    then doubles to the end."""
+    good = [
+        data
+        for data in batch
+        if len(data) >= 16 and data[1] & 1 == _LITTLE_ENDIAN and len(data) == _size(data)
+    ]
+    for _ in range(len(batch) - len(good)):
+        why = f"{where}: a message is no sensor_msgs/Imu in little-endian CDR; record it anew"
+        losses.add(_LOST, f"{losses.counts.get(_LOST)}", why)
+    return good
+
+
+def _unpacked(batch: list[bytes]) -> tuple[I64, F64]:
     heads = np.frombuffer(b"".join(data[4:12] for data in batch), "<u4").reshape(-1, 2).astype(np.int64)
     tails = np.frombuffer(b"".join(data[-8 * _NUMBERS :] for data in batch), "<f8").reshape(-1, _NUMBERS)
     values = np.concatenate([tails[:, _RATE], tails[:, _FORCE]], axis=1)

@@ -6,6 +6,7 @@ rig is our own record of it, else CameraInfo and /tf_static; --calib goes before
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
@@ -20,6 +21,7 @@ from share.errors import ConfigError, DataError
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.io.calibration import Calibration
+from share.io.losses import Losses
 from share.io.mcap import images as ros_images
 from share.io.mcap import rig as ros_rig
 from share.io.mcap import types as ros
@@ -62,6 +64,7 @@ class McapSource(Source):
         shown = rig if calibration else _seen(rig, topics)
         self.name, self.rig = file.path.stem, _fit(shown, topics, file.path)
         self._file, self._own, self.serial = file, own, own_serial(file)
+        self.losses = Losses()
         cameras = ros_rig.cameras(self.rig)
         used = {s for s in topics if s in cameras or (s == IMU and self.rig.imu)}
         self._topics = {s: topics[s] for s in used}
@@ -84,24 +87,34 @@ class McapSource(Source):
         streams = {topic: stream for stream, topic in self._topics.items()}
         kinds = {topic: self._file.topics[topic].kind for topic in streams}
         cameras = ros_rig.cameras(self.rig)
-        for topic, _, data in self._file.messages(streams, *self._log_range):
+        for topic, log_ns, data in self._file.messages(streams, *self._log_range, losses=self.losses):
             stream = streams[topic]
-            message = self._decode(data, kinds[topic], topic)
-            stamp = ros.stamp_of(message)
-            lo, hi = self._span.limits(stream)
-            if lo < stamp <= hi:
+            try:
+                message = _decoded(self._file, data, kinds[topic], topic)
+                stamp = ros.stamp_of(message)
+                lo, hi = self._span.limits(stream)
+                if not lo < stamp <= hi:
+                    continue
                 payload = (
-                    _imu(message)
+                    _imu(message, f"{self._file.path}: {topic} at {stamp}")
                     if stream == IMU
                     else self._image(message, topic, stamp, cameras[stream], stream)
                 )
-                yield Measurement(stream, stamp, payload)
+            except DataError as error:  # it costs itself
+                self.losses.add(f"messages of {topic}", str(log_ns), str(error))
+                continue
+            yield Measurement(stream, stamp, payload)
+        self._check_losses()
+
+    def _check_losses(self) -> None:
+        for topic in self._topics.values():
+            self.losses.check(f"messages of {topic}", len(self._file.log_times[topic]))
 
     def truth(self) -> Trajectory | None:
         path = truth_path(self._file.path)
         if path is None:
             return None
-        truth = read_tum(path)
+        truth = read_tum(path, self.losses)
         return Trajectory(truth.stamps_ns, truth.T @ self._T_recorded_body)
 
     @cached_property
@@ -133,15 +146,10 @@ class McapSource(Source):
 
     def _header_stamps(self) -> I64:
         """Of cam0; one pass over its messages that decodes nothing but the stamp."""
-        heads = (data[4:12] for _, _, data in self._file.messages([self._topics[CAM0]]))
+        messages = self._file.messages([self._topics[CAM0]], losses=self.losses)
+        heads = (data[4:12] for _, _, data in messages if len(data) >= 12)
         pairs = np.frombuffer(b"".join(heads), "<u4").reshape(-1, 2).astype(np.int64)
         return np.sort(pairs[:, 0] * 10**9 + pairs[:, 1])
-
-    def _decode(self, data: bytes, kind: str, topic: str) -> Any:
-        try:
-            return ros.decode(data, kind)
-        except Exception as error:  # rosbags raises many kinds on bytes that are no such message
-            raise DataError(f"{self._file.path}: {topic}: a message cannot be read ({error})") from None
 
     def _image(self, message: Any, topic: str, stamp: int, camera: Camera, stream: str) -> Any:
         where, is_depth = f"{self._file.path}: {topic} at {stamp}", stream == DEPTH
@@ -231,7 +239,8 @@ def _rig_of_messages(file: McapFile, topics: dict[str, str]) -> Rig | None:
     if missing:
         raise ConfigError(f"{file.path}: {missing[0]} has no CameraInfo; give the calibration with --calib")
     where = str(file.path)
-    tree = ros_rig.FrameTree(ros.decode(d, ros.TF) for _, _, d in file.messages([ros.TF_STATIC]))
+    transforms = (_decoded(file, d, ros.TF, ros.TF_STATIC) for _, _, d in file.messages([ros.TF_STATIC]))
+    tree = ros_rig.FrameTree(transforms, where)
     cams = {s: ros_rig.from_camera_info(info, f"{where}: {topics[s]}") for s, info in infos.items()}
     T = {s: tree.find(info.header.frame_id, infos[CAM0].header.frame_id) for s, info in infos.items()}
     if any(pose is None for pose in T.values()):
@@ -247,7 +256,7 @@ def _camera_info(file: McapFile, topic: str) -> Any | None:
     if name not in file.topics:
         return None
     first = next(file.messages([name]), None)
-    return None if first is None else ros.decode(first[2], ros.CAMERA_INFO)
+    return None if first is None else _decoded(file, first[2], ros.CAMERA_INFO, name)
 
 
 def _seen(rig: Rig, topics: dict[str, str]) -> Rig:
@@ -273,9 +282,20 @@ def _fit(rig: Rig, topics: dict[str, str], path: Path) -> Rig:
     return rig
 
 
-def _imu(message: Any) -> tuple[float, ...]:
+def _decoded(file: McapFile, data: bytes, kind: str, topic: str) -> Any:
+    """Raises DataError."""
+    try:
+        return ros.decode(data, kind)
+    except Exception as error:  # rosbags raises many kinds on bytes that are no such message
+        raise DataError(f"{file.path}: {topic}: a message cannot be read ({error})") from None
+
+
+def _imu(message: Any, where: str) -> tuple[float, ...]:
     w, a = message.angular_velocity, message.linear_acceleration
-    return (w.x, w.y, w.z, a.x, a.y, a.z)
+    values = (w.x, w.y, w.z, a.x, a.y, a.z)
+    if not math.isfinite(sum(values)):
+        raise DataError(f"{where}: the sample is not finite")
+    return values
 
 
 def truth_path(recording: Path) -> Path | None:

@@ -18,7 +18,7 @@ import numpy as np
 from share.core.measurement import DEPTH, IMU, Measurement
 from share.errors import DataError, UsageError
 from share.geometry.camera import Rig
-from share.io.files import check_writable, sync_folder, writing
+from share.io.files import check_writable, fresh, sync_folder, writing
 from share.io.images import EncodedImage, encode_jpeg
 from share.io.mcap import images as ros_images
 from share.io.mcap import rig as ros_rig
@@ -69,8 +69,7 @@ class Recorder:
         self.path, self.part = check_writable(path), part_of(path)
         self._rig, self._jpeg, self._durable = rig, jpeg, durable
         try:
-            mode = "xb" if durable else "wb"
-            self._file = open(self.part, mode)  # noqa: SIM115 -- closed by close() or abort()
+            self._file = self.part.open("xb") if durable else fresh(self.part)
         except FileExistsError:
             raise left_over(self.part) from None
         except OSError as error:

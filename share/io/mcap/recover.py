@@ -13,7 +13,9 @@ from typing import IO, Any, BinaryIO, NamedTuple
 
 from share.errors import DataError, UsageError
 from share.io.files import new_file
+from share.io.mcap.chunks import Within, records_of
 from share.io.mcap.file import check_magic, damage
+from share.io.regular_file import open_regular
 
 
 class Recovered(NamedTuple):
@@ -33,7 +35,7 @@ def recover(path: Path, out: Path, progress: Callable[[int], None] = lambda _: N
     check_magic(path)
     if out.exists() and out.samefile(path):
         raise UsageError(f"--out {out}: is the broken file itself; give another name")
-    with open(path, "rb") as file, new_file(out) as target:
+    with open_regular(path) as file, new_file(out) as target:
         result = _copy(file, target, progress)
         if not result.messages:
             raise DataError(f"{path}: holds no complete message ({result.reason or 'it is empty'})")
@@ -55,9 +57,9 @@ def _copy_records(file: BinaryIO, copier: _Copier, progress: Callable[[int], Non
     """Up to the first record that is broken or cannot be read; of a chunk that is broken inside only that is
     left out. Raises OSError where the copy cannot be written."""
     from mcap.records import Chunk
-    from mcap.stream_reader import StreamReader, breakup_chunk
+    from mcap.stream_reader import StreamReader
 
-    records = StreamReader(file, emit_chunks=True, record_size_limit=2**30).records
+    records = StreamReader(Within(file), emit_chunks=True, record_size_limit=2**30).records
     lost, reason, good = 0, "", 0
     while True:
         try:
@@ -67,7 +69,7 @@ def _copy_records(file: BinaryIO, copier: _Copier, progress: Callable[[int], Non
         if record is None:
             return lost, reason
         try:
-            for part in breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]:
+            for part in records_of(record) if isinstance(record, Chunk) else [record]:
                 copier.copy(part)
         except OSError:  # nothing is read here
             raise

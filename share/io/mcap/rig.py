@@ -50,7 +50,7 @@ def from_json(text: str, where: str) -> Rig:
         if IMU in data:
             data[IMU] = ImuNoise(**data[IMU])
         return Rig(**data)
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
         raise DataError(f"{where}: its calibration record is damaged ({error}); give --calib") from None
 
 
@@ -122,12 +122,16 @@ def _transform(parent: str, child: str, T: F64, stamp_ns: int) -> Any:
 class FrameTree:
     """Static transforms between named frames."""
 
-    def __init__(self, messages: Iterable[Any]) -> None:
+    def __init__(self, messages: Iterable[Any], where: str) -> None:
+        """Raises DataError for a transform that is none."""
         self._edges: dict[str, list[tuple[str, F64]]] = {}
         for transform in (t for message in messages for t in message.transforms):
             parent, child = transform.header.frame_id.lstrip("/"), transform.child_frame_id.lstrip("/")
             p, q = transform.transform.translation, transform.transform.rotation
-            T = se3.from_quat(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
+            quaternion = np.array([q.x, q.y, q.z, q.w])
+            if not abs(np.linalg.norm(quaternion) - 1) < 1e-3 or not np.isfinite([p.x, p.y, p.z]).all():
+                raise DataError(f"{where}: {parent} to {child} is no rigid transform; give --calib")
+            T = se3.from_quat(np.array([p.x, p.y, p.z]), quaternion)
             self._edges.setdefault(parent, []).append((child, T))
             self._edges.setdefault(child, []).append((parent, se3.inverse(T)))
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 from multiprocessing.connection import Connection
 
+from share import children
 from share.core.checkup.camera import Sdk
 from share.errors import ShareError
 from share.io.realsense.devices import attached
@@ -17,7 +19,7 @@ def ask(patience_s: float = _PATIENCE_S) -> Sdk:
     """Never raises: what went wrong is in `trouble`."""
     context = multiprocessing.get_context("fork")  # a frozen program has no Python to start
     here, there = context.Pipe(duplex=False)
-    child = context.Process(target=_tell, args=(there,), daemon=True)
+    child = context.Process(target=_tell, args=(there, os.getpid(), children.is_main()), daemon=True)
     child.start()
     there.close()
     try:
@@ -35,7 +37,8 @@ def ask(patience_s: float = _PATIENCE_S) -> Sdk:
         here.close()
 
 
-def _tell(to: Connection) -> None:
+def _tell(to: Connection, parent: int, from_main: bool) -> None:
+    children.follow(parent, from_main)
     to.send(_query())
 
 

@@ -42,4 +42,5 @@ def open_live(
     """
     rates = wanted.rates_hz()
     queue = KeepNewest(WAITING * len(wanted.cameras))
-    return LiveSource(feed_of(spec, wanted, config, say, queue), rates[CAM0], calibration)
+    feed = feed_of(spec, wanted, config, say, queue)
+    return LiveSource(feed, rates[CAM0], calibration, wanted.imu_range())

@@ -6,11 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from share.core.imu_check import ImuRange
 from share.core.intake import ACCEL, GYRO
 from share.core.measurement import CAM0, CAM1, DEPTH
 from share.errors import UsageError
 from share.io.profile_types import Inertial, Profile
 
+_SCALE = 1.1
 _ENOUGH_HZ = 100  # of an IMU; slower ones are taken only where there is nothing else
 Fits = Callable[[Any], bool]  # whether a profile of the SDK is the one
 
@@ -30,6 +32,11 @@ class Wanted:
         rates = {ACCEL: imu.accel.rate_hz, GYRO: imu.gyro.rate_hz}
         image_hz = self.profile.rate_hz / (2 if self.interleaved else 1)
         return rates | {name: self.profile.rate_hz if name == DEPTH else image_hz for name in self.cameras}
+
+    def imu_range(self) -> ImuRange:
+        """Beyond what the sensor shows where it saturates, by as much as its scale and bias are corrected."""
+        imu = self.profile.device.imu
+        return ImuRange(_SCALE * imu.gyro.range, _SCALE * imu.accel.range)
 
     @property
     def cameras(self) -> tuple[str, ...]:

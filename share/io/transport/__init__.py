@@ -51,6 +51,16 @@ class AgentLink(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Arrival:
+    """A message at the edge. peer: its sender's 8-byte id; key: that sender's CURVE public key in Z85, ""
+    without keys."""
+
+    peer: bytes
+    frames: list[bytes]
+    key: str = ""
+
+
 class EdgeLink(Protocol):
     """The edge's way to its agents, each known by its 8-byte peer id (`share.wire.messages.peer_id`)."""
 
@@ -63,8 +73,12 @@ class EdgeLink(Protocol):
         """Whether the message was taken; False if the peer is not connected or its queue is full."""
         ...
 
-    def receive(self, timeout_ms: int) -> tuple[bytes, list[bytes]] | None:
+    def receive(self, timeout_ms: int) -> Arrival | None:
         """The next message and who sent it; None after `timeout_ms`, or at once if woken."""
+        ...
+
+    def names(self, key: str) -> frozenset[str] | None:
+        """Of the agents that the owner of this key may speak for; None where no keys are used."""
         ...
 
     def refusals(self) -> list[str]:

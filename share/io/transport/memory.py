@@ -8,7 +8,7 @@ from threading import Condition, Lock
 from typing import Generic, TypeVar
 
 from share.errors import TransportError
-from share.io.transport import QUEUE_MESSAGES
+from share.io.transport import QUEUE_MESSAGES, Arrival
 from share.wire.codec import Bytes
 from share.wire.messages import peer_id
 
@@ -92,7 +92,7 @@ class MemoryAgentLink:
 
     def send(self, frames: Sequence[Bytes]) -> bool:
         edge = self._network.edge(self._name)
-        return edge is not None and edge.inbox.put((self.peer, [bytes(frame) for frame in frames]))
+        return edge is not None and edge.inbox.put(Arrival(self.peer, [bytes(frame) for frame in frames]))
 
     def receive(self, timeout_ms: int) -> list[bytes] | None:
         return self.inbox.get(timeout_ms)
@@ -116,15 +116,18 @@ class MemoryEdgeLink:
 
     def __init__(self, network: MemoryNetwork, name: str) -> None:
         self.endpoint = name
-        self.inbox: _Mailbox[tuple[bytes, list[bytes]]] = _Mailbox()
+        self.inbox: _Mailbox[Arrival] = _Mailbox()
         self._network = network
 
     def send(self, peer: bytes, frames: Sequence[Bytes]) -> bool:
         agent = self._network.agent(self.endpoint, peer)
         return agent is not None and agent.inbox.put([bytes(frame) for frame in frames])
 
-    def receive(self, timeout_ms: int) -> tuple[bytes, list[bytes]] | None:
+    def receive(self, timeout_ms: int) -> Arrival | None:
         return self.inbox.get(timeout_ms)
+
+    def names(self, key: str) -> frozenset[str] | None:
+        return None
 
     def refusals(self) -> list[str]:
         return []

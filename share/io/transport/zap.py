@@ -9,6 +9,7 @@ import zmq
 from zmq.utils import z85
 
 from share.io.keys import EdgeKeys
+from share.io.transport.guard import Guard
 
 _ENDPOINT = "inproc://zeromq.zap.01"
 _DOMAIN = b"share"
@@ -21,7 +22,10 @@ class Doorkeeper:
     context is terminated; `join` then. Must be made before the socket is bound.
     """
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], socket: zmq.Socket[bytes], keys: EdgeKeys):
+    def __init__(
+        self, context: zmq.Context[zmq.Socket[bytes]], socket: zmq.Socket[bytes], keys: EdgeKeys, guard: Guard
+    ) -> None:
+        self._guard = guard
         self._refusals: deque[str] = deque(maxlen=128)
         self._allowed = keys.allowed
         self._inside: set[str] = set()  # keys let in so far
@@ -57,6 +61,8 @@ class Doorkeeper:
         version, number, _domain, address, _identity, _mechanism, credentials = request
         key = z85.encode(credentials).decode()
         if self._allowed.admits(key):
+            if not self._guard.admits(key, address.decode()):  # 300: for now, so libzmq goes on trying
+                return [version, number, b"300", b"kept out", b"", b""]
             self._inside.add(key)  # a revocation since then is seen by the next `revoked`
             return [version, number, b"200", b"", key.encode(), b""]
         wrong = self._allowed.trouble()

@@ -8,24 +8,40 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from functools import partial
 
 import zmq
 
 from share.errors import TransportError, UsageError
 from share.io.keys import AgentKeys, EdgeKeys
-from share.io.transport import LINGER_MS, QUEUE_MESSAGES, Address, bind_error, check_keys, parse_address
+from share.io.transport import (
+    LINGER_MS,
+    QUEUE_MESSAGES,
+    Address,
+    Arrival,
+    bind_error,
+    check_keys,
+    parse_address,
+)
+from share.io.transport.account import Bounds, wire_bytes
+from share.io.transport.guard import Guard
 from share.io.transport.handshake import Handshakes, Outcome
+from share.io.transport.keep_out import KeepOut
 from share.io.transport.zap import Doorkeeper
 from share.wire.codec import MAX_ARRAYS, MAX_FRAME_BYTES, Bytes
 from share.wire.messages import PEER_BYTES, peer_id
 
 _MAX_PARTS = 2 + MAX_ARRAYS  # peer, header, arrays; parts beyond are read and thrown away
+_SLICE = 2000  # of these, in one call: 3 ms
+_WAKE, _POKE = b"w", b"p"
+_REFUSALS = 128  # lines at a time
+_IN_VAIN = 2000  # messages of strangers, or of who was cut off, in one call
 _REDIAL_S = 1.0  # after a handshake that failed; libzmq itself gives up after most of them
 _COMMON: dict[int, int] = {
     zmq.LINGER: LINGER_MS,
     zmq.SNDHWM: QUEUE_MESSAGES,
-    zmq.RCVHWM: QUEUE_MESSAGES,
+    zmq.RCVHWM: 0,  # see ZmqEdgeLink: an edge that resets while a full queue stops the input ends an agent
     zmq.MAXMSGSIZE: MAX_FRAME_BYTES,  # a larger frame closes the connection of its sender
     zmq.HANDSHAKE_IVL: 2000,
     zmq.HEARTBEAT_IVL: 500,  # a peer whose network is gone is noticed, and its queue dropped, in 2 s
@@ -46,6 +62,15 @@ _ROUTER: dict[int, int] = {
     # An agent that comes back over another network takes over from its own half-open connection;
     # without this, libzmq would never route to it again. Ids are 64 random bits.
     zmq.ROUTER_HANDOVER: 1,
+    # The heartbeat's timer of a connection that another took over ends the process where its peer then resets
+    # it (libzmq 4.3.5, as with RCVHWM below). The kernel notices in 2 to 3 s that a network is gone: by what
+    # is not acknowledged, or where nothing is under way, by its own probes.
+    zmq.HEARTBEAT_IVL: 0,
+    zmq.TCP_MAXRT: 2000,
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 1,
+    zmq.TCP_KEEPALIVE_INTVL: 1,
+    zmq.TCP_KEEPALIVE_CNT: 2,
 }
 
 
@@ -55,7 +80,6 @@ class _Socket:
     def __init__(self, kind: int, options: dict[int, int], target: Address) -> None:
         self.context = zmq.Context()
         self.socket: zmq.Socket[bytes] = self.context.socket(kind)
-        self._handshakes = Handshakes(self.socket)
         for option, value in (_COMMON | options).items():
             self.socket.setsockopt(option, value)
         self.socket.setsockopt(zmq.IPV6, ":" in target.host)
@@ -65,6 +89,8 @@ class _Socket:
         self._poller = zmq.Poller()
         self._poller.register(self.socket, zmq.POLLIN)
         self._poller.register(self._wake_reader, zmq.POLLIN)
+        self._too_long = False  # what comes next are parts of a message that has too many
+        self.empty_s = 0.0  # when it was last asked for a message and there was none
 
     def send(self, frames: Sequence[Bytes]) -> bool:
         try:
@@ -75,41 +101,50 @@ class _Socket:
             raise TransportError(f"cannot send: {error.strerror}") from None
         return True
 
-    def receive(self, timeout_ms: int) -> list[bytes] | None:
-        parts = self._receive_now()
-        if parts is not None:
-            return parts
-        ready = dict(self._poller.poll(timeout_ms))
-        if self._wake_reader.fileno() in ready:
-            self._wake_reader.recv(4096)
-        return self._receive_now()
-
-    def _receive_now(self) -> list[bytes] | None:
-        try:
-            parts = [self.socket.recv(zmq.NOBLOCK)]
-        except zmq.Again:
-            return None
-        while self.socket.getsockopt(zmq.RCVMORE):
-            part = self.socket.recv(zmq.NOBLOCK)
-            if len(parts) <= _MAX_PARTS:  # one too many is kept, so that the decoder refuses it
-                parts.append(part)
+    def receive(self, timeout_ms: int) -> list[zmq.Frame] | None:
+        parts = self.receive_now()
+        if parts is None:
+            self.wait(timeout_ms)
+            parts = self.receive_now()
         return parts
 
-    def wake(self) -> None:
+    def wait(self, timeout_ms: int) -> bool:
+        """Until there is something to receive, or it is woken. Whether it was only poked, to look again."""
+        ready = dict(self._poller.poll(0 if self._too_long else timeout_ms))
+        return self._wake_reader.fileno() in ready and _WAKE not in self._wake_reader.recv(4096)
+
+    def receive_now(self) -> list[zmq.Frame] | None:
+        """The next message. Of one with too many parts one too many stays, so that it is refused."""
+        asked_s = time.monotonic()
+        if self._too_long and not self._skip():
+            return None
+        parts: list[zmq.Frame] = []
         try:
-            self._wake_writer.send(b"\0")
+            while not parts or (parts[-1].more and len(parts) <= _MAX_PARTS):
+                parts.append(self.socket.recv(zmq.NOBLOCK, copy=False))
+        except zmq.Again:
+            self.empty_s = asked_s
+            return None
+        self._too_long = parts[-1].more
+        return parts
+
+    def _skip(self) -> bool:
+        """Throws away what is left of a message that is too long, or some of it. Whether that was all."""
+        for _ in range(_SLICE):
+            if not self.socket.recv(zmq.NOBLOCK, copy=False).more:
+                self._too_long = False
+                break
+        return not self._too_long
+
+    def wake(self, how: bytes = _WAKE) -> None:
+        try:
+            self._wake_writer.send(how)
         except OSError:  # full: it is awake already; closed: nobody sleeps
             return
-
-    def handshakes(self) -> Iterator[Outcome]:
-        """Those that ended since the last look."""
-        while (outcome := self._handshakes.next()) is not None:
-            yield outcome
 
     def close(self, linger_ms: int = LINGER_MS) -> None:
         if self.socket.closed:
             return
-        self._handshakes.close()
         self.socket.close(linger_ms)
         self.context.term()
         self._wake_reader.close()
@@ -127,6 +162,7 @@ class ZmqAgentLink:
         self._redial_s: float | None = None  # when
         self._joined = False  # since last asked
         self._link = _Socket(zmq.DEALER, _DEALER | (_SEALED if keys else {}), self._target)
+        self._handshakes = Handshakes(self._link.socket)
         self._link.socket.setsockopt(zmq.ROUTING_ID, peer_id(run_id))
         if keys is not None:
             self._link.socket.setsockopt(zmq.CURVE_PUBLICKEY, keys.own.public.encode())
@@ -135,7 +171,7 @@ class ZmqAgentLink:
         try:
             self._link.socket.connect(str(self._target))
         except zmq.ZMQError:
-            self._link.close()
+            self.close()
             host = self._target.host
             raise UsageError(f"{self._target}: '{host}' cannot be the name of a machine") from None
 
@@ -144,7 +180,8 @@ class ZmqAgentLink:
 
     def receive(self, timeout_ms: int) -> list[bytes] | None:
         self._keep_connected()
-        return self._link.receive(timeout_ms)
+        parts = self._link.receive(timeout_ms)
+        return [part.bytes for part in parts] if parts else None
 
     def trouble(self) -> str | None:
         return self._trouble
@@ -157,10 +194,12 @@ class ZmqAgentLink:
         self._link.wake()
 
     def close(self) -> None:
+        if not self._link.socket.closed:
+            self._handshakes.close()
         self._link.close()
 
     def _keep_connected(self) -> None:
-        for outcome in self._link.handshakes():
+        while (outcome := self._handshakes.next()) is not None:
             joined = outcome is Outcome.JOINED
             self._joined = self._joined or joined
             self._trouble = None if joined else self._reason(outcome)
@@ -193,8 +232,15 @@ class ZmqEdgeLink:
     ) -> None:
         self._target = check_keys(parse_address(address, bind=True), keys)
         self._keys = keys
-        self._options = _ROUTER | {zmq.MAXMSGSIZE: max_frame_bytes + (_SEAL_BYTES if keys else 0)}
-        self.strangers = 0  # messages dropped because their sender is no agent
+        self._bounds = Bounds.of(max_frame_bytes, keys is not None)
+        self._options = _ROUTER | {
+            zmq.MAXMSGSIZE: max_frame_bytes + (_SEAL_BYTES if keys else 0),
+            # libzmq 4.3.5 aborts where a peer resets its connection while a full queue has stopped its input
+            # (stream_engine_base.cpp: !_io_error), so it never is full: the guard bounds what waits.
+            zmq.RCVHWM: 0,
+        }
+        self._kept_out = KeepOut()
+        self.strangers = 0  # messages dropped: their sender is no agent, or was cut off
         self._open()
 
     @property
@@ -204,21 +250,57 @@ class ZmqEdgeLink:
     def send(self, peer: bytes, frames: Sequence[Bytes]) -> bool:
         return self._link.send([peer, *frames])
 
-    def receive(self, timeout_ms: int) -> tuple[bytes, list[bytes]] | None:
+    def receive(self, timeout_ms: int) -> Arrival | None:
         if self._door is not None and self._door.revoked():
             self._reopen()
-        parts = self._link.receive(timeout_ms)
-        if parts and len(parts[0]) != PEER_BYTES:  # libzmq still takes most bytes for ZMTP 1.0
+        end_s = time.monotonic() + timeout_ms * 1e-3
+        arrival, poked = self._receive_now(), True
+        while arrival is None and poked:
+            poked = self._link.wait(max(0, round((end_s - time.monotonic()) * 1e3)))
+            arrival = self._receive_now()
+        return arrival
+
+    def _receive_now(self) -> Arrival | None:
+        for _ in range(_IN_VAIN):
+            parts = self._link.receive_now()
+            if parts is None:
+                self._guard.empty(self._link.empty_s)
+                return None
+            key = self._account_for(parts)
+            if key is not None and len(parts[0]) == PEER_BYTES:
+                return Arrival(parts[0].bytes, [part.bytes for part in parts[1:]], key)
             self.strangers += 1
+        return None
+
+    def _account_for(self, parts: list[zmq.Frame]) -> str | None:
+        """Tells the guard of a message; its sender's key, None where it is to be thrown away."""
+        sealed = self._keys is not None
+        try:
+            descriptor, key = int(parts[0].get(zmq.SRCFD)), self._key(parts[0])
+        except zmq.ZMQError:  # ZMTP 1.0 has no such thing
+            return ""
+        if self._guard.discards(descriptor):
             return None
-        return (parts[0], parts[1:]) if parts else None
+        self._guard.took(descriptor, sum(wire_bytes(len(part), sealed) for part in parts[1:]), key)
+        if len(parts[0]) != PEER_BYTES:  # libzmq still takes most bytes for ZMTP 1.0
+            self._guard.charge(descriptor, "its id is not 8 bytes: no agent")
+        elif len(parts) > _MAX_PARTS:
+            self._guard.charge(descriptor, "a message of too many parts")
+        return key
+
+    def _key(self, part: zmq.Frame) -> str:
+        """The sender's, that the doorkeeper gave as its ZAP user id."""
+        return "" if self._keys is None else str(part.get("User-Id"))
+
+    def names(self, key: str) -> frozenset[str] | None:
+        return None if self._keys is None else self._keys.allowed.agents(key)
 
     def refusals(self) -> list[str]:
-        failed = [o for o in self._link.handshakes() if o in (Outcome.NO_KEYS, Outcome.BROKEN_OFF)]
+        cut_off, failed = self._guard.lines(), min(self._guard.failed(), _REFUSALS)
         if self._door is None:
-            return ["an agent with keys; this edge uses none: start it with --keys" for _ in failed]
-        lines = ["one without keys, or with the key of another edge: see its --server-key" for _ in failed]
-        return lines + self._door.refusals()
+            return cut_off + ["an agent with keys; this edge uses none: start it with --keys"] * failed
+        lines = ["one without keys, or with the key of another edge: see its --server-key"] * failed
+        return cut_off + lines + self._door.refusals()
 
     def wake(self) -> None:
         self._link.wake()
@@ -229,7 +311,10 @@ class ZmqEdgeLink:
     def _open(self) -> None:
         self._link = _Socket(zmq.ROUTER, self._options, self._target)
         socket = self._link.socket
-        self._door = None if self._keys is None else Doorkeeper(self._link.context, socket, self._keys)
+        self._guard = Guard(socket, self._bounds, self._kept_out, partial(self._link.wake, _POKE))
+        self._door = None
+        if self._keys is not None:
+            self._door = Doorkeeper(self._link.context, socket, self._keys, self._guard)
         try:
             socket.bind(str(self._target))
         except zmq.ZMQError as error:
@@ -244,6 +329,7 @@ class ZmqEdgeLink:
         self.wake()  # in case someone has just woken the old socket
 
     def _close(self, linger_ms: int) -> None:
+        self._guard.close()
         self._link.close(linger_ms)
         if self._door is not None:
             self._door.join()

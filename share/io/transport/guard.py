@@ -1,0 +1,353 @@
+"""The edge's guard: no connection makes libzmq gather more than an honest agent could have waiting.
+
+It learns of connections from the socket's monitor, of what libzmq has read of each from the kernel, and of
+what was handed over from whoever receives (`took`, `empty`). It cuts off who has more waiting than may be,
+whose message has too many parts, who is no agent, and who says nothing.
+
+No whole message of a connection waits when `receive` has found nothing at all, and neither when as many
+messages of others were handed over as there can be connections: libzmq takes one of each in turn. What still
+waits then of what had been read before is one message; if it is larger than any may be, it does not end.
+"""
+
+from __future__ import annotations
+
+import random
+import struct
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from ipaddress import ip_address
+from threading import Lock, Thread
+
+import zmq
+
+from share.io.transport import tcp
+from share.io.transport.account import Account, Bounds
+from share.io.transport.keep_out import KeepOut
+
+CONNECTIONS = 128  # at a time
+STRANGERS = 32  # of these, that have not said anything yet
+MUTE_S = 60.0  # without a message; agents ping every half second
+_STRANGE_S = 10.0  # to the first message
+_TICK_MS, _ALERT_MS = 20, 5
+_ROUND = 2 * CONNECTIONS  # messages; those of connections that are closed by now wait beside the others
+GROWTH_BYTES = 16_000_000  # of memory, beyond the bytes that wait: small parts take much more than they have
+_PAUSE_S = 2.0  # without newcomers from where somebody offended of whom no more is known than that
+_SETTLES_S = 0.05  # until all that libzmq has read of a connection that was cut off is there to be received
+_EVENTS_AT_ONCE = 256
+_HOMES = 4096
+_EVENTS = (
+    zmq.EVENT_ACCEPTED
+    | zmq.EVENT_DISCONNECTED
+    | zmq.EVENT_MONITOR_STOPPED
+    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+    | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+)
+
+
+@dataclass(eq=False)
+class _Connection:
+    """inode: by which its descriptor is known to be still the same. sure: no message of an earlier connection
+    with this descriptor can be waiting."""
+
+    descriptor: int
+    inode: int
+    address: str
+    account: Account
+    sure: bool
+    key: str = ""
+    is_cut: bool = False
+
+    @property
+    def strange(self) -> bool:
+        return self.account.messages == 0
+
+
+class Guard:
+    """Of `socket`, before it is bound. A thread of its own, which ends when `close` is called.
+
+    poke: makes whoever receives look for a message, from any thread.
+    """
+
+    def __init__(
+        self, socket: zmq.Socket[bytes], bounds: Bounds, kept_out: KeepOut, poke: Callable[[], None]
+    ) -> None:
+        self._monitored, self._bounds, self._kept_out, self._poke = socket, bounds, kept_out, poke
+        self._events: zmq.Socket[bytes] = socket.get_monitor_socket(_EVENTS)
+        self._lock = Lock()  # of what several threads use, the next two
+        self._taken: dict[int, tuple[int, int, str]] = {}  # bytes, messages and key by descriptor
+        self._failed = 0
+        self._charges: deque[tuple[_Connection | int, str]] = deque(maxlen=CONNECTIONS)
+        self._admitted: deque[tuple[str, str]] = deque(maxlen=CONNECTIONS)  # key and address
+        self._lines: deque[str] = deque(maxlen=128)
+        self._empty_s = 0.0
+        # Descriptors of those that were cut off: what still waits of them is thrown away, and nobody new is
+        # let in (who could have such a descriptor next) until nothing waits any more.
+        self._cut_off: frozenset[int] = frozenset()
+        self._cut_off_s = 0.0  # when the last was
+        # The thread's own:
+        self._open: dict[int, _Connection] = {}  # by descriptor
+        self._ended: dict[int, float] = {}  # when a descriptor was last given back
+        self._paused: dict[str, float] = {}  # addresses of which nobody new is let in, until when
+        self._to_fail = 0  # handshakes that were cut off
+        self._orphaned = 0  # bytes that waited of connections that ended, since nothing waited
+        self._homes: set[str] = set()  # addresses from which a key has sent a message
+        self._resident = tcp.resident_bytes()  # memory of this process when last little waited
+        self._marked_s = 0.0
+        self._since_mark = 0  # messages handed over
+        self._thread = Thread(target=self._watch, name="guard", daemon=True)
+        self._thread.start()
+
+    # ------------------------------------------------------------------ for other threads
+
+    def took(self, descriptor: int, size: int, key: str) -> None:
+        """A message of so many bytes on the wire was received from that connection."""
+        with self._lock:
+            bytes_, messages, _ = self._taken.get(descriptor, (0, 0, ""))
+            self._taken[descriptor] = bytes_ + size, messages + 1, key
+
+    def discards(self, descriptor: int) -> bool:
+        """Whether what comes from that connection is to be thrown away."""
+        return descriptor in self._cut_off
+
+    def empty(self, asked_s: float) -> None:
+        """There was no message when asked at `asked_s` (time.monotonic)."""
+        self._empty_s = asked_s
+
+    def charge(self, descriptor: int, reason: str) -> None:
+        """What that connection sent no agent sends."""
+        connection = self._open.get(descriptor)
+        if connection is not None and connection.sure:  # at once; who it is will be looked at later
+            tcp.cut(descriptor, connection.inode)
+            self._charges.append((connection, reason))
+        else:
+            self._charges.append((descriptor, reason))
+
+    def admits(self, key: str, address: str) -> bool:
+        """Whether that key, which is authorized, may come in now."""
+        if self._kept_out.holds(key, time.monotonic()):
+            return False
+        self._admitted.append((key, address))
+        return True
+
+    def lines(self) -> list[str]:
+        """Who was cut off since the last call."""
+        return [self._lines.popleft() for _ in range(len(self._lines))]
+
+    def failed(self) -> int:
+        """Handshakes that were broken off or made no sense, since the last call."""
+        with self._lock:
+            failed, self._failed = self._failed, 0
+        return failed
+
+    def close(self) -> None:
+        """Before the socket itself is closed. May be repeated."""
+        if not self._monitored.closed:
+            self._monitored.disable_monitor()
+        self._thread.join()
+
+    # ------------------------------------------------------------------ the thread
+
+    def _watch(self) -> None:
+        wait_ms, next_s = -1, 0.0
+        while True:
+            if self._events.poll(wait_ms) and not self._hear():
+                break
+            if time.monotonic() >= next_s:
+                wait_ms = self._check(time.monotonic())
+                next_s = time.monotonic() + max(wait_ms, 0) * 1e-3
+        self._events.close(linger=0)
+
+    def _hear(self) -> bool:
+        """Events that have come. False once there will be no more."""
+        for _ in range(_EVENTS_AT_ONCE):
+            try:
+                what, _ = self._events.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                break
+            event, value = struct.unpack("=Hi", what)
+            if event == zmq.EVENT_MONITOR_STOPPED:
+                return False
+            if event == zmq.EVENT_ACCEPTED:
+                self._accept(value)
+            elif event == zmq.EVENT_DISCONNECTED:
+                self._forget(value)
+            elif self._to_fail:
+                self._to_fail -= 1
+            else:
+                with self._lock:
+                    self._failed += 1
+        return True
+
+    def _accept(self, descriptor: int) -> None:
+        self._forget(descriptor)  # libzmq does not tell of connections that another took over
+        number, ends = tcp.inode(descriptor), tcp.addresses(descriptor)
+        if number is None or ends is None:
+            return
+        sure = self._ended.get(descriptor, -1.0) < self._empty_s
+        connection = _Connection(descriptor, number, ends[0], Account(time.monotonic()), sure)
+        self._open[descriptor] = connection
+        if self._closed_to(connection.address, time.monotonic()):
+            self._cut(connection)
+            self._cut_off |= {descriptor}
+        self._make_room()
+
+    def _closed_to(self, address: str, now_s: float) -> bool:
+        full = self._orphaned > self._bounds.total
+        return (
+            full
+            or bool(self._cut_off)
+            or now_s < self._paused.get(address, now_s)
+            or self._kept_out.holds(address, now_s)
+        )
+
+    def _make_room(self) -> None:
+        """Where there are too many, one that has said nothing goes, by chance among those of the address that
+        has the most: the first or the last could be foreseen. Where all have spoken, that is the newest."""
+        present = self._present()
+        strange = [connection for connection in present if connection.strange]
+        if strange and (len(strange) > STRANGERS or len(present) > CONNECTIONS):
+            most = Counter(connection.address for connection in strange).most_common(1)[0][0]
+            self._cut(random.choice([connection for connection in strange if connection.address == most]))
+            self._lines.append(f"{most}: more connections than may be open at a time")
+
+    def _present(self) -> list[_Connection]:
+        return [connection for connection in self._open.values() if not connection.is_cut]
+
+    def _forget(self, descriptor: int) -> None:
+        connection = self._open.pop(descriptor, None)
+        if connection is not None:
+            self._ended[descriptor] = time.monotonic()
+            self._orphaned += max(0, connection.account.waiting)
+
+    def _check(self, now_s: float) -> int:
+        """Milliseconds until the next one is due; -1: when somebody connects."""
+        empty_s = self._empty_s  # first: what was received before is then among what was taken
+        while self._admitted:
+            self._recognise(*self._admitted.popleft())
+        self._enter(now_s)
+        self._sample()
+        while self._charges:
+            self._convict(*self._charges.popleft())
+        if empty_s > self._marked_s or self._since_mark >= _ROUND:
+            self._judge(empty_s, now_s)
+        self._bound(now_s)
+        if not self._open:
+            return -1
+        much = sum(max(0, connection.account.waiting) for connection in self._present())
+        if empty_s > self._cut_off_s + _SETTLES_S:
+            self._cut_off = frozenset()
+        if much <= self._bounds.message and not self._cut_off:
+            self._resident = tcp.resident_bytes()
+            return _TICK_MS
+        if much > self._bounds.message and tcp.resident_bytes() - self._resident - much > GROWTH_BYTES:
+            self._offend(self._worst(now_s), "many small parts", now_s)
+        self._poke()
+        return _ALERT_MS
+
+    def _enter(self, now_s: float) -> None:
+        """What was handed over since the last time."""
+        with self._lock:
+            taken, self._taken = self._taken, {}
+        for descriptor, (size, messages, key) in taken.items():
+            self._since_mark += messages
+            connection = self._open.get(descriptor)
+            if connection is not None:
+                if connection.strange:
+                    self._introduce(connection, key)
+                connection.account.took(size, messages, now_s)
+
+    def _introduce(self, connection: _Connection, key: str) -> None:
+        """Its first message: now it is known whose it is."""
+        connection.key = key
+        if key and len(self._homes) < _HOMES:
+            self._homes.add(connection.address)
+        if key and sum(other.key == key for other in self._present()) > CONNECTIONS // 2:
+            self._cut(connection)
+            self._lines.append(f"the key '{key}': more connections than may be open at a time")
+
+    def _recognise(self, key: str, address: str) -> None:
+        """A key was let in: at which connection is known if only one is waiting there."""
+        strange = [c for c in self._present() if c.address == address and c.strange]
+        if len(strange) == 1:
+            strange[0].key = key
+
+    def _sample(self) -> None:
+        for connection in list(self._open.values()):
+            same = tcp.inode(connection.descriptor) == connection.inode
+            read = tcp.bytes_read(connection.descriptor) if same else None
+            if read is None:
+                self._forget(connection.descriptor)
+            else:
+                connection.account.sample(*read)
+
+    def _judge(self, empty_s: float, now_s: float) -> None:
+        """No whole message waits of who was quiet since the mark; of nobody if it was empty since."""
+        empty = empty_s > self._marked_s
+        for connection in self._open.values():
+            account = connection.account
+            if empty:
+                connection.sure |= self._ended.get(connection.descriptor, -1.0) < empty_s
+            if empty or account.quiet():
+                if account.marked > self._bounds.message:
+                    self._offend(connection, "a message that does not end", now_s)
+                elif now_s - account.since_s > (_STRANGE_S if connection.strange else MUTE_S):
+                    self._cut(connection)
+                account.settle()
+            account.mark()
+        self._orphaned = 0 if empty else self._orphaned
+        self._marked_s, self._since_mark = time.monotonic(), 0
+
+    def _bound(self, now_s: float) -> None:
+        """Whatever it is that waits: who has too much of it goes, then who has the most for the longest."""
+        for connection in self._present():
+            if connection.account.waiting > self._bounds.peer:
+                self._shed(connection, "more than may wait")
+        while sum(connection.account.waiting for connection in self._present()) > self._bounds.total:
+            self._shed(self._worst(now_s), "more than may wait of all together")
+
+    def _worst(self, now_s: float) -> _Connection:
+        """Who has the most waiting, for the longest."""
+        return max(self._present(), key=lambda c: c.account.waiting * (now_s - c.account.since_s + 0.1))
+
+    def _convict(self, whom: _Connection | int, reason: str) -> None:
+        connection = self._open.get(whom) if isinstance(whom, int) else whom
+        if connection is not None and connection.sure:
+            self._offend(connection, reason, time.monotonic())
+
+    def _shed(self, connection: _Connection, reason: str) -> None:
+        """Too much waits. An honest agent comes to that where the edge is very busy: it may come back."""
+        self._end(connection)
+        self._lines.append(f"{connection.key or connection.address}: {reason}; cut off")
+
+    def _end(self, connection: _Connection) -> None:
+        self._cut(connection)
+        self._cut_off |= {connection.descriptor}
+        self._cut_off_s = time.monotonic()
+
+    def _offend(self, connection: _Connection, reason: str, now_s: float) -> None:
+        """It sends what no agent does: it is kept out."""
+        if connection.is_cut:
+            return
+        self._end(connection)
+        who = self._culprit(connection)
+        name = f"the key '{connection.key}'" if connection.key else connection.address
+        self._lines.append(f"{name}: {reason}; cut off{' and kept out' if who else ''}")
+        if who is not None:
+            self._kept_out.offend(who, now_s)
+        elif connection.address in self._paused or len(self._paused) < _HOMES:
+            self._paused[connection.address] = now_s + _PAUSE_S
+
+    def _culprit(self, connection: _Connection) -> str | None:
+        """Whom to keep out: the key, if it is known; the address, unless agents live there as well."""
+        if connection.key:
+            return connection.key
+        local = ip_address(connection.address.partition("%")[0]).is_loopback
+        return None if local or connection.address in self._homes else connection.address
+
+    def _cut(self, connection: _Connection) -> None:
+        connection.is_cut = True
+        there = tcp.cut(connection.descriptor, connection.inode)
+        if there and connection.strange and self._to_fail < CONNECTIONS:
+            self._to_fail += 1

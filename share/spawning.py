@@ -1,0 +1,56 @@
+"""Processes of multiprocessing that end with their parent, and leave a terminal's signals to it."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Mapping
+from multiprocessing.context import SpawnContext, SpawnProcess
+from typing import Any
+
+from share import children
+
+_GROUP = {signal.SIGINT, signal.SIGHUP}  # a terminal sends them to all: the parent handles them
+_WAITING = {*_GROUP, signal.SIGTERM}  # until the child can handle them
+
+
+def _begin(parent: int, kernel: bool) -> None:
+    """Called while a spawned process is told what it is to do, before that imports anything."""
+    children.follow(parent, kernel)
+    for number in _GROUP:
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _WAITING)
+
+
+class _First:
+    """Pickled before all else of a process: to read it is to call `_begin`."""
+
+    def __reduce__(self) -> Any:
+        return _begin, (os.getpid(), children.is_main())
+
+
+def _made(first: None, kind: type[_Process], state: Mapping[str, Any]) -> _Process:
+    process = kind.__new__(kind)
+    process.__dict__.update(state)
+    return process
+
+
+class _Process(SpawnProcess):
+    """It ignores SIGINT and SIGHUP from its first instruction: a terminal sends them to the whole group."""
+
+    def start(self) -> None:
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _WAITING)  # inherited
+        try:
+            super().start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+    def __reduce__(self) -> Any:
+        return _made, (_First(), type(self), self.__dict__)
+
+
+class _Context(SpawnContext):
+    Process = _Process
+
+
+SPAWN = _Context()

@@ -1,0 +1,114 @@
+"""Ctrl-C, SIGTERM and SIGHUP at any moment of a command: one line at most, and the shell's exit code."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from recordings import make_euroc
+
+ENDED = {
+    signal.SIGINT: {130, -signal.SIGINT},  # shells call both 130
+    signal.SIGTERM: {143, -signal.SIGTERM},
+    signal.SIGHUP: {129, -signal.SIGHUP},
+}
+STEPS_S = (0.005, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.2, 1.5, 2.0)
+# From SHARE's first line on: what comes while Python itself starts is Python's to handle.
+PROGRAM = "import os; from share.__main__ import run; os.write(1, b'.'); run()"
+
+
+def commands(folder: Path) -> dict[str, list[str]]:
+    walk, nobody = str(folder / "walk"), "tcp://127.0.0.1:9"
+    return {
+        "edge": ["edge", "--bind", "tcp://127.0.0.1:0", "--map", str(folder / "m.sqlite")],
+        "agent": ["agent", walk, "--name", "a", "--kind", "ar", "--edge", nobody, "--out", str(folder / "a")],
+        "track": ["track", walk, "--out", str(folder / "t.tum")],
+        "demo": ["demo", "--scene", "plain", "--seconds", "3", "--seed", "18", "--out", str(folder / "demo")],
+        "capture": ["capture", "realsense", "--out", str(folder / "c.mcap")],
+        "evaluate": ["evaluate", "run", walk, "--out", str(folder / "evaluated")],
+    }
+
+
+def ended(arguments: list[str], after_s: float, number: int) -> tuple[int, str]:
+    """Exit code and stderr of a command that gets a signal so long after its beginning."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert process.stdout is not None
+    assert process.stdout.read(1) == b"."
+    time.sleep(after_s)
+    process.send_signal(number)
+    try:
+        _, said = process.communicate(timeout=30)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        raise AssertionError(f"goes on, {after_s} s: {process.communicate()[1].decode()}") from None
+    return process.returncode, said.decode()
+
+
+def check(folder: Path, command: str, number: int, steps: Sequence[float]) -> None:
+    make_euroc(folder / "walk", frames=40)
+    for after_s in steps:
+        code, said = ended(commands(folder)[command], after_s, number)
+        assert code in {0, 1, 2, *ENDED[number]}, (
+            after_s,
+            code,
+            said,
+        )  # 0 to 2: it was at its end, or told to be
+        for word in ("Traceback", "ignored", "Error:"):
+            assert word not in said, (after_s, said)
+
+
+@pytest.mark.parametrize("command", ["edge", "track"])
+def test_ctrl_c(tmp_path, command):
+    check(tmp_path, command, signal.SIGINT, (0.005, 0.1, 0.4))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", list(ENDED))
+@pytest.mark.parametrize("command", ["edge", "agent", "track", "demo", "capture", "evaluate"])
+def test_at_every_moment(tmp_path, monkeypatch, plain_cache, command, number):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(plain_cache))  # the demo's session
+    check(tmp_path, command, number, STEPS_S)
+
+
+def test_one_line_before_the_command_has_begun(tmp_path):
+    assert ended(["edge"], 0.005, signal.SIGINT) == (130, "share: interrupted\n")
+
+
+def test_where_it_is_ignored_it_stays_so(tmp_path):
+    """As of `share … &` in a script."""
+    program = f"import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); {PROGRAM}"
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, "--version"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout.read(1) == b"."
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, err) == (0, b"")
+    assert out.startswith(b"share")
+
+
+def test_an_import_is_not_interrupted(tmp_path):
+    """poselib makes a RuntimeError of it: then Ctrl-C ended `share track` with a traceback."""
+    (tmp_path / "swallows.py").write_text(
+        "import os, signal, time\n"
+        "try:\n    os.kill(os.getpid(), signal.SIGINT)\n    time.sleep(0.2)\n"
+        "except BaseException as error:\n    raise RuntimeError('cannot be imported') from error\n"
+    )
+    program = (
+        "import sys, time\nfrom share.cli.unwinding import unwinding\n"
+        f"sys.path.insert(0, {str(tmp_path)!r})\n"
+        "try:\n    with unwinding():\n        import swallows\n        time.sleep(10)\n"
+        "except KeyboardInterrupt:\n    print('interrupted')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted\n", "")

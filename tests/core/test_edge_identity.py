@@ -1,0 +1,95 @@
+"""Who may speak for a run: its number is its secret, and with keys only the owner of a name's key."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+from hellos import hello_of
+
+from share.config import Config
+from share.core import edge_events as ed
+from share.core.edge import Edge
+from share.types import Keyframe, View
+from share.wire import messages as m
+from share.wire.codec import decode, encode
+
+SECRET = 0x0123_4567_89AB_CDEF
+EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
+ANN = frozenset({"ann"})
+EVE = frozenset({"eve", "mallory"})
+
+
+def keyframe(id: int) -> Keyframe:
+    cov = 1e-6 * np.eye(6)
+    return Keyframe(id, id - 1, 200 * id, np.eye(4), cov, np.eye(4), np.zeros(3), 0.0, EMPTY)
+
+
+def tell(
+    edge: Edge, message: m.Message, names: frozenset[str] | None, peer: int = SECRET, now_ns: int = 0
+) -> list[ed.Effect]:
+    frames = [bytes(frame) for frame in encode(message)]
+    return edge.handle(ed.Received(m.peer_id(peer), frames, names), now_ns)
+
+
+def sent(effects: list[ed.Effect]) -> list[m.Message]:
+    return [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.Send)]
+
+
+def of(effects: list[ed.Effect], kind: type) -> list:
+    return [effect for effect in effects if isinstance(effect, kind)]
+
+
+def test_a_key_speaks_for_its_names_only() -> None:
+    edge = Edge(Config(), 7)
+    (refused,) = sent(tell(edge, hello_of("ann", SECRET), EVE))
+    assert isinstance(refused, m.Refused)
+    assert "speaks for 'eve', 'mallory', not for 'ann'" in refused.reason
+    assert "share keys authorize" in refused.reason
+    (welcome,) = sent(tell(edge, hello_of("eve", SECRET), EVE))
+    assert isinstance(welcome, m.Welcome)
+
+
+def test_a_run_is_not_taken_over_by_another_key() -> None:
+    """The attacker even knows the run's number and has taken over its routing id."""
+    edge = Edge(Config(), 7)
+    tell(edge, hello_of("ann", SECRET), ANN)
+    tell(edge, keyframe(0), ANN)
+    for message in (keyframe(1), m.Bye(), hello_of("ann", SECRET), m.Evaluation(0, 1.0, 1.0), m.Ping(1, 0)):
+        effects = tell(edge, message, EVE)
+        assert not of(effects, ed.Add), message
+        assert not sent(effects), message
+    assert not edge.report({})["agents"]["ann"]["gone"]
+    assert of(tell(edge, keyframe(1), ANN), ed.Add)
+
+
+def test_without_keys_who_holds_the_number_goes_on() -> None:
+    edge = Edge(Config(), 7)
+    tell(edge, hello_of("ann", SECRET), None)
+    assert of(tell(edge, keyframe(0), None), ed.Add)
+    (welcome,) = sent(tell(edge, hello_of("ann", SECRET), None, now_ns=10**9))  # connected again
+    assert welcome == m.Welcome(7, 1)
+    (refused,) = sent(tell(edge, hello_of("ann", 5), None, peer=5, now_ns=10**9))
+    assert isinstance(refused, m.Refused)
+
+
+def test_nothing_that_is_shown_tells_the_number() -> None:
+    edge = Edge(Config(), 7, keeps=True)
+    effects = tell(edge, hello_of("ann", SECRET), None) + tell(edge, keyframe(0), None)
+    shown = [edge.report({}), edge.series(), *(e.fields for e in of(effects, ed.Record))]
+    keys = [e.key for e in of(effects, ed.Join)]
+    text = json.dumps([shown, keys])
+    for digits in (str(SECRET), f"{SECRET:x}", f"{SECRET:016x}"[-4:], f"{SECRET:016x}"[:4]):
+        assert digits not in text
+
+
+def test_an_id_that_leaps_costs_its_own_message() -> None:
+    edge = Edge(Config(), 7)
+    tell(edge, hello_of("ann", SECRET), None)
+    tell(edge, keyframe(0), None)
+    effects = tell(edge, replace(keyframe(1), id=10**9, reference=-1, follows=-1), None)
+    assert not of(effects, ed.Add)
+    assert sent(effects) == [m.Ack(1)]
+    assert of(tell(edge, keyframe(1), None), ed.Add)
+    assert edge.report({})["agents"]["ann"]["refused_messages"] == 1

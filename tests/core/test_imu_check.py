@@ -1,0 +1,132 @@
+"""What is left out of an IMU's samples is no measurement, and what is a measurement stays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from share.config import SequencerConfig
+from share.core.imu_check import ImuCheck, ImuRange
+from share.core.measurement import Measurement
+from share.core.sequencer import SequencerCounters, sequence
+
+STEP = 5_000_000
+MOTION = Path(__file__).parents[3] / "shared" / "data" / "motion"
+
+
+def walking(count: int = 400, seed: int = 0) -> np.ndarray:
+    """Gyro and accel (count, 6) at 200 Hz of somebody who walks, with noise."""
+    t, rng = np.arange(count)[:, None] * 0.005, np.random.default_rng(seed)
+    gyro, accel = 0.8 * np.sin(9 * t + np.arange(3)), 3 * np.sin(12 * t + np.arange(3)) + [0, 0, 9.81]
+    return np.hstack([gyro, accel]) + rng.normal(size=(count, 6)) * np.repeat([0.01, 0.1], 3)
+
+
+def judged(values: np.ndarray, each: int = 10, step: int = STEP) -> tuple[np.ndarray, ImuCheck]:
+    """Which are believed, in frames of so many samples."""
+    check, stamps = ImuCheck(ImuRange()), np.arange(len(values)) * step
+    parts = [check.believed(stamps[k : k + each], values[k : k + each]) for k in range(0, len(values), each)]
+    return np.concatenate(parts), check
+
+
+@pytest.mark.parametrize("each", [1, 2, 3, 10, 400])
+@pytest.mark.parametrize(
+    ("axis", "value"),
+    [(0, 500.0), (1, -30.0), (2, 20.0), (0, 5.0), (3, 1e6), (4, -150.0), (5, 90.0), (0, np.nan), (3, np.inf)],
+)
+def test_one_sample_that_is_none_is_left_out_and_no_other(axis: int, value: float, each: int) -> None:
+    for at in (100, 103, 109):  # at the beginning, in the middle and at the end of a frame
+        values = walking()
+        values[at, axis] = value
+        good, check = judged(values, each)
+        assert np.flatnonzero(~good).tolist() == [at]
+        assert check.out_of_range + check.spikes == 1
+
+
+def test_a_step_stays() -> None:
+    """Somebody bumps into a wall: from one sample to the next all is different, and stays so."""
+    values = walking()
+    values[204:, :3] += 6.0
+    values[204:, 3:] += 80.0
+    assert judged(values)[0].all()
+
+
+def test_a_step_at_the_end_of_a_frame_costs_at_most_that_sample() -> None:
+    values = walking()
+    values[209:, 0] += 6.0
+    assert set(np.flatnonzero(~judged(values)[0])) <= {209}
+
+
+def test_shocks_and_vibration_stay() -> None:
+    rng, values = np.random.default_rng(1), walking()
+    values[100:300, 3:] += 60 * rng.normal(size=(200, 3))  # a motor
+    values[100:300, :3] += 2 * rng.normal(size=(200, 3))
+    for at in (320, 350, 380):  # knocks that ring
+        ring = np.exp(-np.arange(12) / 3) * np.cos(np.arange(12) * 2)
+        values[at : at + 12, 3:] += 100 * ring[:, None]
+        values[at : at + 12, :3] += 4 * ring[:, None]
+    assert judged(values, each=400)[0].mean() > 0.995
+
+
+def test_across_a_gap_nothing_is_judged() -> None:
+    values = walking()
+    values[200:, 0] += 9.0
+    check = ImuCheck(ImuRange())
+    stamps = np.arange(400) * STEP
+    stamps[200:] += 10**9
+    assert (
+        check.believed(stamps[:200], values[:200]).all() and check.believed(stamps[200:], values[200:]).all()
+    )
+
+
+def test_samples_beyond_a_known_range_are_left_out() -> None:
+    values = walking()
+    values[200:240, 0] = 18.0  # many: no spike
+    check = ImuCheck(ImuRange(17.5, 39.3))
+    assert np.flatnonzero(~check.believed(np.arange(400) * STEP, values)).tolist() == list(range(200, 240))
+    assert (check.out_of_range, check.spikes) == (40, 0)
+
+
+RECORDED = sorted(MOTION.glob("*/*/imu0.csv"))
+
+
+@pytest.mark.skipif(not RECORDED, reason="the recorded motions are not here")
+@pytest.mark.parametrize("path", RECORDED, ids=lambda path: path.parent.name)
+def test_of_what_was_recorded_everything_stays(path: Path) -> None:
+    table = np.loadtxt(path, delimiter=",")
+    stamps, values = table[:, 0].astype(np.int64), table[:, 1:7]
+    check, parts = ImuCheck(ImuRange(17.5, 180.0)), range(0, len(values), 10)
+    assert all(check.believed(stamps[k : k + 10], values[k : k + 10]).all() for k in parts)
+
+
+# ---------------------------------------------------------------- in the sequencer
+
+
+def bundles(values: np.ndarray) -> tuple[list, SequencerCounters]:
+    samples = [Measurement("imu", k * STEP, tuple(row)) for k, row in enumerate(values)]
+    images = [Measurement("cam0", k * 10 * STEP, f"image {k}") for k in range(len(values) // 10)]
+    counters = SequencerCounters()
+    both = sorted([*samples, *images], key=lambda m: m.stamp_ns)
+    return list(sequence(both, ("cam0", "imu"), 20.0, SequencerConfig(), counters)), counters
+
+
+def test_frames_come_without_what_is_no_sample_and_it_is_counted() -> None:
+    values = walking()
+    clean, counters = bundles(values)
+    assert (counters.imu_out_of_range, counters.imu_spikes) == (0, 0)
+    assert counters.imu_samples == 391
+    np.testing.assert_array_equal(np.vstack([b.imu.gyro for b in clean]), values[:391, :3])
+    values[105, 0], values[155, 3], values[207, 1] = 500.0, np.nan, 25.0
+    spoiled, counters = bundles(values)
+    assert (counters.imu_out_of_range, counters.imu_spikes, counters.imu_samples) == (2, 1, 388)
+    assert [b.stamp_ns for b in spoiled] == [b.stamp_ns for b in clean]
+    told = np.concatenate([b.imu.stamps_ns for b in spoiled]) // STEP
+    assert set(range(391)) - set(told.tolist()) == {105, 155, 207}
+
+
+def test_an_imu_that_gives_nothing_else_is_silent() -> None:
+    values = walking()
+    values[100:200] = np.nan
+    _, counters = bundles(values)
+    assert counters.imu_silent == 9 and counters.imu_out_of_range == 100

@@ -1,0 +1,46 @@
+"""Nothing that runs live asks what time of day it is: a clock that is set back or ahead changes nothing."""
+
+import ast
+from pathlib import Path
+
+SHARE = Path(__file__).resolve().parents[2] / "share"
+LIVE = ("core", "control", "estimator", "graph", "io", "merge", "place", "run", "vision", "wire")
+WALL = {"time.time", "time.time_ns", "time.localtime", "time.gmtime", "time.ctime", "datetime.now"}
+WALL |= {"datetime.utcnow", "datetime.today", "date.today", "datetime.datetime.now", "time.clock_settime"}
+WALL |= {"time.CLOCK_REALTIME"}
+
+# What the wall clock is for: to compare it between machines (`share sync`), and a date for a person.
+ALLOWED = {
+    "io/udp.py": {"time.time_ns"},  # of `share sync`: stamps of datagrams
+    "run/time_check.py": {"time.time_ns"},
+    "run/time_server.py": {"time.time_ns"},
+    "run/doctor.py": {"time.time"},  # how old a calibration's file is
+    "run/trial.py": {"datetime.now"},  # when an evaluation was made
+}
+
+
+def asked(source: str) -> set[str]:
+    """Names by which a module asks the wall clock."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Attribute):
+            found |= {ast.unparse(node)} & WALL
+        elif isinstance(node, ast.ImportFrom) and node.module == "time":
+            found |= {f"time.{name.name}" for name in node.names} & WALL
+    return found
+
+
+def test_only_where_it_must_be():
+    found = {}
+    for package in LIVE:
+        for file in sorted((SHARE / package).rglob("*.py")):
+            if names := asked(file.read_text()):
+                found[str(file.relative_to(SHARE))] = names
+    assert found == ALLOWED
+
+
+def test_it_is_found():
+    assert asked("import time\nx = time.time()") == {"time.time"}
+    assert asked("from time import time_ns") == {"time.time_ns"}
+    assert asked("from datetime import datetime\nx = datetime.now()") == {"datetime.now"}
+    assert asked("import time\nx = time.monotonic()") == set()

@@ -1,0 +1,50 @@
+"""What this process may still take of the machine's memory."""
+
+from pathlib import Path
+
+import pytest
+
+from share.io.machine import free_bytes
+
+GB = 1_000_000_000
+
+
+def machine(
+    folder: Path, available: int | None, group: str = "", files: dict[str, str] | None = None
+) -> int | None:
+    proc, groups = folder / "proc", folder / "groups"
+    (proc / "self").mkdir(parents=True)
+    if available is not None:
+        (proc / "meminfo").write_text(f"MemTotal: 1 kB\nMemAvailable:   {available // 1024} kB\n")
+    (proc / "self" / "cgroup").write_text(group)
+    for name, text in (files or {}).items():
+        (groups / name).parent.mkdir(parents=True, exist_ok=True)
+        (groups / name).write_text(text + "\n")
+    return free_bytes(proc, groups)
+
+
+@pytest.mark.parametrize(
+    ("group", "files", "free"),
+    [
+        ("", {}, 3 * GB),
+        ("0::/\n", {"memory.max": "max", "memory.current": "5"}, 3 * GB),
+        ("0::/\n", {"memory.max": str(GB), "memory.current": str(GB // 4)}, 3 * GB // 4),
+        ("0::/a/b\n", {"a/memory.max": str(GB), "a/memory.current": "0", "a/b/memory.max": "max"}, GB),
+        ("0::/a\n", {"a/memory.max": "5", "a/memory.current": "9"}, 0),
+        (
+            "4:cpu:/x\n3:memory:/d\n",
+            {"memory/d/memory.limit_in_bytes": "7", "memory/d/memory.usage_in_bytes": "2"},
+            5,
+        ),
+    ],
+)
+def test_the_least_counts(tmp_path, group, files, free):
+    assert machine(tmp_path, 3 * GB, group, files) == (free if free != 3 * GB else free // 1024 * 1024)
+
+
+def test_a_system_that_does_not_say(tmp_path):
+    assert machine(tmp_path, None) is None
+
+
+def test_this_one_says():
+    assert free_bytes() > 10_000_000

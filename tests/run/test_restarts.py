@@ -1,0 +1,183 @@
+"""A mapper that dies again and again: the edge stays up, pauses grow, a map that it dies of is set aside."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from map_changes import small_map
+
+from share.config import Config
+from share.errors import StoreError
+from share.io.map_store import MapStore
+from share.run import edge as edge_module
+from share.run.companion import END
+from share.run.edge import EdgeRun
+from share.run.mapping import Restore, Restored
+from share.run.restarts import Restarts
+
+
+class Link:
+    """Nobody is there."""
+
+    endpoint = "nowhere"
+
+    def receive(self, timeout_ms):
+        time.sleep(min(timeout_ms, 5) / 1e3)
+
+    def send(self, peer, frames): ...
+    def refusals(self):
+        return []
+
+    def wake(self): ...
+    def close(self): ...
+
+
+def dies_of_a_map(inbox, answer, settings):
+    """A mapper that cannot take in any keyframe."""
+    while (message := inbox.get()) is not END:
+        if isinstance(message, Restore):
+            if message.kept.keyframes:
+                os._exit(3)
+            answer(Restored())
+
+
+def dies_later(inbox, answer, settings):
+    """A mapper that dies of what comes after its map."""
+    while (message := inbox.get()) is not END:
+        if isinstance(message, Restore):
+            answer(Restored())
+            time.sleep(0.1)
+            os._exit(3)
+
+
+@pytest.fixture
+def path(tmp_path):
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        store.write(small_map())
+    return tmp_path / "room.sqlite"
+
+
+@pytest.fixture
+def edge(path, monkeypatch):
+    """Makes an edge of a mapper, whose pauses are a hundredth as long."""
+    runs = []
+
+    def make(mapper):
+        monkeypatch.setattr(edge_module, "map_all", mapper)
+        died = Restarts.died
+        monkeypatch.setattr(Restarts, "died", lambda self: pauses.append(died(self)) or pauses[-1] / 100)
+        pauses, told = [], []
+        run = EdgeRun(Config(), Link(), None, told.append, MapStore.open(path))
+        runs.append(run)
+        return run, pauses, told
+
+    yield make
+    for run in runs:
+        run.stop()
+        run.go()
+
+
+def step_until(run, condition, seconds=30):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        run._step()
+
+
+def events(told, name):
+    return [event["reason"] for event in told if event["event"] == name]
+
+
+def test_a_map_that_ends_mappers_is_set_aside(edge, path):
+    before = path.read_bytes()
+    run, pauses, told = edge(dies_of_a_map)
+    step_until(run, lambda: events(told, "map"))
+    assert pauses == [1, 2, 4]
+    assert len(events(told, "mapper lost")) == 3
+    assert "its process ended with exit code 3; a new one begins in" in events(told, "mapper lost")[0]
+    aside = "the map is set aside as room.sqlite.damaged-1: 3 mappers, one after the other, have died of it"
+    assert events(told, "map") == [f"{aside}; a fresh one is begun"]
+    assert path.with_name("room.sqlite.damaged-1").read_bytes() == before
+    step_until(run, lambda: run._restarts._tries == 0 and run._mapping.pid is not None)
+    run._note()
+    assert any(text.startswith("the mapper: its process ended") for text in run.report()["trouble"])
+    deadline = time.monotonic() + 0.5
+    step_until(run, lambda: time.monotonic() > deadline)
+    assert len(pauses) == 3  # the next lives
+    assert run._restarts.writable
+    with MapStore.read(path.with_name("room.sqlite.damaged-1")) as old:
+        assert len(old.load().keyframes) == 40
+
+
+def test_a_mapper_that_dies_of_something_else_keeps_its_map(edge, path):
+    run, pauses, told = edge(dies_later)
+    step_until(run, lambda: len(pauses) == 5)
+    assert pauses == [1, 2, 4, 8, 16]
+    assert not events(told, "map")
+    assert not path.with_name("room.sqlite.damaged-1").exists()
+
+
+def test_answers_of_a_life_that_is_over_are_none_of_the_next(edge):
+    """A ticket of the keeper before would acknowledge what the new one has not written."""
+    run, _, _ = edge(dies_later)
+    run._answered(edge_module.Kept(10**6))
+    run._begin_anew("its process was ended")
+    run._take_answers()
+    assert run._machine._kept_to == 0
+
+
+class Store:
+    def __init__(self, load, writable=True):
+        self.load, self.writable, self.asides = load, writable, 0
+
+    def set_aside(self):
+        self.asides += 1
+        return Path("m.damaged-1")
+
+
+def raises(error):
+    def load():
+        raise error
+
+    return load
+
+
+@pytest.mark.parametrize("error", [np.linalg.LinAlgError("no pose"), ValueError("x"), RecursionError("deep")])
+def test_a_map_that_the_front_cannot_read_is_set_aside(error):
+    said, store = [], Store(raises(error))
+    assert Restarts(store, 0.05, said.append).found() == (None, [])
+    assert store.asides == 1
+    aside = f"the map is set aside as m.damaged-1: {type(error).__name__}: {error}; a fresh one is begun"
+    assert said == [aside]
+
+
+def test_a_map_that_may_not_be_written_is_no_longer_used():
+    said = []
+    restarts = Restarts(Store(raises(ValueError("x")), writable=False), 0.05, said.append)
+    assert restarts.found() == (None, [])
+    assert restarts.store is None
+    assert said == ["the map is not used any more: ValueError: x; nothing is kept"]
+
+
+def test_a_disk_that_fails_is_not_the_maps_fault():
+    store = Store(raises(StoreError("the map cannot be read: disk I/O error")))
+    with pytest.raises(StoreError):
+        Restarts(store, 0.05, print).found()
+    assert store.asides == 0
+
+
+def test_the_edge_waits_for_a_disk_that_cannot_be_read(edge, monkeypatch):
+    run, _, told = edge(dies_later)
+    found = run._restarts.found
+    monkeypatch.setattr(
+        run._restarts, "found", raises(StoreError("room: the map cannot be read: disk I/O error"))
+    )
+    run._begin_anew("its process was ended")
+    assert events(told, "map") == ["room: the map cannot be read: disk I/O error; tried again in 0.01 s"]
+    monkeypatch.setattr(run._restarts, "found", found)
+    step_until(run, lambda: run._begin_at is None)
+    assert run._mapping is not None
