@@ -30,9 +30,10 @@ from share.core.lookups import Lookups, form_of, served_as
 from share.core.search import Effort, Search
 from share.core.steps import Look, Query, Solve, Step, Verify
 from share.graph.change import Solution
-from share.merge.atlas import Applied, Atlas, Parted, Placed
+from share.merge.atlas import Applied, Atlas, Placed
 from share.merge.join import Loop
 from share.merge.judge import Decision
+from share.merge.parting import Parted
 from share.merge.thinning import TakenOut
 from share.metrics.latency import summary
 from share.place.index import PlaceIndex

@@ -121,7 +121,7 @@ class Agreement:
         state = "agrees" if any(self._agrees(pair) for pair in pairs.values()) else "unknown"
         reason = ""
         if agent in self.apart:
-            state, reason = "set apart", _reason(agent, bad)
+            state, reason = "set apart", _reason(agent, bad) + ": check its calibration"
         elif any(frozenset(names) in self.disputed for names, _ in bad):
             state, reason = "disputed", f"{_reason(agent, bad)}; nobody can say which of the two is wrong"
         return Standing(state, reason, log, sigma, nis)
@@ -154,7 +154,7 @@ class Agreement:
             out.append(_told(ways.path, self._tolerance, "its way is {} % {}", ("longer", "shorter")))
             turn = f"its camera is turned by {np.degrees(ways.turn.value):.1f} degrees against what it says"
             out.append((_severity(ways.turn, _TURN), turn, turn))
-        sure = f"its motion fits loops {np.sqrt(ways.nis):.0f} times worse than its covariances say"
+        sure = f"loops are off by {ways.nis:.1f} times the variance that it claims"
         out.append((ways.nis / _NIS, sure, sure))
         return out
 
@@ -237,7 +237,7 @@ def _reason(agent: str, bad: list[tuple[Names, _Pair]]) -> str:
     for (first, second), pair in bad:
         other, what = (first, pair.what) if agent == second else (second, pair.turned)
         said.append(f"against {other} {what}")
-    return "; ".join(said) + ": check its calibration"
+    return "; ".join(said)
 
 
 def _least_telling(loops: list[Witness]) -> int:

@@ -6,7 +6,6 @@ new, `apply` takes the solution in.
 
 from __future__ import annotations
 
-import itertools
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,11 +15,11 @@ import numpy as np
 from share.config import MergeConfig
 from share.geometry import se3
 from share.graph.change import Solution
-from share.graph.posegraph import Edge
-from share.merge.agreement import Agreement, Standing, tilt_between
+from share.merge.agreement import Standing
 from share.merge.chart import Chart
 from share.merge.join import Key, Loop
 from share.merge.judge import Decision, Judge, that_waited
+from share.merge.parting import Parted, Parting
 from share.merge.promising import promising_first
 from share.merge.solving import SolveJob
 from share.merge.surety import Found, Surety
@@ -58,28 +57,19 @@ class Placed:
     as_sent: bool
 
 
-@dataclass(frozen=True, eq=False)
-class Parted:
-    """Agents whose standing with the others has changed, and how it is now; dropped: loops that are taken
-    back because of it."""
-
-    standing: dict[str, Standing] = field(default_factory=dict)
-    dropped: tuple[Loop, ...] = ()
-
-
 class Atlas:
     """All keyframes of all agents, in maps."""
 
     def __init__(self, config: MergeConfig, sights: Mapping[int, Sight] | None = None) -> None:
         """sights: what each keyframe saw, by its number; kept by whoever asks."""
         self._config = config
-        self._sights: Mapping[int, Sight] = {} if sights is None else sights
+        seen: Mapping[int, Sight] = {} if sights is None else sights
         self._chart = Chart()
-        self._judge = Judge(config, self._chart, Survey(self._chart, self._sights))
+        self._judge = Judge(config, self._chart, Survey(self._chart, seen))
         self._answers: dict[str, int] = {}  # agent -> its newest keyframe that a loop came from
         self._surety = Surety(config.enter_m, config.enter_patience)
         self._absent: set[str] = set()
-        self._agreement = Agreement(config.scale_tolerance)
+        self._parting = Parting(config.scale_tolerance, self._chart, self._judge, seen)
 
     # ------------------------------------------------------------ what is known
 
@@ -171,7 +161,7 @@ class Atlas:
         """
         cov, plumb = self._believed(keyframe.cov), self._plumb(keyframe)
         number = self._chart.add(agent, keyframe, cov, plumb, rank)
-        self._agreement.walk(number, self._chart.trails.before(number), keyframe.T_ref_body, cov)
+        self._parting.agreement.walk(number, self._chart.trails.before(number), keyframe.T_ref_body, cov)
         return number
 
     def restore(
@@ -196,7 +186,7 @@ class Atlas:
             T_odom_body = found.keyframe.T_odom_body
             numbers.append(chart.trails.put(found.key, at[found.stretch], T_odom_body, found.ordinal))
             chart.place(numbers[-1], found.T_ref_body, cov, self._plumb(found.keyframe))
-            self._agreement.walk(numbers[-1], chart.trails.before(numbers[-1]), found.T_ref_body, cov)
+            self._parting.agreement.walk(numbers[-1], chart.trails.before(numbers[-1]), found.T_ref_body, cov)
             chart.poses[numbers[-1]] = T_map_body.get(found.key, chart.poses[numbers[-1]])
         for loop in loops:
             chart.tie(loop)
@@ -229,7 +219,7 @@ class Atlas:
         taken = [take_out(chart, n, self._config.most_loops) for n in going]
         chart.find_maps()
         self._judge.forget({out.key for out in taken})
-        self._agreement.forget([out.number for out in taken])
+        self._parting.agreement.forget([out.number for out in taken])
         return taken
 
     def _staying(self) -> set[int]:
@@ -246,7 +236,7 @@ class Atlas:
 
         Raises ValueError if either keyframe is unknown.
         """
-        if why := self._kept_apart(loop):
+        if why := self._parting.forbids(loop):
             return Decision(False, f"loop {loop}: {why}")
         decision = self._judge.decide(loop)
         if decision.accepted:  # loops that waited are believed because of it: it is what is answered
@@ -254,61 +244,20 @@ class Atlas:
         return decision
 
     def witness(self, loop: Loop, scale: Scale | None) -> Parted:
-        """A verified loop, before it is proposed, says how its agents agree; scale: of b's depths over a's.
-        Those who do no longer are parted."""
-        if loop.a.agent == loop.b.agent:
-            return Parted()
-        a, b = self._chart.ends(loop)
-        edge, sights = Edge(a, b, loop.T_a_b, loop.cov), self._sights
-        up = [(sights[n].up, self._up_sigma(n)) for n in (a, b) if n in sights]
-        tilt = tilt_between(*up[0], *up[1], edge) if len(up) == 2 else None
-        stretches = self._chart.stretch_of(loop.a), self._chart.stretch_of(loop.b)
-        before = self._agreement.apart, self._agreement.disputed
-        if not self._agreement.witness((loop.a.agent, loop.b.agent), stretches, edge, scale, tilt):
-            return Parted()
-        now = self._agreement.apart, self._agreement.disputed
-        changed = (before[0] ^ now[0]).union(*(before[1] ^ now[1]))
-        return Parted({who: self._agreement.standing(who) for who in sorted(changed)}, self._part())
+        """A verified loop, before it is proposed, says how its agents agree: see `Parting`."""
+        return self._parting.witness(loop, scale)
 
     def standing(self, agent: str) -> Standing:
         """How the agent agrees with the others."""
-        return self._agreement.standing(agent)
+        return self._parting.agreement.standing(agent)
 
     def are_apart(self, one: str, other: str) -> bool:
         """Whether these agents must not come into one map."""
-        return bool(self._agreement.forbids([one], [other]))
+        return bool(self._parting.agreement.forbids([one], [other]))
 
     def kept_apart(self, number: int) -> tuple[int, ...]:
         """Keyframes of agents that must not come into one map with this one's."""
-        mine, forbids = self.key(number).agent, self._agreement.forbids
-        agents = {stretch.agent for stretch in self._chart.trails.stretches}
-        apart = {agent for agent in agents if forbids([mine], [agent])}
-        stretches = (s for s in self._chart.trails.stretches if s.agent in apart) if apart else ()
-        return tuple(n for stretch in stretches for n in stretch.nodes)
-
-    def _kept_apart(self, loop: Loop) -> str:
-        founders = self._chart.founder_of(loop.a), self._chart.founder_of(loop.b)
-        if loop.a.agent == loop.b.agent and founders[0] == founders[1]:
-            return ""
-        return self._agreement.forbids(*(self._agents_of(f) for f in founders))
-
-    def _agents_of(self, founder: int) -> set[str]:
-        return {self._chart.trails.stretches[s].agent for s in self._chart.stretches_of(founder)}
-
-    def _part(self) -> tuple[Loop, ...]:
-        """Take back what ties agents that are kept apart, until no map has two of them."""
-        dropped: tuple[Loop, ...] = ()
-        stretches = self._chart.trails.stretches
-        for a, b in itertools.combinations(range(len(stretches)), 2):
-            one, other = stretches[a].agent, stretches[b].agent
-            if self._chart.founder[a] == self._chart.founder[b] and self._agreement.forbids([one], [other]):
-                dropped += self._judge.part(a, b)
-        return dropped
-
-    def _up_sigma(self, number: int) -> float:
-        """rad, as it is believed; large where up is not known."""
-        line = self._chart.plumb.get(number)
-        return np.pi if line is None else 1 / float(np.linalg.norm(line))
+        return self._parting.kept_apart(self.key(number).agent)
 
     def review(self, number: int) -> Decision | None:
         """Whether what this keyframe saw speaks against a young join of its map: it is undone."""

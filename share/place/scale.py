@@ -17,7 +17,7 @@ from share.place.refine import Noise, by_keypoint, by_pose, move
 from share.types import F64
 
 _LEAST = 10  # matches with both depths: fewer say little
-_STEPS = 3
+_STEPS = 2
 _RIDGE = 1e-6 * np.eye(7)
 
 
@@ -42,14 +42,15 @@ def relative_scale(
     T, log = T_c_q, 0.0
     for _ in range(_STEPS):
         J, information, residual = _linear(T, log, source, target, noise_q, noise_c)
-        WJ = np.einsum("nij,njk->nik", information, J)
-        d2 = np.einsum("ni,nij,nj->n", residual, information, residual)
+        WJ = information @ J
+        d2 = (residual * (information @ residual[:, :, None])[:, :, 0]).sum(1)
         inside = d2 < gate
         if inside.sum() < _LEAST:
             return None
         J, WJ, residual = J[inside], WJ[inside], residual[inside]
-        normal = np.einsum("nij,nik->jk", J, WJ) + _RIDGE
-        step = np.linalg.solve(normal, np.einsum("nij,ni->j", WJ, residual))
+        J, WJ = J.reshape(-1, 7), WJ.reshape(-1, 7)
+        normal = J.T @ WJ + _RIDGE
+        step = np.linalg.solve(normal, WJ.T @ residual.ravel())
         T, log = se3.exp(step[:6]) @ T, log + float(step[6])
     variance = max(1.0, float(d2[inside].sum()) / max(1, 3 * int(inside.sum()) - 7))
     return Scale(log, float(np.sqrt(np.linalg.inv(normal)[6, 6] * variance)))
@@ -64,7 +65,8 @@ def _linear(
     moved = move(T, y)
     K = by_keypoint(T, y, moved)  # (3, 3, N)
     J = np.concatenate([by_pose(moved), (K[:, 2] * y[2])[None]]).transpose(2, 1, 0)
-    covariance = np.einsum("ikn,k,jkn->nij", K, noise_q.variances, K) + np.diag(noise_c.variances)
+    by = K.transpose(2, 0, 1)
+    covariance = (by * noise_q.variances) @ by.swapaxes(1, 2) + np.diag(noise_c.variances)
     residual = (target - moved).T
     seen = np.isfinite(moved.sum(0))
     J, residual = np.where(seen[:, None, None], J, 0.0), np.where(seen[:, None], residual, 0.0)
