@@ -133,7 +133,7 @@ class Agreement:
         most = max(pair.loops.values(), key=len)
         scales = [w.scale for w in every if w.scale is not None]
         pair.points = points_scale(scales) if len(scales) >= _ENOUGH_POINTS else None
-        pair.ways = compare(most) if len(most) >= _ENOUGH_PATH else None
+        pair.ways = _compared(most) if len(most) >= _ENOUGH_PATH else None
         found = [*self._by_points(pair), *self._by_ways(pair), *_by_gravity(every)]
         severe = max((severity for severity, _, _ in found), default=0.0)
         pair.disagrees = severe >= (_CALM if pair.disagrees else 1.0)
@@ -217,6 +217,14 @@ def _by_gravity(loops: list[Witness]) -> list[tuple[float, str, str]]:
     angle, sigmas = float(np.median(known[:, 0])), float(np.median(known[:, 0] / known[:, 1]))
     text = f"its up is {np.degrees(angle):.1f} degrees off"
     return [(min(angle / _TILT, sigmas / _SIGMAS), text, text)]
+
+
+def _compared(loops: list[Witness]) -> Comparison | None:
+    """None where absurd numbers leave no solution."""
+    try:
+        return compare(loops)
+    except np.linalg.LinAlgError:
+        return None
 
 
 def _severity(found: Estimate, harmless: float) -> float:

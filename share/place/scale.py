@@ -18,6 +18,7 @@ from share.types import F64
 
 _LEAST = 10  # matches with both depths: fewer say little
 _STEPS = 2
+_MOST = 1.0  # log scale; beyond, the matches are none
 _RIDGE = 1e-6 * np.eye(7)
 
 
@@ -36,7 +37,8 @@ def relative_scale(
     T_c_q: F64, y_q: F64, y_c: F64, noise_q: Noise, noise_c: Noise, gate: float
 ) -> Scale | None:
     """Of cameras, from T_c_q (4, 4) as refined and matched keypoints y_q, y_c (N, 3), NaN where a depth is
-    unknown. gate: squared Mahalanobis distance of an inlier. None where too few matches have both depths."""
+    unknown. gate: squared Mahalanobis distance of an inlier. None where too few matches have both depths.
+    Raises LinAlgError where they determine nothing."""
     both = np.isfinite(y_q[:, 2]) & np.isfinite(y_c[:, 2])
     source, target = y_q[both].T, y_c[both].T
     T, log = T_c_q, 0.0
@@ -52,6 +54,8 @@ def relative_scale(
         normal = J.T @ WJ + _RIDGE
         step = np.linalg.solve(normal, WJ.T @ residual.ravel())
         T, log = se3.exp(step[:6]) @ T, log + float(step[6])
+    if not abs(log) < _MOST:
+        return None
     variance = max(1.0, float(d2[inside].sum()) / max(1, 3 * int(inside.sum()) - 7))
     return Scale(log, float(np.sqrt(np.linalg.inv(normal)[6, 6] * variance)))
 

@@ -134,8 +134,16 @@ def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> V
     if upright:
         _check_gravity(fit.T, query, candidate, config)
     T, cov = _between_bodies(fit.T, fit.cov, query.T_body_cam0, candidate.T_body_cam0)
-    scale = relative_scale(fit.T, *fit.beside, *noises, config.inlier_chi2)
+    scale = _scale(fit, noises, config)
     return Verified(T, cov + _floor(config), fit.matches, fit.inliers, scale)
+
+
+def _scale(fit: _Fit, noises: tuple[Noise, Noise], config: PlaceConfig) -> Scale | None:
+    """None where the matches do not tell: a pose may be told all the same."""
+    try:
+        return relative_scale(fit.T, *fit.beside, *noises, config.inlier_chi2)
+    except np.linalg.LinAlgError:
+        return None
 
 
 def _noise(sight: Sight, config: PlaceConfig) -> Noise:
