@@ -250,6 +250,7 @@ class MergeConfig:
     enter_patience: int = 20  # but for so many of his keyframes that found loops at most
     rebel_places: int = 4  # so many places at least, that weigh more than what stands, take a map apart
     rebel_weight: float = 1.4  # by how many times they have to weigh more
+    scale_tolerance: float = 0.015  # agents whose depths or ways differ by more (1.5 %) keep apart
     drop_chi2: float = 1000.0  # a solved graph at odds with a loop by more than this drops it
 
 

@@ -251,11 +251,9 @@ class Town:
         """Of all keyframes of these agents, one alignment: RMSE in m; inf unless they are in one map."""
         assert self.edge is not None
         kept = self.edge.mapper.poses()
-        truth = {
-            f"{p.name}-{p.run_id % 0x10000:04x}": p.T_world_body
-            for p in self.people.values()
-            if p.name in names
-        }
+        told = {p.name: p.T_world_body for p in self.people.values() if p.name in names}
+        owners = {key.agent: key.agent.rpartition("-")[0] for key in kept.keys}  # a run: name-tag
+        truth = {run: told[name] for run, name in owners.items() if name in told}
         which = [i for i, key in enumerate(kept.keys) if key.agent in truth]
         if len({kept.maps[i] for i in which}) > 1:
             return float("inf")

@@ -8,7 +8,7 @@ solved together, once.
 from __future__ import annotations
 
 from collections import Counter, deque
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from share.config import Config
@@ -34,6 +34,7 @@ from share.graph.change import Solution
 from share.merge.atlas import Applied, Atlas, Placed
 from share.merge.join import Loop
 from share.merge.judge import Decision
+from share.merge.parting import Parted
 from share.merge.thinning import TakenOut
 from share.metrics.latency import summary
 from share.place.index import PlaceIndex
@@ -44,6 +45,7 @@ from share.wire.messages import Hello
 _TIMES = 5000  # of each kind of step that a report is about: the newest
 _SLACK = 1.05  # so much above the bound before it is asked which keyframes may go
 _AT_ONCE = 2
+_LOOK_AGAIN = 4
 
 
 @dataclass
@@ -228,6 +230,8 @@ class Mapper:
 
     def _ask(self, number: int) -> Query:
         near = self._atlas.neighbours(number)
+        if number % _LOOK_AGAIN:  # what is kept apart is looked up seldom: it may agree by now
+            near += self._atlas.kept_apart(number)
         return Query(self._index, number, self._sights[number], self._config.place.candidates, near)
 
     def _begin_search(self, query: Query, found: list[int]) -> None:
@@ -256,7 +260,7 @@ class Mapper:
         account.loops_tried += 1
         if isinstance(outcome, Refusal):
             return [Finding(b.agent, "loop refused", f"{a} - {b}: {outcome.reason}")]
-        if self._search is not None:
+        if self._search is not None and not self._atlas.are_apart(a.agent, b.agent):
             self._search.verified()
         loop = Loop(a, b, outcome.T_c_q, outcome.cov, outcome.inliers)
         account.merges["requested"] += 1
@@ -264,15 +268,28 @@ class Mapper:
         if objection := self._gating.refuses(volume, self._atlas.map_of(a) == self._atlas.map_of(b)):
             account.merges["skipped"] += 1
             return [Finding(b.agent, "merge skipped", f"loop {loop}: {objection}")]
+        parted = self._atlas.witness(loop, outcome.scale)
+        findings = self._parted(parted)
         decision = self._atlas.propose(loop)
         reason = f"{decision.reason} ({outcome.reason})"
         self._note(decision)
         if not decision.accepted:
-            return [Finding(b.agent, "loop not taken", reason)]
+            return [*findings, Finding(b.agent, "loop not taken", reason)]
         account.merges["done"] += 1
         self._gating.completed(volume)
         undone = [Finding(b.agent, "merge undone", reason)] if decision.dropped else []
-        return [*undone, Finding(b.agent, "maps joined" if decision.joined else "loop accepted", reason)]
+        taken = Finding(b.agent, "maps joined" if decision.joined else "loop accepted", reason)
+        return [*findings, *undone, taken]
+
+    def _parted(self, parted: Parted) -> list[Finding]:
+        """Who disagrees with the others since now, or no longer."""
+        self._changes += [DropLoop(loop.a, loop.b) for loop in parted.dropped]
+        return [
+            Finding(
+                who, now.state if now.reason else "agrees again", now.reason or "its claims fit the others'"
+            )
+            for who, now in parted.standing.items()
+        ]
 
     def _review(self, number: int) -> list[Finding]:
         decision = self._atlas.review(number) if number in self._sights else None
@@ -348,6 +365,7 @@ class Mapper:
             "merges": _told(account.merges),
             "queries_skipped": self._lookups.skipped[agent],
             "map_id": self._atlas.current_map(agent),
+            "consistency": asdict(self._atlas.standing(agent)),
         }
 
 

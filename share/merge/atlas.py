@@ -15,14 +15,17 @@ import numpy as np
 from share.config import MergeConfig
 from share.geometry import se3
 from share.graph.change import Solution
+from share.merge.agreement import Standing
 from share.merge.chart import Chart
 from share.merge.join import Key, Loop
 from share.merge.judge import Decision, Judge, that_waited
+from share.merge.parting import Parted, Parting
 from share.merge.promising import promising_first
 from share.merge.solving import SolveJob
 from share.merge.surety import Found, Surety
 from share.merge.survey import Survey
 from share.merge.thinning import TakenOut, redundant, take_out
+from share.place.scale import Scale
 from share.place.verify import Sight
 from share.types import F64, Correction, Keyframe
 
@@ -60,11 +63,13 @@ class Atlas:
     def __init__(self, config: MergeConfig, sights: Mapping[int, Sight] | None = None) -> None:
         """sights: what each keyframe saw, by its number; kept by whoever asks."""
         self._config = config
+        seen: Mapping[int, Sight] = {} if sights is None else sights
         self._chart = Chart()
-        self._judge = Judge(config, self._chart, Survey(self._chart, {} if sights is None else sights))
+        self._judge = Judge(config, self._chart, Survey(self._chart, seen))
         self._answers: dict[str, int] = {}  # agent -> its newest keyframe that a loop came from
         self._surety = Surety(config.enter_m, config.enter_patience)
         self._absent: set[str] = set()
+        self._parting = Parting(config.scale_tolerance, self._chart, self._judge, seen)
 
     # ------------------------------------------------------------ what is known
 
@@ -155,7 +160,9 @@ class Atlas:
         Raises ValueError for a keyframe known already or whose reference is unknown.
         """
         cov, plumb = self._believed(keyframe.cov), self._plumb(keyframe)
-        return self._chart.add(agent, keyframe, cov, plumb, rank)
+        number = self._chart.add(agent, keyframe, cov, plumb, rank)
+        self._parting.agreement.walk(number, self._chart.trails.before(number), keyframe.T_ref_body, cov)
+        return number
 
     def restore(
         self,
@@ -179,6 +186,7 @@ class Atlas:
             T_odom_body = found.keyframe.T_odom_body
             numbers.append(chart.trails.put(found.key, at[found.stretch], T_odom_body, found.ordinal))
             chart.place(numbers[-1], found.T_ref_body, cov, self._plumb(found.keyframe))
+            self._parting.agreement.walk(numbers[-1], chart.trails.before(numbers[-1]), found.T_ref_body, cov)
             chart.poses[numbers[-1]] = T_map_body.get(found.key, chart.poses[numbers[-1]])
         for loop in loops:
             chart.tie(loop)
@@ -211,6 +219,7 @@ class Atlas:
         taken = [take_out(chart, n, self._config.most_loops) for n in going]
         chart.find_maps()
         self._judge.forget({out.key for out in taken})
+        self._parting.agreement.forget([out.number for out in taken])
         return taken
 
     def _staying(self) -> set[int]:
@@ -227,10 +236,28 @@ class Atlas:
 
         Raises ValueError if either keyframe is unknown.
         """
+        if why := self._parting.forbids(loop):
+            return Decision(False, f"loop {loop}: {why}")
         decision = self._judge.decide(loop)
         if decision.accepted:  # loops that waited are believed because of it: it is what is answered
             self._answers[loop.b.agent] = max(loop.b.id, self._answers.get(loop.b.agent, -1))
         return decision
+
+    def witness(self, loop: Loop, scale: Scale | None) -> Parted:
+        """A verified loop, before it is proposed, says how its agents agree: see `Parting`."""
+        return self._parting.witness(loop, scale)
+
+    def standing(self, agent: str) -> Standing:
+        """How the agent agrees with the others."""
+        return self._parting.agreement.standing(agent)
+
+    def are_apart(self, one: str, other: str) -> bool:
+        """Whether these agents must not come into one map."""
+        return bool(self._parting.agreement.forbids([one], [other]))
+
+    def kept_apart(self, number: int) -> tuple[int, ...]:
+        """Keyframes of agents that must not come into one map with this one's."""
+        return self._parting.kept_apart(self.key(number).agent)
 
     def review(self, number: int) -> Decision | None:
         """Whether what this keyframe saw speaks against a young join of its map: it is undone."""

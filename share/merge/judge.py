@@ -78,6 +78,10 @@ class Judge:
                 return Decision(True, f"{why}; {taken_out(dropped)}", dropped=dropped)
         return None
 
+    def part(self, a: int, b: int) -> tuple[Loop, ...]:
+        """Take back the loops without which stretches a and b, of one map, are of two."""
+        return self._chart.drop(self._ties_between(a, b))
+
     def settle(self) -> tuple[Loop, ...]:
         """Those that waited and fit the map that they are in by now are believed."""
         inside = [loop for loop in self.waiting if self._chart.same_map(*self._chart.ends(loop))]

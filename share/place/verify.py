@@ -19,6 +19,7 @@ from share.geometry.camera import rays
 from share.place.guided import beside
 from share.place.matching import Pairs, hamming, mutual, near
 from share.place.refine import Noise, refine
+from share.place.scale import Scale, relative_scale
 from share.types import F64, View
 
 _NEAR, _FAR = 0.05, 1000.0  # m; a depth outside says nothing
@@ -54,13 +55,15 @@ class Sight:
 class Verified:
     """T_c_q (4, 4): body of the query in the body frame of the candidate; cov (6, 6) of it.
 
-    matches: descriptor pairs; inliers: those that agree with the pose.
+    matches: descriptor pairs; inliers: those that agree with the pose. scale: of the query's depths over the
+    candidate's; None where too few points have both.
     """
 
     T_c_q: F64
     cov: F64
     matches: int
     inliers: int
+    scale: Scale | None = None
 
     @property
     def reason(self) -> str:
@@ -93,14 +96,18 @@ def verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int = 0) -
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """What a rough pose becomes: T_c_q of the cameras, its covariance, and the matches beside it, of which
-    keypoints y_q, y_c (N, 3) are inliers."""
+    """What a rough pose becomes: T_c_q of the cameras, its covariance, the matches beside it (M, 3), (M, 3),
+    and those of them, y_q, y_c (N, 3), that are inliers."""
 
     T: F64
     cov: F64
-    matches: int
+    beside: tuple[F64, F64]
     y_q: F64
     y_c: F64
+
+    @property
+    def matches(self) -> int:
+        return len(self.beside[0])
 
     @property
     def inliers(self) -> int:
@@ -127,7 +134,16 @@ def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> V
     if upright:
         _check_gravity(fit.T, query, candidate, config)
     T, cov = _between_bodies(fit.T, fit.cov, query.T_body_cam0, candidate.T_body_cam0)
-    return Verified(T, cov + _floor(config), fit.matches, fit.inliers)
+    scale = _scale(fit, noises, config)
+    return Verified(T, cov + _floor(config), fit.matches, fit.inliers, scale)
+
+
+def _scale(fit: _Fit, noises: tuple[Noise, Noise], config: PlaceConfig) -> Scale | None:
+    """None where the matches do not tell: a pose may be told all the same."""
+    try:
+        return relative_scale(fit.T, *fit.beside, *noises, config.inlier_chi2)
+    except np.linalg.LinAlgError:
+        return None
 
 
 def _noise(sight: Sight, config: PlaceConfig) -> Noise:
@@ -153,7 +169,7 @@ def _fit(rough: F64, y_q: F64, y_c: F64, noises: tuple[Noise, Noise], config: Pl
     """The pose from matched keypoints, and which of them agree with it."""
     fine = refine(rough, y_q, y_c, *noises, config.inlier_chi2)
     inlier = fine.d2 < config.inlier_chi2
-    return _Fit(fine.T, fine.cov, len(y_q), y_q[inlier], y_c[inlier])
+    return _Fit(fine.T, fine.cov, (y_q, y_c), y_q[inlier], y_c[inlier])
 
 
 def _best(fits: list[_Fit], config: PlaceConfig) -> _Fit:

@@ -12,15 +12,15 @@ from edge_sim import Person, Town, walls
 GOOD = ("ann", "bob")
 FRAMES = 48
 MOST_M = 0.007  # error of the good agents; 4 mm beside a stranger in another room
-BENDS_M = {
-    "baseline 3 % off": 0.015,
-    "extrinsics 5 deg off": 0.010,
-}  # not noticed: they join, and bend the map
+SURE = 4e-8 * np.eye(6)  # a hundredth of what it should be
+APART = ("baseline 10 % off", "baseline 3 % off", "baseline 3 % off, too sure", "baseline 5 % less, too sure")
 
 BAD = {
     "focal length 10 % off": (Miscalibrated, {"scale": (1.0, 1.0, 1.1)}),
     "baseline 10 % off": (Miscalibrated, {"scale": (1.1, 1.1, 1.1)}),
     "baseline 3 % off": (Miscalibrated, {"scale": (1.03, 1.03, 1.03)}),
+    "baseline 3 % off, too sure": (Miscalibrated, {"scale": (1.03, 1.03, 1.03), "cov": SURE}),
+    "baseline 5 % less, too sure": (Miscalibrated, {"scale": (0.95, 0.95, 0.95), "cov": SURE}),
     "extrinsics 5 deg off": (Miscalibrated, {"tilt": (0.0, np.radians(5.0), 0.0)}),
     "clock an hour off": (WrongClock, {}),
     "leaps": (Leaper, {}),
@@ -59,4 +59,10 @@ def test_the_others_map_stays_right(bad):
         f"eve {100 * town.map_error(('eve',)):.2f} cm"
     )
     assert town.edge.report()["failed_jobs"] == 0
-    assert town.map_error(GOOD) <= BENDS_M.get(bad, MOST_M)
+    assert town.map_error(GOOD) <= MOST_M
+    states = {name: agent["consistency"]["state"] for name, agent in maps.items()}
+    assert all(states[name] != "set apart" for name in GOOD)
+    if bad in APART:
+        assert states["eve"] == "set apart"
+        assert maps["eve"]["map_id"] != maps["ann"]["map_id"]
+        assert any(r["event"] == "set apart" and "calibration" in r["reason"] for r in town.records)

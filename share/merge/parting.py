@@ -1,0 +1,88 @@
+"""Agents that disagree with the others are kept out of their map, or taken out if the evidence is late."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from share.graph.posegraph import Edge
+from share.merge.agreement import Agreement, Standing, tilt_between
+from share.merge.chart import Chart
+from share.merge.join import Loop
+from share.merge.judge import Judge
+from share.place.scale import Scale
+from share.place.verify import Sight
+
+
+@dataclass(frozen=True, eq=False)
+class Parted:
+    """Agents whose standing with the others has changed, and how it is now; dropped: loops that are taken
+    back because of it."""
+
+    standing: dict[str, Standing] = field(default_factory=dict)
+    dropped: tuple[Loop, ...] = ()
+
+
+class Parting:
+    """Of one chart. sights: what each node saw."""
+
+    def __init__(self, tolerance: float, chart: Chart, judge: Judge, sights: Mapping[int, Sight]) -> None:
+        self.agreement = Agreement(tolerance)
+        self._chart, self._judge, self._sights = chart, judge, sights
+
+    def witness(self, loop: Loop, scale: Scale | None) -> Parted:
+        """A verified loop says how its agents agree; scale: of b's depths over a's. Those who do no longer
+        are parted."""
+        agents = loop.a.agent, loop.b.agent
+        if agents[0] == agents[1]:
+            return Parted()
+        a, b = self._chart.ends(loop)
+        edge = Edge(a, b, loop.T_a_b, loop.cov)
+        stretches = self._chart.stretch_of(loop.a), self._chart.stretch_of(loop.b)
+        before = self.agreement.apart, self.agreement.disputed
+        if not self.agreement.witness(agents, stretches, edge, scale, self._tilt(edge)):
+            return Parted()
+        now = self.agreement.apart, self.agreement.disputed
+        changed = (before[0] ^ now[0]).union(*(before[1] ^ now[1]))
+        return Parted({who: self.agreement.standing(who) for who in sorted(changed)}, self._part())
+
+    def kept_apart(self, agent: str) -> tuple[int, ...]:
+        """Nodes of agents that must not come into one map with this one."""
+        stretches = self._chart.trails.stretches
+        apart = {s.agent for s in stretches if self.agreement.forbids([agent], [s.agent])}
+        return tuple(n for s in stretches if s.agent in apart for n in s.nodes) if apart else ()
+
+    def forbids(self, loop: Loop) -> str:
+        """Why it must not be believed: it would tie agents that are kept apart; empty if it would not."""
+        founders = self._chart.founder_of(loop.a), self._chart.founder_of(loop.b)
+        if founders[0] == founders[1]:
+            return ""
+        return self.agreement.forbids(*(self._agents_of(founder) for founder in founders))
+
+    def _part(self) -> tuple[Loop, ...]:
+        """Take back what ties agents that are kept apart, until no map has two of them."""
+        dropped: tuple[Loop, ...] = ()
+        stretches = self._chart.trails.stretches
+        for a, b in itertools.combinations(range(len(stretches)), 2):
+            if self._chart.founder[a] != self._chart.founder[b]:
+                continue
+            if self.agreement.forbids([stretches[a].agent], [stretches[b].agent]):
+                dropped += self._judge.part(a, b)
+        return dropped
+
+    def _agents_of(self, founder: int) -> set[str]:
+        return {self._chart.trails.stretches[s].agent for s in self._chart.stretches_of(founder)}
+
+    def _tilt(self, edge: Edge) -> tuple[float, float] | None:
+        if not {edge.a, edge.b} <= self._sights.keys():
+            return None
+        a, b = (self._sights[n].up for n in (edge.a, edge.b))
+        return tilt_between(a, self._up_sigma(edge.a), b, self._up_sigma(edge.b), edge)
+
+    def _up_sigma(self, number: int) -> float:
+        """rad, as it is believed; large where up is not known."""
+        line = self._chart.plumb.get(number)
+        return float(np.pi) if line is None else 1 / float(np.linalg.norm(line))

@@ -1,0 +1,159 @@
+"""Two odometries against each other: what is wrong with one shows, and honest ones show nothing."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from share.geometry import se3
+from share.graph.posegraph import Edge
+from share.merge.agreement import Agreement
+from share.merge.consistency import Walked, Witness, compare, points_scale
+from share.place.scale import Scale
+
+STEP_COV = np.diag([2e-4**2] * 3 + [2e-3**2] * 3)
+LOOP_COV = np.diag([4e-3**2] * 3 + [0.02**2] * 3)
+FRAMES = 60
+
+
+def ring(phase: float) -> list:
+    """Poses round a room, nodding."""
+    out = []
+    for k in range(FRAMES):
+        angle = phase + 0.1 * k
+        R = se3.so3_exp(np.array([0, 0, angle])) @ se3.so3_exp(np.array([0.3 * np.sin(k / 5), 0, 0]))
+        out.append(se3.compose(R, np.array([3 * np.cos(angle), 2 * np.sin(angle), 1.5])))
+    return out
+
+
+def steps_of(poses: list, rng, scale: float = 1.0, drift: float = 1.0) -> list:
+    out = []
+    for before, after in itertools.pairwise(poses):
+        step = se3.inverse(before) @ after
+        step[:3, 3] *= scale
+        out.append(step @ se3.exp(drift * np.sqrt(np.diag(STEP_COV)) * rng.standard_normal(6)))
+    return out
+
+
+def chain(steps: list, sure: float = 1.0) -> list[Walked]:
+    out = [Walked.start()]
+    for step in steps:
+        out.append(out[-1].on(step, sure * STEP_COV))
+    return out
+
+
+def loops(rng, turn: float = 0.0, sure: float = 1.0, **bad) -> list[Witness]:
+    """24 of them, of which two are false, between an honest odometry and one that is `bad`."""
+    x, y = ring(0.0), ring(0.7)
+    a, b = chain(steps_of(x, rng)), chain(steps_of(y, rng, **bad), sure)
+    X = se3.exp(np.array([turn, 0, 0, 0, 0, 0]))
+    out = []
+    for n, j in enumerate(range(4, FRAMES - 8, 2)):
+        i = min(FRAMES - 1, j + 7)
+        noise = se3.exp(np.sqrt(np.diag(LOOP_COV)) * rng.standard_normal(6))
+        T = se3.inverse(x[i]) @ y[j] @ noise @ X
+        if n in (5, 11):
+            T = T @ se3.exp(np.array([0.3, 0, 0, 1.0, 2.0, 0]))
+        out.append(Witness(a[i], b[j], se3.orthonormal(T), LOOP_COV))
+    return out
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_honest_agents_show_nothing(seed):
+    found = compare(loops(np.random.default_rng(seed)))
+    assert found.path.significance < 3.5
+    assert found.turn.significance < 4
+    assert found.nis < 2
+    assert found.inside > 0.8
+
+
+@pytest.mark.parametrize("scale", [0.95, 0.97, 1.03, 1.05])
+@pytest.mark.parametrize("sure", [1.0, 0.01])
+def test_a_longer_way_is_measured(scale, sure):
+    found = compare(loops(np.random.default_rng(3), scale=scale, sure=sure))
+    assert found.path.value == pytest.approx(np.log(scale), abs=3.5 * found.path.sigma)
+    assert found.path.significance > 4.5
+
+
+def test_a_turned_camera_is_measured():
+    found = compare(loops(np.random.default_rng(4), turn=np.radians(4.0)))
+    assert np.degrees(found.turn.value) == pytest.approx(4.0, abs=1.0)
+    assert found.turn.significance > 4.5
+
+
+def test_drift_beyond_its_covariances_is_seen():
+    """Beyond the loops' own noise: 6 cm a step. What is less than that noise, no loop can tell."""
+    assert compare(loops(np.random.default_rng(5), drift=30.0, sure=0.01)).nis > 3
+
+
+def test_points_are_pooled_robustly():
+    rng = np.random.default_rng(1)
+    scales = [Scale(0.05 + 0.005 * rng.standard_normal(), 0.005) for _ in range(12)] + [Scale(-0.3, 0.005)]
+    found = points_scale(scales)
+    assert found.value == pytest.approx(0.05, abs=3 * found.sigma)
+    assert found.sigma < 0.005
+
+
+def town(scales: dict[str, float], pairs: list[tuple[str, str]]) -> tuple[Agreement, list[bool]]:
+    """Agents whose depths are so much too large, who meet so."""
+    agreement, rng, said = Agreement(0.015), np.random.default_rng(2), []
+    nodes = {name: range(10 * i, 10 * i + 10) for i, name in enumerate(scales)}
+    for numbers in nodes.values():
+        for number in numbers:
+            before = number - 1 if number > numbers[0] else None
+            step = se3.compose(np.eye(3), np.array([0.3, 0, 0]))
+            agreement.walk(number, before, step, STEP_COV)
+    for k in range(6):
+        for a, b in pairs:
+            edge = Edge(nodes[a][k], nodes[b][k], np.eye(4), LOOP_COV)
+            log = np.log(scales[b] / scales[a]) + 0.004 * rng.standard_normal()
+            said.append(agreement.witness((a, b), (nodes[a][0], nodes[b][0]), edge, Scale(log, 0.004), None))
+    return agreement, said
+
+
+THREE = [("ann", "bob"), ("eve", "ann"), ("bob", "eve")]
+
+
+@pytest.mark.parametrize("liar", ["ann", "bob", "eve"])
+@pytest.mark.parametrize("scale", [0.9, 0.95, 0.97, 1.03, 1.05])
+def test_of_three_the_one_that_is_wrong_is_set_apart(liar, scale):
+    agreement, said = town({n: scale if n == liar else 1.0 for n in ("ann", "bob", "eve")}, THREE)
+    assert agreement.apart == {liar}
+    assert any(said)
+    standing = agreement.standing(liar)
+    assert standing.state == "set apart"
+    assert ("larger" if scale > 1 else "smaller") in standing.reason
+    assert standing.log_scale == pytest.approx(np.log(scale), abs=0.015)
+    honest = {"ann", "bob", "eve"} - {liar}
+    assert all(agreement.standing(name).state == "agrees" for name in honest)
+    assert agreement.forbids([liar], honest)
+    assert not agreement.forbids(honest, honest)
+
+
+def test_honest_agents_stay_together():
+    agreement, said = town({"ann": 1.003, "bob": 1.0, "eve": 0.997}, THREE)
+    assert not agreement.apart
+    assert not agreement.disputed
+    assert not any(said)
+
+
+def test_of_two_nobody_can_say_who_is_wrong():
+    agreement, _ = town({"ann": 1.0, "eve": 1.05}, [("ann", "eve")])
+    assert not agreement.apart
+    assert agreement.disputed == {frozenset(("ann", "eve"))}
+    assert "nobody can say" in agreement.standing("ann").reason
+    assert "smaller" in agreement.standing("ann").reason
+    assert "larger" in agreement.standing("eve").reason
+
+
+def test_who_agrees_by_later_loops_is_let_in_again():
+    agreement, _ = town({"ann": 1.0, "eve": 1.04}, [("ann", "eve")])
+    assert agreement.disputed
+    for k in range(200):
+        i, j = k % 10, k // 3 % 10
+        edge = Edge(i, 10 + j, se3.compose(np.eye(3), np.array([0.3 * (j - i), 0, 0])), LOOP_COV)
+        agreement.witness(("ann", "eve"), (0, 10), edge, Scale(0.0, 0.004), None)
+    assert not agreement.disputed
+    assert not agreement.forbids(["ann"], ["eve"])
