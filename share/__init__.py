@@ -1,3 +1,3 @@
 """SHARE: user-centric collaborative SLAM for people in AR headsets and robots in one room."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -300,12 +300,13 @@ FROZEN = (m.Ping, m.Pong, m.Refused)  # the same in all versions, so that two of
 _BAD = (msgspec.MsgspecError, ValueError, OverflowError, RecursionError)
 
 
-def encode(message: m.Message, version: int = VERSION) -> list[Bytes]:
-    """Frames of a message; array frames are views on its (read-only) arrays. version: another one for a
-    message of FROZEN.
+def encode(message: m.Message, version: int | None = None) -> list[Bytes]:
+    """Frames of a message; array frames are views on its (read-only) arrays. version: ours, or another one
+    for a message of FROZEN.
 
     Raises WireError if a field does not fit the wire, so that what is sent can always be decoded.
     """
+    version = VERSION if version is None else version
     assert version == VERSION or isinstance(message, FROZEN)
     layout = _LAYOUTS[type(message)]
     arrays = [spec.get(message) for spec in layout.arrays]

@@ -86,8 +86,8 @@ def test_the_refusal_is_written_down_and_seen_on_the_page(old: int) -> None:
     ]
     assert 1 <= len(records) <= 30
     assert {record["event"] for record in records} == {"refused"}
-    (trouble,) = edge.trouble(58 * S)
-    assert f"this agent speaks wire {old}: upgrade the agent" in trouble
+    (line,) = edge.report({})["refused"]
+    assert f"this agent speaks wire {old}: upgrade the agent" in line
 
 
 def frame(k: int) -> ev.FrameTracked:

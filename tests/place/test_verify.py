@@ -8,7 +8,7 @@ from place_sim import bodies, sights
 from share.config import PlaceConfig
 from share.geometry import se3
 from share.place.verify import Refusal, Sight, Verified, verify
-from share.types import View
+from share.types import MAX_M, MAX_UV, View
 
 CONFIG = PlaceConfig()
 T_C_Q = se3.exp(np.array([0.1, -0.15, 0.05, 0.3, 0.1, -0.2]))
@@ -118,16 +118,16 @@ def test_empty_views_are_refused() -> None:
 
 @pytest.mark.parametrize("seed", range(40))
 def test_hostile_numbers_do_not_raise(seed: int) -> None:
-    """Finite values of any size, repeated, collinear or absurd, as a broken peer may send them."""
+    """Values as large as the types admit, repeated, collinear or absurd, as a broken peer may send them."""
     rng = np.random.default_rng(seed)
     query, candidate = sights(12, T_C_Q)
     uv, points = query.view.uv.copy(), query.view.points.copy()
     some = rng.random(len(uv)) < 0.5 + 0.5 * (seed % 2)
     kind = seed % 5
     if kind == 0:
-        uv[some], points[some] = 1e38, 1e38
+        uv[some], points[some] = MAX_UV, MAX_M
     elif kind == 1:
-        points[some, 2] = rng.choice([0.0, -1.0, 1e-30, 1e30], some.sum())
+        points[some, 2] = rng.choice([0.0, -1.0, 1e-30, MAX_M], some.sum())
     elif kind == 2:
         uv[some], points[some] = uv[0], points[0]
     elif kind == 3:
