@@ -48,6 +48,6 @@ class Losses:
     def lines(self) -> list[str]:
         """For a person, one a kind."""
         return [
-            f"{kind.count} {what} could not be read and were left out; the first: {kind.first}"
+            f"left out, since damaged: {kind.count} of the {what}; the first: {kind.first}"
             for what, kind in self._kinds.items()
         ]

@@ -210,8 +210,11 @@ def test_a_truth_that_is_cut_short(share, tmp_path):
     recording = make_tum(tmp_path / "kitchen")
     cut(recording / "groundtruth.txt")
     with untouched(tmp_path):
-        said = complaint(share(*as_track(recording, tmp_path / "out")), 1)
+        done = share(*as_track(recording, tmp_path / "out"))
+    said, failed = done.err.splitlines()  # the five frames of this recording show nothing
     assert "groundtruth.txt, line 4: 2 of 8 columns; the line is cut short" in said
+    assert said.startswith("share: kitchen: left out, since damaged: 1 of the lines of ")
+    assert (done.code, "none of its 5 frames could be tracked" in failed) == (1, True)
 
 
 @both
@@ -304,7 +307,8 @@ CONFIGS = {
         "tracker: {spacing_px: -1}",
         "spacing_px: expected a number from 0 to 1e+09, found -1",
     ),
-    "huge": ("tracker: {corners: 1" + 400 * "0" + "}", "tracker: corners: expected a number from 0 to 1e+09"),
+    "huge": ("tracker: {corners: 1" + 40 * "0" + "}", "tracker: corners: expected a number from 0 to 1e+09"),
+    "absurd": ("tracker: {corners: 1" + 400 * "0" + "}", "not valid YAML: a number of 401 characters"),
     "too many bits": ("place: {hash_bits: 30}", "place: hash_bits: 8 tables of 30 bits are too many words"),
     "not a number": ("link: {ping_s: .nan}", "link: ping_s: expected a number from 0 to 1e+09, found nan"),
     "infinite": ("sequencer: {sync_tolerance_ms: .inf}", "from 0 to 1e+09, found inf"),
@@ -402,7 +406,7 @@ def test_track_of_a_damaged_image(damaged, share, tmp_path):
     done = share(*as_track(damaged, tmp_path / "out"))
     assert done.code == 0
     (said,) = done.err.splitlines()
-    assert "1 frames could not be read and were left out; the first: " in said
+    assert "left out, since damaged: 1 of the frames; the first: " in said
     assert f"{damaged}/mav0/cam1/data/" in said
     assert "the image is cut short or damaged" in said
 

@@ -72,7 +72,7 @@ def test_a_flipped_bit_costs_one_chunk(tmp_path):
     source = open_source(str(broken))
     read = list(source.measurements())
     (said,) = source.losses.lines()
-    assert said.startswith(f"1 chunks of {broken} could not be read and were left out")
+    assert said.startswith(f"left out, since damaged: 1 of the chunks of {broken}; the first: ")
     assert "share dataset recover" in said
     result = recover(broken, tmp_path / "good.mcap")
     assert result.reason
