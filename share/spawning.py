@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
 
@@ -29,6 +30,28 @@ class _First:
         return _begin, (os.getpid(), children.is_main())
 
 
+@contextlib.contextmanager
+def _held() -> Iterator[None]:
+    """Signals are handled after the block: a child that is left half started writes a traceback. The mask is
+    inherited by the child and holds back this thread alone; another thread may take a signal, which Python
+    then handles in the main thread."""
+    came: list[int] = []
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _WAITING)
+    handlers = {number: signal.getsignal(number) for number in _WAITING} if children.is_main() else {}
+    for number, handler in handlers.items():
+        if callable(handler):
+            signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            if callable(handler):
+                signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number in came:
+            signal.raise_signal(number)
+
+
 def _made(first: None, kind: type[_Process], state: Mapping[str, Any]) -> _Process:
     process = kind.__new__(kind)
     process.__dict__.update(state)
@@ -39,11 +62,8 @@ class _Process(SpawnProcess):
     """It ignores SIGINT and SIGHUP from its first instruction: a terminal sends them to the whole group."""
 
     def start(self) -> None:
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, _WAITING)  # inherited
-        try:
+        with _held():
             super().start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def __reduce__(self) -> Any:
         return _made, (_First(), type(self), self.__dict__)

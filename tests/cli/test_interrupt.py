@@ -112,3 +112,27 @@ def test_an_import_is_not_interrupted(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30)
     assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted\n", "")
+
+
+def test_a_worker_is_not_left_half_started():
+    """It would say that it got no work (EOFError), with a traceback. The signal goes to another thread, which
+    does not hold it back, while the worker is started."""
+    program = (
+        "import os, signal, threading, time\n"
+        "from multiprocessing import popen_spawn_posix as spawning\n"
+        "from share.cli.unwinding import unwinding\n"
+        "from share.spawning import SPAWN\n"
+        "threading.Thread(target=time.sleep, args=(2.0,), daemon=True).start()\n"
+        "start = spawning.util.spawnv_passfds\n"
+        "def interrupted(*arguments):\n"
+        "    worker = start(*arguments)\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    time.sleep(0.1)\n"
+        "    return worker\n"
+        "spawning.util.spawnv_passfds = interrupted\n"
+        "worker = SPAWN.Process(target=print, args=('worked',))\n"
+        "try:\n    with unwinding():\n        worker.start()\n"
+        "except KeyboardInterrupt:\n    worker.join()\n    print('interrupted')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "worked\ninterrupted\n", "")

@@ -103,7 +103,14 @@ def test_health_says_who_is_there():
     assert (status, headers["Content-Type"]) == (200, "application/json")
     health = json.loads(body)
     assert 0 <= health.pop("uptime_s") < 60
-    expected = {"status": "ok", "trouble": [], "agents": ["ann"], "waiting": 3, "last_solve_s": 0.5}
+    expected = {
+        "status": "ok",
+        "trouble": [],
+        "refused": [],
+        "agents": ["ann"],
+        "waiting": 3,
+        "last_solve_s": 0.5,
+    }
     assert health == expected
 
 

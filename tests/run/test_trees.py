@@ -117,7 +117,8 @@ def test_grandchildren_follow(tmp_path):
 
 
 def _workers(pid: int) -> list[int]:
-    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    of_threads = Path(f"/proc/{pid}/task").glob("*/children")
+    children = [child for file in of_threads for child in file.read_text().split()]
     return [int(c) for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
 
 
