@@ -194,11 +194,11 @@ def _gone(root):
 
 
 ONE = {
-    "line of IMU cut": (_cut_csv, 6, 70, r"1 lines of .*imu0/data\.csv, line 72: 6 of 7 columns; the line is cut short"),  # noqa: E501
-    "NaN in the IMU": (_edit("imu0/data.csv", ",0", ",nan"), 6, 70, r"1 lines of .*line \d+: 'nan.*' is not "),  # noqa: E501
-    "NaN stamp": (_edit("cam0/data.csv", str(START_NS), "nan"), 5, 71, r"1 lines of .*cam0/data.csv, line 2: stamp 'nan'"),  # noqa: E501
+    "line of IMU cut": (_cut_csv, 6, 70, r"1 of the lines of .*imu0/data\.csv, line 72: 6 of 7 columns; the line is cut short"),  # noqa: E501
+    "NaN in the IMU": (_edit("imu0/data.csv", ",0", ",nan"), 6, 70, r"1 of the lines of .*line \d+: 'nan.*' is not "),  # noqa: E501
+    "NaN stamp": (_edit("cam0/data.csv", str(START_NS), "nan"), 5, 71, r"1 of the lines of .*cam0/data.csv, line 2: stamp 'nan'"),  # noqa: E501
     "stamp far ahead": (_edit("imu0/data.csv", "14037152", "24037152"), 6, 70, "line 2: stamp .* later than those after"),  # noqa: E501
-    "one image gone": (_gone, 5, 71, rf"1 images of .*cam1/data.csv.*: {START_NS}\.png is missing"),
+    "one image gone": (_gone, 5, 71, rf"1 of the images of .*cam1/data.csv.*: {START_NS}\.png is missing"),
 }  # fmt: skip
 
 
@@ -224,7 +224,7 @@ def test_one_damaged_line_of_a_truth_costs_itself(request, file):
     truth = source.truth()
     np.testing.assert_array_equal(truth.T, whole.T[:-1])
     (said,) = source.losses.lines()
-    assert said.startswith(f"1 lines of {path} could not be read")
+    assert said.startswith(f"left out, since damaged: 1 of the lines of {path}")
 
 
 def test_files_that_a_list_names_stay_in_its_folder(tum):
