@@ -24,6 +24,23 @@ if __name__ == "__main__":
 """
 
 
+INTERRUPTED = """
+from test_companion import doubles
+from share.run import companion
+start = companion.SPAWN.Process.start
+def interrupted(process):
+    start(process)
+    raise KeyboardInterrupt
+if __name__ == "__main__":
+    companion.SPAWN.Process.start = interrupted
+    try:
+        companion.Companion("doubles", doubles, (), lambda m: None, lambda how: None)
+    except KeyboardInterrupt as error:
+        kept = error  # as a traceback that is printed keeps it
+    print("interrupted", flush=True)
+"""
+
+
 def doubles(inbox: Inbox, answer: Callable[[Any], None]) -> None:
     while (number := inbox.get()) is not END:
         if number == "die":
@@ -65,6 +82,15 @@ def test_it_ends_with_us_however_we_end() -> None:
     while _alive(pid) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not _alive(pid)
+
+
+def test_interrupted_before_anybody_can_close_it() -> None:
+    here = os.path.dirname(__file__)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([here, *sys.path])}
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, env=environment, timeout=20
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted\n", "")
 
 
 def _alive(pid: int) -> bool:
