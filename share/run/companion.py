@@ -46,7 +46,7 @@ class Companion:
         self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._ours, self._theirs = SPAWN.Pipe()
         self._process = SPAWN.Process(target=_begin, args=(self._theirs, work, arguments), name=name)
-        # An interrupt that comes before the caller can close it: at its end Python would wait for the process.
+        # An interrupt may come before the caller can close it: Python would wait for the process at its end.
         self._unclosed = Finalize(None, _kill, args=(self._process,), exitpriority=0)
         if after_s <= 0.0:
             self._start()

@@ -43,7 +43,7 @@ def family(pid: int) -> dict[str, int]:
 
 
 def _workers(pid: int) -> list[int]:
-    """Started by any of its threads: one that is restarted after a pause is not started by the main thread."""
+    """By any of its threads: not the main thread starts one again after a pause."""
     of_threads = Path(f"/proc/{pid}/task").glob("*/children")
     children = [child for file in of_threads for child in file.read_text().split()]
     return [int(c) for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
