@@ -97,7 +97,8 @@ class AgentRun:
         self._guard = Guard(say)
         self._machine = Agent(hello, settings)
         self._prepare()
-        self._files, self._log = AgentFiles(out, say), RunLog()
+        self._files = AgentFiles(out, say)
+        self._log = RunLog(self._files.frames)
         self._errors, self._poses = Unknown() if errors is None else errors, poses
         self._late = Late(settings.agent.late_ms)
         self._lateness = Lateness(say, "the edge" if hello.streams else "this machine")
