@@ -144,11 +144,11 @@ class EdgeRun:
         now = time.monotonic()
         self._report_at = now + _REPORT_S
         kept = None if self._keeper is None else self._keeper.trouble
-        trouble = [text for text, until in self._trouble.items() if now < until]
+        self._trouble = {text: until for text, until in self._trouble.items() if now < until}
         self._report = {
             **self._machine.report(self._mapped),
             "refused_handshakes": self._refused.total(),
-            "trouble": [*trouble, *([] if kept is None else [kept])],
+            "trouble": [*self._trouble, *([] if kept is None else [kept])],
             "uptime_s": round((time.monotonic_ns() - self._began_ns) * 1e-9, 3),
             **({} if self._solved_at is None else {"last_solve_s": round(now - self._solved_at, 3)}),
         }
