@@ -36,7 +36,7 @@ class Spool:
         self._file.write(line)
 
     def read(self) -> Iterator[str]:
-        """All lines in order, without those that could not be written. Raises ShareError if the disk fails."""
+        """Lines in order, but for those that could not be written. Raises ShareError if the disk fails."""
         if self._file is None or self._reading is None:
             return
         at, cut = 0, b""
@@ -59,9 +59,12 @@ class Spool:
             self._reading = None
 
     def _opened(self, path: Path) -> IO[bytes]:
-        file = tempfile.TemporaryFile(dir=_lasting()) if self._path is None else fresh(path)
+        file = self._nameless() if self._path is None else fresh(path)
         self._reading = os.dup(file.fileno())
         return file
+
+    def _nameless(self) -> IO[bytes]:
+        return tempfile.TemporaryFile(dir=_lasting())
 
     def _part(self, at: int, size: int) -> bytes:
         assert self._file is not None and self._reading is not None

@@ -20,8 +20,10 @@ from share.types import F64, I64, TrackState
 
 CSV_HEADER = "stamp_ns,track_ms,corrected_ms,state,keyframe,sent"
 _LINE = np.dtype(
-    [("stamp_ns", "i8"), ("track_ms", "f8"), ("corrected_ms", "f8"), ("state", "S14")]
-    + [("keyframe", "i1"), ("sent", "i1")]
+    [
+        *(("stamp_ns", "i8"), ("track_ms", "f8"), ("corrected_ms", "f8")),
+        *(("state", "S14"), ("keyframe", "i1"), ("sent", "i1")),
+    ]
 )
 _AT_ONCE = 65_536  # lines
 

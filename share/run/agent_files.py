@@ -70,8 +70,9 @@ class AgentFiles:
         correction after the last frame does not change that. Raises ShareError if the disk was full: then the
         report, too, is of a part of the frames only."""
         files = list(self._open.values())
-        for file in [*files, self.frames]:
+        for file in files:
             file.check()  # what there is stays, as .partial
+        self.frames.check()
         self._close()
         if self._out is None:
             return

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
+
 from share.core.history import History
 from share.estimator.result import TrackResult
 from share.evaluator.features import features
@@ -16,7 +18,6 @@ from share.evaluator.odometer import Fared, Lately, Odometer
 from share.metrics.latency import summary
 from share.metrics.local_error import LocalError
 from share.types import U8, Candidate, Footing, Frame
-
 
 _TIMES = 50_000  # estimates that a report is about, the newest: hours, at two keyframes a second
 
@@ -135,7 +136,8 @@ class ByModel(AtOnce):
         self._thread.join(timeout=2)
 
     def report(self) -> dict[str, Any]:
-        told = {"estimate_ms": summary(self._ms.column(0)).report(), "drop_estimate": self._dropped}
+        took = summary(np.array(self._ms.column(0), float))
+        told = {"estimate_ms": took.report(), "drop_estimate": self._dropped}
         return {"error_model": {**told, "strange": self._strange}}
 
     def _work(self) -> None:
