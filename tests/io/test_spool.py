@@ -13,7 +13,7 @@ from share.metrics.runlog import RunLog
 from share.run.agent_files import AgentFiles
 from share.types import TrackState
 
-LINES = [f"line {k}, {'é' * (k % 50)}" for k in range(60_000)]  # more than is read at once
+LINES = [f"line {k}, {'é' * (k % 50)}" for k in range(30_000)]  # more than is read at once
 
 
 @pytest.mark.parametrize("in_a_folder", [True, False])
