@@ -34,6 +34,7 @@ from share.io.pose_feed import PoseFeed
 from share.io.source import Source
 from share.io.transport import AgentLink
 from share.metrics.runlog import RunLog
+from share.process import Heap
 from share.run.agent_files import AgentFiles
 from share.run.arrivals import Arrivals, Played, Seen
 from share.run.errors import Errors, Unknown
@@ -216,7 +217,9 @@ class AgentRun:
     # ------------------------------------------------------------------ main
 
     def _loop(self) -> None:
+        heap = Heap()
         while not self._ended and not self._is_overdue():
+            heap.tidy(time.monotonic())
             self._listen()
             while not self._shared.inbox.empty():
                 self._take(self._shared.inbox.get())
