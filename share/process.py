@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
+from typing import Any
 
 from share import children
 
@@ -20,6 +22,7 @@ _THREADS = (
 )
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # mallopt(3) parameter numbers
 _KEEP_BYTES = 512 * 1024 * 1024
+_TIDY_S = 60.0
 
 
 def prepare() -> None:
@@ -29,12 +32,34 @@ def prepare() -> None:
     for name in _THREADS:
         os.environ.setdefault(name, "1")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
-    if sys.platform == "linux":
-        import ctypes
-
-        try:
-            mallopt = ctypes.CDLL(None).mallopt
-        except AttributeError:  # a C library other than glibc
-            return
+    if (mallopt := _of_glibc("mallopt")) is not None:
         mallopt(_M_MMAP_THRESHOLD, _KEEP_BYTES)
         mallopt(_M_TRIM_THRESHOLD, _KEEP_BYTES)
+
+
+class Heap:
+    """Of a process that runs for hours. What `prepare` keeps from going back to the kernel lies ever more
+    scattered among what is in use, so memory would grow though nothing is held: once a minute, what is free
+    goes back (a millisecond, and a slower frame after it)."""
+
+    def __init__(self) -> None:
+        self._trim = _of_glibc("malloc_trim")
+        self._due_s: float | None = None
+
+    def tidy(self, now_s: float) -> None:
+        """To be called often, with a monotonic time."""
+        if self._due_s is not None and now_s < self._due_s:
+            return
+        if self._due_s is not None and self._trim is not None:
+            self._trim(0)
+        self._due_s = now_s + _TIDY_S
+
+
+def _of_glibc(name: str) -> Callable[..., Any] | None:
+    """None with another C library."""
+    if sys.platform != "linux":
+        return None
+    import ctypes
+
+    found: Callable[..., Any] | None = getattr(ctypes.CDLL(None), name, None)
+    return found

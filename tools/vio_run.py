@@ -94,13 +94,13 @@ def series(source: Source, told: Told) -> Series:
 
 def figures(source: Source, told: Told, found: Series) -> dict[str, Any]:
     """All of a run's; accuracies are None where there are too few poses to speak of any."""
-    report, states = told.log.report(), [row.state for row in told.log.rows]
+    report, frames = told.log.report(), told.log.frames()
     return {
         "frames": report["frames"],
         "told": report["tracked"] / report["frames"],
         "with_truth": len(found.stamps_ns),
         **accuracy(source, told, found),
-        "states": {str(state): states.count(state) / len(states) for state in TrackState},
+        "states": {str(state): int(frames.has(state).sum()) / len(frames) for state in TrackState},
         "lost_s": report["lost_s"],
         "init_s": report["init_s"],
         "new_stretches": max(report["stretches"] - 1, 0),

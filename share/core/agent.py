@@ -12,21 +12,21 @@ from typing import Any
 
 from share.config import Config
 from share.core import events as ev
+from share.core.belief import Belief
 from share.core.chain import Chain
 from share.core.clock_claim import ClockClaim
 from share.core.ledger import Entry, Ledger
 from share.core.lines import Lines
 from share.core.lives import Lives
-from share.core.map_frame import MapFrame
 from share.core.own_error import OwnError
 from share.core.own_status import OwnStatus
 from share.core.pings import Pings
 from share.core.rate import Every, TokenBucket, seconds
 from share.core.streaming import Streaming
 from share.core.versions import EdgeVersion
+from share.core.whereabouts import Whereabouts, pose_update
 from share.core.worth import Worth
 from share.errors import UsageError, VersionError, WireError
-from share.geometry.se3 import inverse
 from share.types import F64, Correction, Keyframe
 from share.wire import messages as m
 from share.wire.codec import Bytes, decode, encode, size
@@ -54,14 +54,12 @@ class Agent:
         self._ledger = Ledger(config.agent, link)
         self._bucket = TokenBucket(config.agent.rate_burst)
         self._worth = Worth()
-        self._map = MapFrame(config.agent)
+        self._where = Whereabouts(config.agent)
         self._error = OwnError(config.agent.tell_placement)
         self._streaming = Streaming(config.stream) if hello.streams else None
         self._pings = Pings(link, config.clock)
         self._hello_timer = Every(link.hello_s)
-        self._T_odom_body: F64 | None = None
         self._status = OwnStatus(link.ping_s, hello.streams)
-        self._stretch = 0  # of odometry, in the order in which they began
         self._connected = False
         self._lives = Lives()
         self._refusal: str | None = None  # the edge's last
@@ -70,6 +68,7 @@ class Agent:
         self._silence_said = False
         self._edge_version = EdgeVersion()
         self._lines = Lines()
+        self._belief = Belief(self._ledger, self._lives, self._lines, self._add_line)
         self._now_ns = 0  # of the newest event
         self._finish_by_ns: int | None = None
         self._ended = False
@@ -122,6 +121,7 @@ class Agent:
         """Counters and the present state, as plain data."""
         return {
             **{name: self._counts[name] for name in _COUNTED},
+            "bad_messages": self._belief.bad_messages,
             **{name: self._ledger.counts[name] for name in _BOOKED},
             **(self._streaming.report() if self._streaming else {}),
             "keyframes": self._chain.next_id,
@@ -129,7 +129,7 @@ class Agent:
             "rate_hz": self._bucket.hz,
             "connected": self._connected,
             "edge_sessions": len(self._lives),
-            "map_id": self._map.map_id,
+            "map_id": self._where.frame.map_id,
             "revision": self._lives.revision,
             "refusal": self._refusal,
             **self._pings.clock.report(),
@@ -149,8 +149,7 @@ class Agent:
         self._status.tracked(frame, now_ns)
         if frame.new_stretch:
             self._chain.break_off()
-            self._map.forget()
-            self._stretch += 1
+            self._where.break_off()
         if frame.T_odom_body is not None and frame.state.has_pose:
             self._localised(frame, frame.T_odom_body, now_ns)
         if self._streaming or not frame.keyframe:
@@ -175,36 +174,21 @@ class Agent:
         if self._connected and (clock := self._pings.clock).rtt_ms is not None:
             self._send(
                 self._error.evaluation(
-                    keyframe.id, clock.rtt_ms, frame.error_cm, self._T_odom_body, self._map, now_ns
+                    keyframe.id,
+                    clock.rtt_ms,
+                    frame.error_cm,
+                    self._where.T_odom_body,
+                    self._where.frame,
+                    now_ns,
                 )
             )
 
     def _localised(self, frame: ev.FrameTracked, T_odom_body: F64, now_ns: int) -> None:
-        self._T_odom_body = T_odom_body
-        T_map_odom = self._map.at(now_ns)
-        self._effects.append(
-            ev.Localised(
-                frame.index,
-                frame.stamp_ns,
-                frame.arrived_ns,
-                self._stretch,
-                T_odom_body,
-                T_map_odom,
-                self._map.map_id,
-                frame.state,
-            )
-        )
+        self._effects.append(self._where.localised(frame, T_odom_body, now_ns))
         if self._connected and not self._streaming:
             self._counts["poses"] += 1
-            self._send(self._pose_update(frame, T_odom_body))
-
-    def _pose_update(self, frame: ev.FrameTracked, T_odom_body: F64) -> m.PoseUpdate:
-        """Relative to the last keyframe that the edge has, if it is of the present stretch."""
-        last = self._ledger.last_acknowledged
-        if last is None or last.keyframe.id < self._chain.first_of_stretch:
-            return m.PoseUpdate(frame.stamp_ns, frame.state, -1, T_odom_body)
-        T_keyframe_body = inverse(last.keyframe.T_odom_body) @ T_odom_body
-        return m.PoseUpdate(frame.stamp_ns, frame.state, last.keyframe.id, T_keyframe_body)
+            last, first = self._ledger.last_acknowledged, self._chain.first_of_stretch
+            self._send(pose_update(frame, T_odom_body, last, first))
 
     def _frame_done(self, frame: ev.FrameTracked, sent: bool) -> None:
         self._effects.append(ev.FrameDone(frame.stamp_ns, frame.track_ms, frame.state, frame.keyframe, sent))
@@ -216,7 +200,7 @@ class Agent:
         try:
             message = self._decode(event.frames)
         except WireError as error:
-            self._complain(f"a message from the edge is not understood: {error}")
+            self._belief.complain(f"a message from the edge is not understood: {error}", now_ns)
             return
         if message is None:
             return
@@ -227,7 +211,7 @@ class Agent:
             case m.Refused():
                 self._refused(message, now_ns)
             case m.Ack():
-                self._acknowledged(message)
+                self._belief.take(message, now_ns)
             case Correction():
                 self._corrected(message, now_ns)
             case m.Rate():
@@ -237,7 +221,8 @@ class Agent:
             case m.Tracked() if self._streaming:
                 self._tracked_afar(message, self._streaming, now_ns)
             case _:
-                self._complain(f"the edge sent a {type(message).__name__}, which is not for this agent")
+                what = f"a {type(message).__name__}, which is not for this agent"
+                self._belief.complain(f"the edge sent {what}", now_ns)
 
     def _decode(self, frames: Sequence[Bytes]) -> m.Message | None:
         """None for what an edge of an older version says, of which a person is told. Raises WireError."""
@@ -249,27 +234,8 @@ class Agent:
                 self._say(f"{line}; {self._alone}")
             return None
 
-    def _complain(self, text: str) -> None:
-        """Counts a bad message; says each kind once."""
-        self._counts["bad_messages"] += 1
-        self._add_line(self._lines.complain(text, self._now_ns))
-
-    def _is_unsent(self, what: str, *keyframes: int) -> bool:
-        """Whether the edge speaks of a keyframe that it cannot know of; then the message is not believed."""
-        unsent = max(keyframes, default=-1) >= self._ledger.next_unsent
-        if unsent:
-            self._complain(f"the edge sent {what} of keyframes that were never sent; it is not believed")
-        return unsent
-
-    def _acknowledged(self, ack: m.Ack) -> None:
-        if not self._ledger.acknowledge(ack):
-            self._is_unsent("an acknowledgement", ack.next_keyframe - 1, *ack.held)
-
     def _welcomed(self, welcome: m.Welcome, now_ns: int) -> None:
-        if self._lives.is_over(welcome.session) or self._is_unsent("a welcome", welcome.next_keyframe - 1):
-            return
-        if self._lives.is_unasked(welcome.session):
-            self._complain("the edge sent a welcome that nobody asked for; it is not believed")
+        if not self._belief.welcomes(welcome, now_ns):
             return
         returned, self._connected, self._silence_said = not self._connected, True, False
         self._edge_version.answered()
@@ -306,28 +272,16 @@ class Agent:
         self._say(f"{text}; {self._alone}")
 
     def _corrected(self, correction: Correction, now_ns: int) -> None:
-        if self._is_unsent("a correction", correction.about, correction.answers):
+        if not self._belief.corrects(correction, now_ns):
             return
         of_now = self._connected and correction.about >= self._chain.first_of_stretch  # of odometry
         if not (of_now and self._lives.is_newer(correction.revision)):
             self._counts["corrections_stale"] += 1
             return
         self._counts["corrections"] += 1
-        T_odom_body = correction.T_map_odom if self._T_odom_body is None else self._T_odom_body
-        new_map = self._map.correct(correction, T_odom_body, now_ns)
         self._error.drift.answered(correction.answers)
         entry, corrected_ms = self._ledger.answered(correction.answers, now_ns)
-        self._effects.append(
-            ev.CorrectionApplied(
-                entry.keyframe.id if entry else None,
-                entry.frame if entry else None,
-                entry.keyframe.stamp_ns if entry else None,
-                corrected_ms,
-                correction.map_id,
-                correction.revision,
-                new_map,
-            )
-        )
+        self._effects.append(self._where.correct(correction, entry, corrected_ms, now_ns))
 
     def _tracked_afar(self, answer: m.Tracked, streaming: Streaming, now_ns: int) -> None:
         frame = streaming.tracked(answer, now_ns)
@@ -412,8 +366,8 @@ class Agent:
         return "nobody tracks this agent" if self._streaming else "tracking goes on alone"
 
     def _say(self, text: str) -> None:
-        self._add_line(self._lines.say(text, self._now_ns))
+        if (line := self._lines.say(text, self._now_ns)) is not None:
+            self._add_line(line)
 
-    def _add_line(self, line: str | None) -> None:
-        if line is not None:
-            self._effects.append(ev.Say(line))
+    def _add_line(self, line: str) -> None:
+        self._effects.append(ev.Say(line))

@@ -7,7 +7,7 @@ own and answers with findings; what must survive a crash goes to the keeper, whi
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -21,7 +21,6 @@ from share.core.edge_events import (
     Event,
     Found,
     Join,
-    Keep,
     Kept,
     Present,
     Received,
@@ -29,11 +28,12 @@ from share.core.edge_events import (
     Tick,
 )
 from share.core.finding import Finding
-from share.core.inorder import InOrder
 from share.core.keeping import Change, KeepKeyframe, KeepRun
 from share.core.peer import Known, Peer, Refusals, refused_lines
 from share.core.rate import seconds
 from share.core.records import Records
+from share.core.runs import Runs
+from share.core.safekeeping import Safekeeping
 from share.core.schedule import Schedule
 from share.core.versions import OtherVersions
 from share.errors import VersionError, WireError, describe
@@ -41,8 +41,6 @@ from share.strict import to_mapping
 from share.types import Keyframe
 from share.wire import messages as wire
 from share.wire.codec import VERSION, decode, encode
-
-_MAX_IDLE_RUNS = 256  # gone without a keyframe; the oldest is forgotten
 
 
 class Edge:
@@ -62,23 +60,19 @@ class Edge:
         known: Sequence[Known] = (),
         began_ns: int | None = None,
     ) -> None:
-        self._config, self._session, self._keeps = config, session, keeps
-        self._peers: dict[bytes, Peer] = {}
-        self._by_key: dict[str, bytes] = {}
-        self._latest: dict[str, Peer] = {}  # run of each name
+        self._config, self._session = config, session
+        self._runs = Runs()
         self._schedule = Schedule(config.control, config.edge.policy)
         self._strangers: Counter[str] = Counter()
         self._strangers_refused = Refusals()
         self._admission = Admission(config.edge, self.tracks)
         self._records, self._versions = Records(began_ns), OtherVersions()
         self._internal_errors = 0
-        self._ticket = 0
-        self._unsafe: deque[tuple[int, Peer, int]] = deque()  # ticket, and what is safe once it is kept
-        self._kept_to = 0  # the newest ticket that is kept
+        self._safekeeping = Safekeeping(keeps)
         self._effects: list[Effect] = []
         self._now_ns = 0  # of the newest event
         for run in known:
-            self._recall(run)
+            self._runs.recall(run)
 
     def handle(self, event: Event, now_ns: int) -> list[Effect]:
         """What `event` leads to. `now_ns` is the edge's clock and never goes back.
@@ -94,7 +88,7 @@ class Edge:
 
     def _failed(self, event: Event, error: Exception, now_ns: int) -> None:
         self._internal_errors += 1
-        peer = self._peers.get(event.peer) if isinstance(event, Received) else None
+        peer = self._runs.get(event.peer) if isinstance(event, Received) else None
         reason = f"{type(event).__name__}: {describe(error)}"
         if peer is not None:
             peer.refusals.add(reason, now_ns)
@@ -109,14 +103,14 @@ class Edge:
                 for finding in event.findings:
                     self._found(finding, now_ns)
             case Kept():
-                self._kept(event.ticket)
+                self._acknowledge(*self._safekeeping.kept(event.ticket))
             case Tick():
                 self._notice_silence(now_ns)
 
     # ------------------------------------------------------------------ messages
 
     def _receive(self, event: Received, now_ns: int) -> None:
-        peer = self._peers.get(event.peer)
+        peer = self._runs.get(event.peer)
         counts = self._counts(peer)
         counts["bytes_up"] += sum(len(frame) for frame in event.frames)
         try:
@@ -187,7 +181,7 @@ class Edge:
             self._record_seldom(now_ns, "back", peer, "is heard again")
 
     def _notice_silence(self, now_ns: int) -> None:
-        for peer in self._peers.values():
+        for peer in self._runs.values():
             if not peer.gone and now_ns - peer.heard_ns > seconds(self._config.edge.silent_s):
                 self._gone(peer, "silent", f"nothing heard for {self._config.edge.silent_s:g} s", now_ns)
 
@@ -204,20 +198,21 @@ class Edge:
         if (reason := self._objection(event, hello, now_ns)) is not None:
             self._refuse(peer_id, reason, now_ns)
             return
-        if peer_id not in self._peers:
-            self._forget_idle()
-            self._enter(peer_id, Peer(hello, new_key(hello, self._by_key), now_ns))
+        if peer_id not in self._runs:
+            if (idle := self._runs.forget_idle()) is not None:
+                self._forget(*idle)
+            self._enter(peer_id, Peer(hello, new_key(hello, self._runs.by_key), now_ns))
             self._schedule.begin(hello.name)
             joined = f"{hello.kind} '{hello.name}'"
-            self._record_seldom(now_ns, "joined the edge", self._peers[peer_id], joined)
-        self._welcome(peer_id, self._peers[peer_id], now_ns)
+            self._record_seldom(now_ns, "joined the edge", self._runs[peer_id], joined)
+        self._welcome(peer_id, self._runs[peer_id], now_ns)
 
     def _objection(self, event: Received, hello: wire.Hello, now_ns: int) -> str | None:
-        return self._admission.objection(event, hello, self._peers, now_ns)
+        return self._admission.objection(event, hello, self._runs, now_ns)
 
     def _refuse(self, peer_id: bytes, reason: str, now_ns: int, version: int = VERSION) -> None:
         self._send(peer_id, wire.Refused(reason), version)
-        self._refusals(self._peers.get(peer_id)).add(reason, now_ns)
+        self._refusals(self._runs.get(peer_id)).add(reason, now_ns)
         self._record_seldom(now_ns, "refused", None, reason)
 
     def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
@@ -228,31 +223,13 @@ class Edge:
             self._correct(peer_id, peer, peer.newest, now_ns, again=True)
 
     def _enter(self, peer_id: bytes, peer: Peer) -> None:
-        self._know(peer_id, peer)
+        self._runs.add(peer_id, peer)
         self._keep(KeepRun(peer.key, peer.hello))
         self._effects.append(Join(peer.key, peer.hello))
 
-    def _recall(self, run: Known) -> None:
-        """A run of an earlier life: it is not here, but may go on where it was."""
-        peer_id, asked = wire.peer_id(run.hello.run_id), run.next_keyframe
-        peer = Peer(run.hello, run.key, 0, InOrder(asked), asked, run.foot, gone=True, greeted=False)
-        peer.newest = run.finding
-        self._know(peer_id, peer)
-
-    def _know(self, peer_id: bytes, peer: Peer) -> None:
-        self._peers[peer_id] = self._latest[peer.hello.name] = peer
-        self._by_key[peer.key] = peer_id
-
-    def _forget_idle(self) -> None:
-        """Whoever joins again and again without a keyframe fills no memory."""
-        idle = [(peer.heard_ns, peer_id) for peer_id, peer in self._peers.items() if peer.is_idle]
-        if len(idle) >= _MAX_IDLE_RUNS:
-            self._forget(self._peers.pop(min(idle)[1]))
-
-    def _forget(self, peer: Peer) -> None:
-        del self._by_key[peer.key]
-        if self._latest[peer.hello.name] is peer:
-            del self._latest[peer.hello.name]
+    def _forget(self, peer: Peer, was_latest: bool) -> None:
+        """Of a run that was never of use."""
+        if was_latest:
             self._schedule.drop(peer.hello.name)
 
     # ------------------------------------------------------------------ keyframes
@@ -261,10 +238,9 @@ class Edge:
         applicable = self._in_order(peer, keyframe, now_ns)
         for ready in applicable:
             peer.counts["keyframes"] += 1
-            peer.unsafe += 1
             self._apply(peer, ready, now_ns)
-            self._unsafe.append((self._ticket, peer, ready.id + 1))
-        self._kept(self._kept_to if self._keeps else self._ticket)
+            self._safekeeping.applied(peer, ready.id)
+        self._acknowledge(*self._safekeeping.safe())
         if not applicable:  # the others are acknowledged once they are safe
             self._acknowledge(peer)
 
@@ -292,24 +268,13 @@ class Edge:
         self._effects.append(Add(peer.key, keyframe))
 
     def _keep(self, *changes: Change) -> None:
-        if self._keeps and changes:
-            self._ticket += 1
-            self._effects.append(Keep(self._ticket, changes))
+        if (keep := self._safekeeping.keep(changes)) is not None:
+            self._effects.append(keep)
 
-    def _kept(self, ticket: int) -> None:
-        """Acknowledge what is safe now."""
-        self._kept_to = max(self._kept_to, ticket)
-        told = {}
-        while self._unsafe and self._unsafe[0][0] <= ticket:
-            _, peer, next_keyframe = self._unsafe.popleft()
-            peer.safe = next_keyframe
-            peer.unsafe -= 1
-            told[peer.key] = peer
-        for peer in told.values():
-            self._acknowledge(peer)
-
-    def _acknowledge(self, peer: Peer) -> None:
-        self._send(self._by_key[peer.key], peer.inorder.ack(peer.safe))
+    def _acknowledge(self, *peers: Peer) -> None:
+        """What is safe of them by now."""
+        for peer in peers:
+            self._send(self._runs.by_key[peer.key], peer.inorder.ack(peer.safe))
 
     def _evaluated(self, peer_id: bytes, peer: Peer, told: wire.Evaluation, now_ns: int) -> None:
         peer.counts["evaluations"] += 1
@@ -322,9 +287,9 @@ class Edge:
 
     def _found(self, finding: Finding, now_ns: int) -> None:
         """Write down what the mapper decided, and send what follows from it."""
-        if (peer_id := self._by_key.get(finding.agent)) is None:  # forgotten meanwhile
+        if (peer_id := self._runs.by_key.get(finding.agent)) is None:  # forgotten meanwhile
             return
-        peer = self._peers[peer_id]
+        peer = self._runs[peer_id]
         if finding.correction is None:
             record = self._record_seldom if finding.what == "job failed" else self._record
             record(now_ns, finding.what, peer, finding.reason)
@@ -350,7 +315,7 @@ class Edge:
 
     def _send(self, peer_id: bytes, message: wire.Down, version: int = VERSION) -> None:
         frames = encode(message, version)
-        self._counts(self._peers.get(peer_id))["bytes_down"] += sum(len(frame) for frame in frames)
+        self._counts(self._runs.get(peer_id))["bytes_down"] += sum(len(frame) for frame in frames)
         self._effects.append(Send(peer_id, frames))
 
     def _counts(self, peer: Peer | None) -> Counter[str]:
@@ -371,11 +336,11 @@ class Edge:
 
     def series(self) -> dict[str, Any]:
         """Of every agent, its evaluations and what came of them (`share.core.schedule`)."""
-        return {peer.hello.name: self._schedule.series(peer.hello.name) for peer in self._peers.values()}
+        return {peer.hello.name: self._schedule.series(peer.hello.name) for peer in self._runs.values()}
 
     def _report_of(self, peer: Peer) -> dict[str, Any]:
         """What is known of it beside what was heard."""
-        is_latest = self._latest[peer.hello.name] is peer
+        is_latest = self._runs.is_latest(peer)
         return self._schedule.report(peer.hello.name) if is_latest else dict.fromkeys(Schedule.REPORTED)
 
     def report(self, mapped: dict[str, Any]) -> dict[str, Any]:
@@ -388,13 +353,13 @@ class Edge:
             "policy": self._config.edge.policy,
             **mapped,
             "agents": {
-                peer.hello.name if self._latest[peer.hello.name] is peer else peer.key: peer.report(now_ns)
+                peer.hello.name if self._runs.is_latest(peer) else peer.key: peer.report(now_ns)
                 | self._report_of(peer)
                 | of_agents.get(peer.key, {})
-                for peer in self._peers.values()
+                for peer in self._runs.values()
             },
             "strangers": dict(self._strangers),
-            "refused": refused_lines(self._peers.values(), self._strangers_refused, now_ns),
+            "refused": refused_lines(self._runs.values(), self._strangers_refused, now_ns),
             "internal_errors": self._internal_errors,
             "version": __version__,
             "config": to_mapping(self._config),

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Any, ClassVar, NamedTuple
 
 from share.config import ControlConfig
 from share.control.policies import POLICIES
 from share.control.qoe import Needs, qoe
+from share.core.history import History
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 
@@ -31,7 +31,7 @@ class Schedule:
 
     def __init__(self, config: ControlConfig, policy: str) -> None:
         self._config, self._policy = config, POLICIES[policy](config)
-        self._rated: dict[str, deque[Rated]] = {}  # of all runs of that name
+        self._rated: dict[str, History] = {}  # of all runs of that name
         self._newest: dict[str, Rated] = {}  # of the present one
 
     def begin(self, agent: str) -> None:
@@ -51,7 +51,7 @@ class Schedule:
         rate_hz = self._policy.rate(agent, kind, told.delay_ms, told.error_cm, now_ns)
         value = qoe(told.delay_ms, told.error_cm, Needs.of(self._config, kind, agent))
         rated = Rated(*(_rounded(x) for x in (t_s, told.delay_ms, told.error_cm, value, rate_hz)))
-        self._rated.setdefault(agent, deque(maxlen=_REMEMBERED)).append(rated)
+        self._rated.setdefault(agent, History(len(rated), _REMEMBERED)).add(rated)
         self._newest[agent] = rated
         return rate_hz
 
@@ -62,8 +62,8 @@ class Schedule:
 
     def series(self, agent: str) -> dict[str, list[float | None]]:
         """edge.json's `series`: a list for each column of `Rated`."""
-        rated = self._rated.get(agent, ())
-        return {name: [getattr(one, name) for one in rated] for name in Rated._fields}
+        rated = self._rated.get(agent, History(len(Rated._fields), 0))
+        return {name: rated.column(k) for k, name in enumerate(Rated._fields)}
 
 
 def _rounded(value: float | None) -> float | None:

@@ -42,13 +42,13 @@ class TrackingEdge(Edge):
             case Ready() | Answered() | Lost():
                 afar = self._afar[event.key]
                 if event.life == afar.life and afar.is_running:
-                    self._hear(self._by_key[event.key], afar, event, now_ns)
+                    self._hear(self._runs.by_key[event.key], afar, event, now_ns)
             case _:
                 super()._react(event, now_ns)
 
     def _hear(self, peer_id: bytes, afar: Afar, event: Ready | Answered | Lost, now_ns: int) -> None:
         """Its tracker says so."""
-        peer = self._peers[peer_id]
+        peer = self._runs[peer_id]
         match event:
             case Ready():
                 afar.is_ready = True
@@ -78,7 +78,7 @@ class TrackingEdge(Edge):
             self._complain(peer, str(error), now_ns)
 
     def _objection(self, event: Received, hello: wire.Hello, now_ns: int) -> str | None:
-        known = self._peers.get(event.peer)
+        known = self._runs.get(event.peer)
         return super()._objection(event, hello, now_ns) or self._full(None if known is None else known.key)
 
     def _full(self, key: str | None) -> str | None:
@@ -90,12 +90,12 @@ class TrackingEdge(Edge):
         return f"this machine can track {most}: {self._room.why}; wait until one leaves"
 
     def _enter(self, peer_id: bytes, peer: Peer) -> None:
-        self._know(peer_id, peer)
+        self._runs.add(peer_id, peer)
         window = Window(self._config.stream.window)
         self._afar[peer.key] = Afar(peer.key, peer.hello.rig, window)
 
-    def _forget(self, peer: Peer) -> None:
-        super()._forget(peer)
+    def _forget(self, peer: Peer, was_latest: bool) -> None:
+        super()._forget(peer, was_latest)
         del self._afar[peer.key]
 
     def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
@@ -109,7 +109,7 @@ class TrackingEdge(Edge):
         was_gone = peer.gone
         super()._heard(peer, now_ns)
         if was_gone and (reason := self._full(peer.key)) is not None:
-            self._send(self._by_key[peer.key], wire.Refused(reason))
+            self._send(self._runs.by_key[peer.key], wire.Refused(reason))
         elif was_gone:
             self._do(self._afar[peer.key].begin())
 

@@ -99,7 +99,7 @@ def fresh(path: Path) -> IO[bytes]:
     return os.fdopen(os.open(path, _FRESH, 0o666), "wb")
 
 
-_FRESH = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_FRESH = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 def claim(folder: Path) -> int:

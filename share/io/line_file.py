@@ -20,13 +20,16 @@ class LineFile:
     more is tried: what is there stays, in whole lines.
     """
 
-    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
+    def __init__(
+        self, path: Path, say: Callable[[str], None], opened: Callable[[Path], IO[bytes]] = fresh
+    ) -> None:
+        """opened: makes the file; may raise OSError."""
         self.path, self._say = path, say
+        self.whole_bytes = 0  # of whole lines
         self._file: IO[str] | None = None
-        self._whole_bytes = 0
         self._failure = ""
         try:
-            self._file = io.TextIOWrapper(fresh(path), "utf-8", line_buffering=True)
+            self._file = io.TextIOWrapper(opened(path), "utf-8", line_buffering=True)
         except OSError as error:
             self._fail(error)
 
@@ -36,7 +39,7 @@ class LineFile:
             return
         try:
             self._file.write(line + "\n")
-            self._whole_bytes += len(line.encode()) + 1
+            self.whole_bytes += len(line.encode()) + 1
         except OSError as error:
             self._fail(error)
 
@@ -57,5 +60,5 @@ class LineFile:
                 self._file.close()
             self._file = None
             with contextlib.suppress(OSError):  # a device has no end to cut off
-                os.truncate(self.path, self._whole_bytes)
+                os.truncate(self.path, self.whole_bytes)
         self._say(f"{self.path}: cannot be written: {self._failure}; the run goes on without it")

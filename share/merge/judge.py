@@ -94,7 +94,8 @@ class Judge:
         return tuple(fitting)
 
     def forget(self, gone: Collection[Key]) -> None:
-        """Loops of these keyframes are waited with no longer."""
+        """Loops of these keyframes, which the chart has no more, are waited with no longer."""
+        self._alike.intersection_update(self._chart.poses)
         self.waiting = [loop for loop in self.waiting if loop.pair.isdisjoint(gone)]
         self.rebels = [loop for loop in self.rebels if loop.pair.isdisjoint(gone)]
 

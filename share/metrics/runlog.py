@@ -4,62 +4,64 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
-import numpy as np
-
+from share.metrics.frame_columns import CSV_HEADER, FrameColumns, line_of_correction, line_of_frame, read
 from share.metrics.latency import latency
 from share.types import TrackState, Wait
 
-CSV_HEADER = "stamp_ns,track_ms,corrected_ms,state,keyframe,sent"
+
+class Lines(Protocol):
+    """Where the lines of a run go, and come from again."""
+
+    def write(self, line: str) -> None:
+        """One more, without its end."""
+
+    def read(self) -> Iterable[str]:
+        """All of them, in order."""
 
 
-@dataclass
-class FrameRow:
-    """One line of latency.csv. corrected_ms is NaN until a correction based on this frame arrives."""
+class InMemory:
+    """For runs that end before that matters."""
 
-    stamp_ns: int
-    track_ms: float
-    state: TrackState
-    keyframe: bool
-    sent: bool = False
-    corrected_ms: float = math.nan
+    def __init__(self) -> None:
+        self._lines: list[str] = []
 
-    def csv(self) -> str:
-        corrected = "" if math.isnan(self.corrected_ms) else f"{self.corrected_ms:.3f}"
-        return (
-            f"{self.stamp_ns},{self.track_ms:.3f},{corrected},{self.state},"
-            f"{int(self.keyframe)},{int(self.sent)}"
-        )
+    def write(self, line: str) -> None:
+        self._lines.append(line)
+
+    def read(self) -> Iterable[str]:
+        return self._lines
 
 
 @dataclass
 class RunLog:
-    """Rows in order of their stamps once read; marks come later, by the frame's stamp."""
+    """Frames as their fate becomes known; corrections come later, and name the frame by its stamp.
 
-    _rows: list[FrameRow] = field(default_factory=list)
+    Nothing of a frame is kept but its line in `lines`: a run of hours takes no more memory than one of
+    seconds, until its report is made.
+    """
+
+    lines: Lines = field(default_factory=InMemory)
     cpu_s: float = 0.0  # process CPU time of the tracking pipeline
     decode_s: float = 0.0  # CPU time of image decoding
     contradicted: int = 0  # frames in which images and IMU told of different motions
     waited: Counter[Wait] = field(default_factory=Counter)  # frames, by what was still waited for
     stretches: int = 0  # of unbroken odometry; poses of different ones do not compare
-    _by_stamp: dict[int, FrameRow] = field(default_factory=dict)
+    _frames: int = 0
+    _begun: bool = False  # the first line, the columns' names, is written
 
     def __len__(self) -> int:
-        return len(self._rows)
-
-    @property
-    def rows(self) -> list[FrameRow]:
-        """In order of time, which is not the order in which their fate was known."""
-        return sorted(self._rows, key=lambda row: row.stamp_ns)
+        """How many frames."""
+        return self._frames
 
     def add(
         self, stamp_ns: int, track_ms: float, state: TrackState, keyframe: bool, sent: bool = False
     ) -> None:
-        row = FrameRow(stamp_ns, track_ms, state, keyframe, sent)
-        self._rows.append(row)
-        self._by_stamp[stamp_ns] = row
+        self._write(line_of_frame(stamp_ns, track_ms, state, keyframe, sent))
+        self._frames += 1
 
     def add_result(self, new_stretch: bool, sound: bool, waits: Wait | None) -> None:
         """Of a frame: whether odometry broke before it, whether images and IMU agree, and what is still
@@ -73,25 +75,35 @@ class RunLog:
         self.decode_s += cpu_s
 
     def mark_corrected(self, stamp_ns: int, corrected_ms: float) -> None:
-        self._by_stamp[stamp_ns].corrected_ms = corrected_ms
+        """Of a frame that was added; a later mark of the same frame replaces this one."""
+        self._write(line_of_correction(stamp_ns, corrected_ms))
 
-    def csv(self) -> str:
-        """The whole of latency.csv."""
-        return "\n".join([CSV_HEADER, *(row.csv() for row in self.rows)]) + "\n"
+    def _write(self, line: str) -> None:
+        if not self._begun:
+            self.lines.write(CSV_HEADER)
+            self._begun = True
+        self.lines.write(line)
+
+    def frames(self) -> FrameColumns:
+        """In order of time, which is not the order in which their fate was known."""
+        return read(self.lines.read())
+
+    def csv(self) -> Iterator[str]:
+        """The whole of latency.csv, in parts."""
+        return self.frames().csv()
 
     def report(self) -> dict[str, Any]:
         """The fields of report.json that come from frames alone (docs/architecture.md)."""
-        rows = self.rows
+        rows = self.frames()
         frames = len(rows)
-        parts = latency([r.track_ms for r in rows], [r.corrected_ms for r in rows])
-        sent = sum(r.sent for r in rows)
-        span_s = (rows[-1].stamp_ns - rows[0].stamp_ns) * 1e-9 if frames > 1 else 0.0
+        parts = latency(rows.track_ms, rows.corrected_ms)
+        sent = int(rows.sent.sum())
         return {
             "frames": frames,
-            "tracked": sum(r.state.has_pose for r in rows),
-            "keyframes": sum(r.keyframe for r in rows),
+            "tracked": int(rows.has_pose.sum()),
+            "keyframes": int(rows.keyframe.sum()),
             "sent": sent,
-            "lost_s": _lost_s(rows),
+            "lost_s": rows.lost_s,
             "stretches": self.stretches,
             "contradicted": self.contradicted,
             "track_ms": parts.track_ms.report(),
@@ -100,20 +112,7 @@ class RunLog:
             "over_20ms": None if math.isnan(parts.over_20ms) else parts.over_20ms,
             "cpu_ms_per_frame": 1e3 * self.cpu_s / frames if frames else None,
             "decode_ms_per_frame": 1e3 * self.decode_s / frames if frames else None,
-            "rate_hz": sent / span_s if span_s else None,
-            "init_s": _init_s(rows),
+            "rate_hz": sent / rows.span_s if rows.span_s else None,
+            "init_s": rows.init_s,
             "waited": {str(wait): frames for wait, frames in self.waited.items()},
         }
-
-
-def _lost_s(rows: list[FrameRow]) -> float:
-    """Time from each LOST frame to the next frame."""
-    stamps = np.array([r.stamp_ns for r in rows], np.int64)
-    lost = np.array([r.state is TrackState.LOST for r in rows], bool)
-    return float((np.diff(stamps) * lost[:-1]).sum() * 1e-9) if len(rows) > 1 else 0.0
-
-
-def _init_s(rows: list[FrameRow]) -> float | None:
-    """From the first frame to the first with a pose; None if there was none."""
-    first = next((r.stamp_ns for r in rows if r.state.has_pose), None)
-    return None if first is None else (first - rows[0].stamp_ns) * 1e-9

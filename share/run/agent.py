@@ -34,6 +34,7 @@ from share.io.pose_feed import PoseFeed
 from share.io.source import Source
 from share.io.transport import AgentLink
 from share.metrics.runlog import RunLog
+from share.process import Heap
 from share.run.agent_files import AgentFiles
 from share.run.arrivals import Arrivals, Played, Seen
 from share.run.errors import Errors, Unknown
@@ -97,7 +98,8 @@ class AgentRun:
         self._guard = Guard(say)
         self._machine = Agent(hello, settings)
         self._prepare()
-        self._files, self._log = AgentFiles(out, say), RunLog()
+        self._files = AgentFiles(out, say)
+        self._log = RunLog(self._files.frames)
         self._errors, self._poses = Unknown() if errors is None else errors, poses
         self._late = Late(settings.agent.late_ms)
         self._lateness = Lateness(say, "the edge" if hello.streams else "this machine")
@@ -215,7 +217,9 @@ class AgentRun:
     # ------------------------------------------------------------------ main
 
     def _loop(self) -> None:
+        heap = Heap()
         while not self._ended and not self._is_overdue():
+            heap.tidy(time.monotonic())
             self._listen()
             while not self._shared.inbox.empty():
                 self._take(self._shared.inbox.get())

@@ -15,6 +15,7 @@ from typing import Any
 
 from share.io.files import atomic_write, check_writable, claim
 from share.io.line_file import LineFile
+from share.io.spool import Spool
 from share.io.trajectory import format_pose
 from share.metrics.runlog import RunLog
 from share.types import F64
@@ -43,6 +44,7 @@ class AgentFiles:
         self._too_many_said = False
         self._claim = None if out is None else _claim(out)
         self._remove_partials()  # of a run that was killed
+        self.frames = Spool(None if out is None else out / "latency.csv.partial", say)  # of the run's log
 
     def odom(self, stamp_ns: int, T_odom_body: F64) -> None:
         self._line("odom.tum", stamp_ns, T_odom_body)
@@ -65,13 +67,15 @@ class AgentFiles:
 
     def finish(self, log: RunLog, report: dict[str, Any]) -> None:
         """Close what is open and give everything its name; the report also says in which map map.tum is: a
-        correction after the last frame does not change that. Raises ShareError if the disk was full."""
+        correction after the last frame does not change that. Raises ShareError if the disk was full: then the
+        report, too, is of a part of the frames only."""
         files = list(self._open.values())
+        for file in files:
+            file.check()  # what there is stays, as .partial
+        self.frames.check()
         self._close()
         if self._out is None:
             return
-        for file in files:
-            file.check()  # what there is stays, as .partial
         for old in self._out.glob("map.before-*.tum"):
             old.unlink()  # of an earlier run in the same folder
         for name in ("odom.tum", "map.tum"):
@@ -81,18 +85,21 @@ class AgentFiles:
         for number in range(1, self._maps_before + 1):
             name = f"map.before-{number}.tum"
             (self._out / f"{name}.partial").replace(self._out / name)
-        atomic_write(self._out / "latency.csv", log.csv())
+        atomic_write(self._out / "latency.csv", "".join(log.csv()))
+        (self._out / "latency.csv.partial").unlink(missing_ok=True)
         report = report | {"map_tum": self._map_id}
         atomic_write(self._out / "report.json", json.dumps(report, indent=2) + "\n")
 
     def discard(self) -> None:
         """The run came to nothing: leave no trace of it."""
         self._close()
+        self.frames.close()
         self._remove_partials()
 
     def release(self) -> None:
         """Give the folder free for another run."""
         self._close()
+        self.frames.close()
         if self._claim is not None:
             os.close(self._claim)
             self._claim = None
@@ -105,8 +112,9 @@ class AgentFiles:
         self._open[name].write(format_pose(stamp_ns, T))
 
     def _remove_partials(self) -> None:
-        for partial in self._out.glob("*.tum.partial") if self._out else ():
-            partial.unlink()
+        if self._out is not None:
+            for partial in (*self._out.glob("*.tum.partial"), *self._out.glob("latency.csv.partial")):
+                partial.unlink()
 
     def _close(self) -> None:
         for file in self._open.values():

@@ -48,6 +48,7 @@ from share.io.files import atomic_write, check_writable, claim
 from share.io.line_file import LineFile
 from share.io.map_store import MapStore
 from share.io.transport import EdgeLink
+from share.process import Heap
 from share.run.companion import Companion
 from share.run.keeper import Keeper
 from share.run.mapping import Mapped, Restore, Restored, SolverLost, map_all
@@ -105,6 +106,7 @@ class EdgeRun:
         self._trouble: dict[str, float] = {}  # what to say until when
         self._report: dict[str, Any] = {}
         self._report_at = 0.0
+        self._heap = Heap()
         self._begin()
 
     def stop(self) -> None:
@@ -143,12 +145,13 @@ class EdgeRun:
         """A report, and when the next is due."""
         now = time.monotonic()
         self._report_at = now + _REPORT_S
+        self._heap.tidy(now)
         kept = None if self._keeper is None else self._keeper.trouble
-        trouble = [text for text, until in self._trouble.items() if now < until]
+        self._trouble = {text: until for text, until in self._trouble.items() if now < until}
         self._report = {
             **self._machine.report(self._mapped),
             "refused_handshakes": self._refused.total(),
-            "trouble": [*trouble, *([] if kept is None else [kept])],
+            "trouble": [*self._trouble, *([] if kept is None else [kept])],
             "uptime_s": round((time.monotonic_ns() - self._began_ns) * 1e-9, 3),
             **({} if self._solved_at is None else {"last_solve_s": round(now - self._solved_at, 3)}),
         }

@@ -8,6 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
+
+from share.core.history import History
 from share.estimator.result import TrackResult
 from share.evaluator.features import features
 from share.evaluator.model import Estimate, Network, estimate
@@ -15,6 +18,8 @@ from share.evaluator.odometer import Fared, Lately, Odometer
 from share.metrics.latency import summary
 from share.metrics.local_error import LocalError
 from share.types import U8, Candidate, Footing, Frame
+
+_TIMES = 50_000  # estimates that a report is about, the newest: hours, at two keyframes a second
 
 
 class Tracker(Protocol):
@@ -113,7 +118,7 @@ class ByModel(AtOnce):
         self._waits: _Job | None = None
         self._wake = threading.Condition()
         self._ended = False
-        self._ms: list[float] = []
+        self._ms = History(1, _TIMES)
         self._dropped = self._strange = 0
         self._thread = threading.Thread(target=self._work, name="error model", daemon=True)
         self._thread.start()
@@ -131,7 +136,8 @@ class ByModel(AtOnce):
         self._thread.join(timeout=2)
 
     def report(self) -> dict[str, Any]:
-        told = {"estimate_ms": summary(self._ms).report(), "drop_estimate": self._dropped}
+        took = summary(np.array(self._ms.column(0), float))
+        told = {"estimate_ms": took.report(), "drop_estimate": self._dropped}
         return {"error_model": {**told, "strange": self._strange}}
 
     def _work(self) -> None:
@@ -145,7 +151,7 @@ class ByModel(AtOnce):
                 return
             self._newest = found
             self._strange += found.strange
-            self._ms.append(1e3 * (time.thread_time() - began))
+            self._ms.add([1e3 * (time.thread_time() - began)])
 
     def _next(self) -> _Job | None:
         with self._wake:

@@ -17,6 +17,7 @@ from share.core.keeping import Kept
 from share.core.mapper import Mapper
 from share.core.steps import Solve
 from share.graph.solver import Solver
+from share.process import Heap
 from share.run.companion import END, Companion, Inbox
 
 T = TypeVar("T")
@@ -81,6 +82,7 @@ class _Mapping:
         self._findings: list[Finding] = []
         self._report_at = self._poses_at = 0.0
         self._is_moved = False
+        self._heap = Heap()
         self._ended = False
 
     def go(self) -> None:
@@ -181,13 +183,15 @@ class _Mapping:
         if time.monotonic() >= self._report_at:
             self._report_at = time.monotonic() + _REPORT_S
             self._answer(Mapped(self._mapper.report()))
+            self._heap.tidy(time.monotonic())
 
 
 def solve_all(inbox: Inbox, answer: Callable[[Any], None], settings: GraphConfig) -> None:
     """For a `Companion`: takes Solve, answers with what came of it, until END."""
-    solver = Solver(settings)
+    solver, heap = Solver(settings), Heap()
     while (step := inbox.get()) is not END:
         answer(_Solved(*_timed(partial(step.run, solver))))
+        heap.tidy(time.monotonic())
 
 
 def _timed(work: Callable[[], object]) -> tuple[object, float]:

@@ -14,6 +14,7 @@ from share.core.tracking_edge import Room
 from share.estimator.result import TrackResult
 from share.geometry.camera import Rig
 from share.io.machine import cores, free_bytes
+from share.process import Heap
 from share.run.companion import END, Companion, Inbox
 from share.run.pipeline import tracker_of
 from share.types import Frame
@@ -89,7 +90,7 @@ def track_all(
     inbox: Inbox, answer: Callable[[FromTracker], None], settings: Config, rig: Rig, key: str, life: int
 ) -> None:
     """For a `Companion`: takes frames, answers Ready and then each with Answered, until END."""
-    tracker = tracker_of(rig, settings)
+    tracker, heap = tracker_of(rig, settings), Heap()
     broken = life > 0  # there was another before, in another odom
     answer(Ready(key, life))
     while (frame := inbox.get()) is not END:
@@ -100,6 +101,7 @@ def track_all(
         if result.keyframe:  # after its pose is out; what it shows to others is for nobody
             tracker.keyframe(frame)
             tracker.settle()
+        heap.tidy(time.monotonic())
 
 
 def _told(frame: Frame, result: TrackResult, new_stretch: bool) -> Tracked:

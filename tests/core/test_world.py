@@ -41,12 +41,12 @@ def world(policy: str = "covins-g", seed: int = 0, seconds: float = 6.0, **costs
 
 
 def track_ms(room: World, name: str) -> list[float]:
-    return [row.track_ms for row in room.logs[name].rows]
+    return room.logs[name].frames().track_ms.tolist()
 
 
 def corrected_ms(room: World, name: str) -> list[float]:
     """Of the frames that were corrected."""
-    late = [row.corrected_ms for row in room.logs[name].rows]
+    late = room.logs[name].frames().corrected_ms.tolist()
     return [ms for ms in late if not np.isnan(ms)]
 
 

@@ -60,6 +60,15 @@ def test_a_keyframe_in_the_middle_leaves_its_neighbours_tied() -> None:
     assert known.cov == pytest.approx(twice)
 
 
+def test_that_others_look_alike_is_forgotten_with_the_keyframe() -> None:
+    ann, atlas = Walker("ann", 1), Atlas(CONFIG)
+    for keyframe in ann.keyframes:
+        atlas.add_keyframe("ann", keyframe)
+    atlas._judge._alike.update({20, 30})
+    assert [out.number for out in atlas.take_out([20, 21])] == [20, 21]
+    assert atlas._judge._alike == {30}
+
+
 def test_without_its_first_a_stretch_begins_with_the_next() -> None:
     ann = Walker("ann", 1)
     chart = chart_of(ann)

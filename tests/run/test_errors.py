@@ -76,6 +76,18 @@ def test_what_was_said_last_holds():
     assert (told["drop_estimate"], told["strange"], said) == (0, 0, [])
 
 
+def test_times_are_remembered_of_the_newest_estimates_only(monkeypatch):
+    monkeypatch.setattr("share.run.errors._TIMES", 3)
+    network = Network()
+    network.may.set()
+    errors = ByModel(network, print)
+    for brightness in range(1, 6):
+        keyframe(errors, brightness)
+        until(lambda at=brightness: network.seen[-1:] == [at])
+    errors.close()
+    assert errors.report()["error_model"]["estimate_ms"]["n"] == 3
+
+
 def test_who_is_busy_leaves_the_older_out():
     network = Network()
     errors = ByModel(network, lambda text: None)

@@ -127,7 +127,7 @@ def test_answers_of_a_life_that_is_over_are_none_of_the_next(edge):
     run._answered(edge_module.Kept(10**6))
     run._begin_anew("its process was ended")
     run._take_answers()
-    assert run._machine._kept_to == 0
+    assert run._machine._safekeeping._kept_to == 0
 
 
 class Store:

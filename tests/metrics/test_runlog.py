@@ -1,0 +1,136 @@
+"""What is told of a run's frames, and that they take no memory while it lasts."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from share.errors import DataError
+from share.io.spool import Spool
+from share.metrics.latency import latency
+from share.metrics.runlog import InMemory, RunLog
+from share.types import TrackState, Wait
+
+STATES = list(TrackState)
+
+
+class Rows:
+    """A list of every frame, as plainly as can be: what `RunLog` has to agree with to the last byte."""
+
+    def __init__(self) -> None:
+        self.rows: list[list[Any]] = []
+        self.by_stamp: dict[int, list[Any]] = {}
+
+    def add(self, stamp_ns: int, track_ms: float, state: TrackState, keyframe: bool, sent: bool) -> None:
+        row = [stamp_ns, track_ms, math.nan, state, keyframe, sent]
+        self.rows.append(row)
+        self.by_stamp[stamp_ns] = row
+
+    def mark_corrected(self, stamp_ns: int, corrected_ms: float) -> None:
+        self.by_stamp[stamp_ns][2] = corrected_ms
+
+    def csv(self) -> str:
+        lines = ["stamp_ns,track_ms,corrected_ms,state,keyframe,sent"]
+        for stamp, track, corrected, state, keyframe, sent in sorted(self.rows, key=lambda row: row[0]):
+            told = "" if math.isnan(corrected) else f"{corrected:.3f}"
+            lines.append(f"{stamp},{track:.3f},{told},{state},{int(keyframe)},{int(sent)}")
+        return "\n".join(lines) + "\n"
+
+    def report(self) -> dict[str, Any]:
+        rows = sorted(self.rows, key=lambda row: row[0])
+        parts = latency([row[1] for row in rows], [row[2] for row in rows])
+        poses = [row[0] for row in rows if row[3].has_pose]
+        later = itertools.pairwise(rows)
+        lost_ns = sum(after[0] - row[0] for row, after in later if row[3] is TrackState.LOST)
+        span_s = (rows[-1][0] - rows[0][0]) * 1e-9 if len(rows) > 1 else 0.0
+        sent = sum(row[5] for row in rows)
+        return {
+            "frames": len(rows),
+            "tracked": len(poses),
+            "keyframes": sum(row[4] for row in rows),
+            "sent": sent,
+            "lost_s": lost_ns * 1e-9,
+            "track_ms": parts.track_ms.report(),
+            "corrected_ms": parts.corrected_ms.report(),
+            "latency_ms": parts.latency_ms.report(),
+            "over_20ms": None if math.isnan(parts.over_20ms) else parts.over_20ms,
+            "rate_hz": sent / span_s if span_s else None,
+            "init_s": (poses[0] - rows[0][0]) * 1e-9 if poses else None,
+        }
+
+
+def drive(logs: list[Any], n: int, seed: int) -> None:
+    """Frames out of order, some of one stamp; corrections of frames of late, some of them twice."""
+    draw, stamps = np.random.default_rng(seed), []
+    for k in range(n):
+        stamp = 1_700_000_000_000_000_000 + k * 33_333_333 + int(draw.integers(-40_000_000, 40_000_000))
+        stamps.append(stamps[-1] if stamps and draw.random() < 0.02 else stamp)
+        state, track_ms = STATES[draw.integers(len(STATES))], float(draw.gamma(3, 5))
+        keyframe, sent = draw.random() < 0.3, draw.random() < 0.2
+        late = stamps[-1 - int(draw.integers(min(len(stamps), 50)))], float(draw.gamma(3, 30))
+        corrected = draw.random() < 0.2
+        for log in logs:
+            log.add(stamps[-1], track_ms, state, bool(keyframe), bool(sent))
+            if corrected:
+                log.mark_corrected(*late)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 20, 3000])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("in_a_folder", [True, False])
+def test_the_report_is_that_of_all_rows_to_the_last_byte(
+    n: int, seed: int, in_a_folder: bool, tmp_path: Path
+) -> None:
+    spool = Spool(tmp_path / "latency.csv.partial" if in_a_folder else None, print)
+    rows, spooled, in_memory = Rows(), RunLog(spool), RunLog()
+    drive([rows, spooled, in_memory], n, seed)
+    assert len(spooled) == n
+    for log in (spooled, in_memory):
+        told = log.report()
+        assert json.dumps({key: told[key] for key in rows.report()}) == json.dumps(rows.report())
+        assert "".join(log.csv()) == rows.csv()
+    spool.close()
+
+
+def test_what_does_not_come_of_rows_is_told_too() -> None:
+    log = RunLog()
+    log.add(5, 2.0, TrackState.OK, False)
+    log.cpu_s = 0.5
+    log.add_decode(0.25)
+    for waits in (Wait.IMU, Wait.IMU, None):
+        log.add_result(waits is None, waits is not None, waits)
+    told = log.report()
+    assert (told["cpu_ms_per_frame"], told["decode_ms_per_frame"]) == (500.0, 250.0)
+    assert (told["stretches"], told["contradicted"], told["waited"]) == (1, 1, {"imu": 2})
+
+
+def test_an_hour_of_frames_takes_no_memory(tmp_path: Path) -> None:
+    """Rows that were kept took 0.3 kB a frame: tens of MB an hour."""
+    spool = Spool(tmp_path / "latency.csv.partial", print)
+    log = RunLog(spool)
+    log.add(0, 1.0, TrackState.OK, False)
+    tracemalloc.start()
+    for k in range(1, 5000):
+        log.add(k, k / 7, TrackState.OK, True, True)
+        log.mark_corrected(k, k / 3)
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert held < 50_000
+    assert (len(log), len(log.frames())) == (5000, 5000)
+    spool.close()
+
+
+def test_a_line_that_somebody_changed_is_said() -> None:
+    lines = InMemory()
+    log = RunLog(lines)
+    log.add(5, 2.0, TrackState.OK, False)
+    lines.write("5,what,,OK,0,0")
+    with pytest.raises(DataError, match="the run's own latencies were changed by somebody"):
+        log.report()
