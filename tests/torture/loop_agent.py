@@ -1,13 +1,14 @@
-"""`share agent` for hours: a recording to and fro, so that motion goes on smoothly.
+"""`share agent` for hours: a recording of a closed round again and again.
 
     python loop_agent.py SESSION/NAME NAME ADDRESS OUT SECONDS
 
-Played backwards, the gyroscope's sign turns and the accelerometer's does not: acceleration is the second
-derivative of time. (The gyroscope's bias turns too, so each turn is a step of it.) All else is the product.
+The recording begins and ends at rest at the same place (`soak.py`), so that motion goes on smoothly. All else
+is the product.
 """
 
 from __future__ import annotations
 
+import itertools
 import secrets
 import sys
 import threading
@@ -20,10 +21,9 @@ from share import process
 
 process.prepare()
 
-import numpy as np  # noqa: E402
 
 from share.config import Config  # noqa: E402
-from share.core.measurement import IMU, Measurement  # noqa: E402
+from share.core.measurement import Measurement  # noqa: E402
 from share.io.network import error_model  # noqa: E402
 from share.io.recording import Source  # noqa: E402
 from share.io.source import open_source  # noqa: E402
@@ -37,12 +37,16 @@ from share.wire.messages import Hello  # noqa: E402
 
 
 class Loop(Source):
-    """A recording to and fro, until stopped. Its samples are kept; images are decoded anew each time."""
+    """A recording again and again, until stopped. Its samples are kept; images are decoded anew each time."""
 
     def __init__(self, source: Source) -> None:
         self.name, self.rig, self.notes, self.serial = source.name, source.rig, source.notes, source.serial
         self._stamps = source.stamps()
-        self._samples = sorted(source.measurements(), key=lambda m: m.stamp_ns)
+        samples = sorted(source.measurements(), key=lambda m: m.stamp_ns)
+        images = self._stamps["cam0"]
+        self._period_ns = int(images[-1] - images[0] + round(1e9 / self.rate_hz))
+        begin_ns = samples[0].stamp_ns
+        self._samples = [m for m in samples if m.stamp_ns < begin_ns + self._period_ns]
         self._ending = False
 
     def stamps(self) -> dict[str, Any]:
@@ -55,24 +59,11 @@ class Loop(Source):
         self._ending = True
 
     def measurements(self) -> Iterator[Measurement]:
-        first, last = self._samples[0].stamp_ns, self._samples[-1].stamp_ns
-        step = round(1e9 / self.rate_hz)
-        start = first
-        while not self._ending:
+        for turn in itertools.count():
             for m in self._samples:
-                yield Measurement(m.stream, start + m.stamp_ns - first, m.payload)
-            start += last - first + step
-            for m in reversed(self._samples):
-                yield Measurement(m.stream, start + last - m.stamp_ns, _backwards(m))
-            start += last - first + step
-
-
-def _backwards(m: Measurement) -> Any:
-    if m.stream != IMU:
-        return m.payload
-    values = np.array(m.payload, float)
-    values[:3] *= -1
-    return tuple(values.tolist())
+                if self._ending:
+                    return
+                yield Measurement(m.stream, m.stamp_ns + turn * self._period_ns, m.payload)
 
 
 def main() -> None:

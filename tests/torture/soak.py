@@ -32,7 +32,11 @@ import harness
 import numpy as np
 from harness import EdgeProgram, Program, Setup, say
 
+from share.geometry.se3 import compose
+from share.io.trajectory import Trajectory, format_tum
+
 EVERY_S, BLOCKS = 5.0, 300
+ROUND_S = 40.0  # of a recording, which is played again and again
 BOUND = {"rss_mb": 1.0, "fds": 1.0, "threads": 1.0}  # an hour
 LONG_ENOUGH_H = 2.0  # after the warm-up: from here on, not to know is to fail
 AGENTS = {"ann": "ann", "bob": "bob", "cy": "ann"}  # name: recording
@@ -140,22 +144,32 @@ def draw(series: Series, warm_up_s: float, path: Path) -> None:
     pyplot.close(figure)
 
 
+def poses_of_a_round(begin_rad: float, seconds: float = ROUND_S) -> str:
+    """A TUM file: around the middle of the room with the camera ahead (z forward, y down), at rest for a
+    second at both ends, which are one place."""
+    t = np.arange(0.0, seconds + 0.005, 0.01)
+    x = ((t - 1) / (seconds - 2)).clip(0, 1)
+    angle = begin_rad + 2 * math.pi * x**3 * (10 - 15 * x + 6 * x**2)
+    at = np.stack([1.6 * np.cos(angle), 1.1 * np.sin(angle), 1.6 + 0.08 * np.sin(3 * angle)], axis=1)
+    forward = np.stack([-1.6 * np.sin(angle), 1.1 * np.cos(angle), np.zeros_like(angle)], axis=1)
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    down = np.broadcast_to([0.0, 0.0, -1.0], forward.shape)
+    R = np.stack([np.cross(down, forward), down, forward], axis=2)
+    return format_tum(Trajectory(np.round(1e9 * (1000 + t)).astype(np.int64), compose(R, at)))
+
+
 def session_at(folder: Path) -> Path:
-    """ann and bob for 20 s in the plain room, made if it is not there."""
+    """ann and bob, once around in the plain room from opposite places, made if it is not there."""
     if not (folder / "session.yaml").exists():
         say("making a session")
-        motions = ("--motion", "ann=walk:", "--motion", "bob=walk:", "--profile", "d435i:640x480@15")
-        made = [
-            *harness.SHARE,
-            "emulate",
-            "--scene",
-            "plain",
-            *motions,
-            "--seconds",
-            "20",
-            "--out",
-            str(folder),
-        ]
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        motions = []
+        for name, begin_rad in (("ann", 0.0), ("bob", math.pi)):
+            poses = folder.parent / f"{name}.tum"
+            poses.write_text(poses_of_a_round(begin_rad))
+            motions += ["--motion", f"{name}=tum:{poses}"]
+        how = ("--scene", "plain", "--profile", "d435i:640x480@15", "--seconds", f"{ROUND_S:g}")
+        made = [*harness.SHARE, "emulate", *motions, *how, "--out", str(folder)]
         subprocess.run(made, check=True, env=harness.ENV, capture_output=True)
     return folder
 
