@@ -16,6 +16,9 @@ MB = 10**6
 SETTINGS = 2 * MB  # YAML that a person or a calibration wrote; ours with all provenance has 0.1
 TABLE = 4000 * MB  # of numbers as text: half a day of a 1 kHz IMU
 REPORT = 1000 * MB  # JSON that our own commands wrote; the events of a day
+KEYS = 10 * MB  # public keys, a line each: 100,000 machines
+ARRAYS = 2000 * MB  # labels of a run, weights; a run of an hour at 5 keyframes a second has 300
+LOG = 100 * MB  # what a child process said
 _FLAGS = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY
 _KINDS = {
     stat.S_IFDIR: "it is a folder",
