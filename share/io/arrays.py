@@ -20,8 +20,8 @@ _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.r
 
 
 def read_arrays(path: Path, otherwise: str, most: int = ARRAYS) -> dict[str, NDArray[Any]]:
-    """Those of an archive, by name. most: bytes, packed and unpacked. otherwise: what to say of a file that is
-    none (`is no file of labels`). Raises DataError that names it."""
+    """Those of an archive, by name. most: bytes, packed and unpacked. otherwise: what to say of a file that
+    is none (`is no file of labels`). Raises DataError that names it."""
     try:
         with zipfile.ZipFile(io.BytesIO(read_bytes(path, most))) as archive:
             told = archive.infolist()
@@ -52,8 +52,8 @@ def _entry(archive: zipfile.ZipFile, told: zipfile.ZipInfo) -> NDArray[Any]:
 
 
 def _array(file: IO[bytes], size: int) -> NDArray[Any]:
-    """size: bytes of the file, header and all. Raises ValueError, KeyError and what numpy makes of a header."""
-    shape, by_column, dtype = _HEADERS[np.lib.format.read_magic(file)](file)  # type: ignore[no-untyped-call]
+    """size: bytes of the file, header and all. Raises what numpy does, ValueError, KeyError."""
+    shape, by_column, dtype = _HEADERS[np.lib.format.read_magic(file)](file)
     if dtype.kind not in _PLAIN or dtype.hasobject:
         raise ValueError(f"an array of {dtype}")
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != size - file.tell():

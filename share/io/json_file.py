@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from share.errors import DataError
-from share.io.regular_file import REPORT, read_text
+from share.io.regular_file import EVENTS, REPORT, read_text
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """One object, the whole file. Raises DataError that names it."""
-    return _object(_text(path), str(path))
+    return _object(_text(path, REPORT), str(path))
 
 
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
@@ -23,7 +23,7 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
 
     Raises DataError that names file and line.
     """
-    text = _text(path)
+    text = _text(path, EVENTS)
     whole = text[: text.rfind("\n") + 1].splitlines()
     return [_object(line, f"{path}, line {number}") for number, line in enumerate(whole, 1)]
 
@@ -69,9 +69,9 @@ def with_nan(row: dict[str, Any]) -> dict[str, Any]:
     return {name: math.nan if value is None else value for name, value in row.items()}
 
 
-def _text(path: Path) -> str:
+def _text(path: Path, most: int) -> str:
     try:
-        return read_text(path, REPORT)
+        return read_text(path, most)
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:

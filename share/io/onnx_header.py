@@ -1,8 +1,8 @@
 """What an ONNX file asks for, before a runtime sees it. Pure: bytes in, names out.
 
-Only the parts of the protocol buffer that matter are looked at (onnx.proto: ModelProto, GraphProto, NodeProto,
-AttributeProto, TensorProto). Layers whose output is at most about as large as input and weights are let
-through; those that loop, branch, call or make tensors of any size out of a few bytes are not.
+Only those parts of the protocol buffer are looked at that matter (onnx.proto: ModelProto, GraphProto,
+NodeProto, AttributeProto, TensorProto). Layers whose output is at most about as large as input and weights
+are let through; those that loop, branch, call or make tensors of any size out of a few bytes are not.
 """
 
 from __future__ import annotations
@@ -18,9 +18,19 @@ _BYTES, _FIXED = 2, {1: 8, 5: 4}  # wire types, and how long those of one length
 _MOST_NODES = 20_000
 _DOMAINS = (b"", b"ai.onnx")
 
-LAYERS = frozenset(
-    ["Abs", "Add", "And", "ArgMax", "ArgMin", "AveragePool", "BatchNormalization", "Cast", "CastLike", "Ceil", "Clip", "Concat", "Constant", "Conv", "ConvInteger", "Cos", "DequantizeLinear", "Div", "Dropout", "DynamicQuantizeLinear", "Elu", "Equal", "Erf", "Exp", "Flatten", "Floor", "Gather", "Gelu", "Gemm", "GlobalAveragePool", "GlobalMaxPool", "Greater", "GreaterOrEqual", "HardSigmoid", "HardSwish", "Identity", "InstanceNormalization", "LayerNormalization", "LeakyRelu", "Less", "LessOrEqual", "Log", "LogSoftmax", "LpNormalization", "MatMul", "MatMulInteger", "Max", "MaxPool", "Mean", "Min", "Mish", "Mul", "Neg", "Not", "Or", "PRelu", "Pow", "QLinearConv", "QLinearMatMul", "QuantizeLinear", "Reciprocal", "ReduceL1", "ReduceL2", "ReduceLogSumExp", "ReduceMax", "ReduceMean", "ReduceMin", "ReduceProd", "ReduceSum", "ReduceSumSquare", "Relu", "Reshape", "Round", "Selu", "Shape", "Sigmoid", "Sign", "Sin", "Slice", "Softmax", "Softplus", "Softsign", "Split", "Sqrt", "Squeeze", "Sub", "Sum", "Tanh", "Transpose", "Unsqueeze", "Where", "Xor"]
-)
+LAYERS = frozenset((
+    "Abs", "Add", "And", "ArgMax", "ArgMin", "AveragePool", "BatchNormalization", "Cast", "CastLike",
+    "Ceil", "Clip", "Concat", "Constant", "Conv", "ConvInteger", "Cos", "DequantizeLinear", "Div",
+    "Dropout", "DynamicQuantizeLinear", "Elu", "Equal", "Erf", "Exp", "Flatten", "Floor", "Gather", "Gelu",
+    "Gemm", "GlobalAveragePool", "GlobalMaxPool", "Greater", "GreaterOrEqual", "HardSigmoid", "HardSwish",
+    "Identity", "InstanceNormalization", "LayerNormalization", "LeakyRelu", "Less", "LessOrEqual", "Log",
+    "LogSoftmax", "LpNormalization", "MatMul", "MatMulInteger", "Max", "MaxPool", "Mean", "Min", "Mish",
+    "Mul", "Neg", "Not", "Or", "PRelu", "Pow", "QLinearConv", "QLinearMatMul", "QuantizeLinear",
+    "Reciprocal", "ReduceL1", "ReduceL2", "ReduceLogSumExp", "ReduceMax", "ReduceMean", "ReduceMin",
+    "ReduceProd", "ReduceSum", "ReduceSumSquare", "Relu", "Reshape", "Round", "Selu", "Shape", "Sigmoid",
+    "Sign", "Sin", "Slice", "Softmax", "Softplus", "Softsign", "Split", "Sqrt", "Squeeze", "Sub", "Sum",
+    "Tanh", "Transpose", "Unsqueeze", "Where", "Xor",
+))  # fmt: skip
 
 
 def check_model(data: bytes) -> None:

@@ -81,7 +81,7 @@ def small(
     weights: Sequence[bytes] = (),
     first: str = "log_error",
 ) -> Path:
-    """A valid error model that always says the same, with `more` layers, which make of `first` what it says."""
+    """One that always says the same, with `more` layers, which make of `first` what it says."""
     nodes = [
         node("Gemm", ["scalars", "w3", "says"], first),
         node("Gemm", ["scalars", "w64"], "embedding"),
@@ -117,7 +117,11 @@ EXTERNAL = field(13, field(1, "location") + field(2, "../../../etc/passwd")) + f
 LAYERS = {
     "a loop": ([node("Loop", ["n"], "y", BRANCH)], [], "a layer of it holds a graph"),
     "a loop without a body": ([node("Loop", ["n"], "y")], [], "'Loop' is none that an error model may have"),
-    "a size out of nothing": ([node("ConstantOfShape", ["big"], "y")], [ints("big", [10**12])], "'ConstantOfShape'"),
+    "a size out of nothing": (
+        [node("ConstantOfShape", ["big"], "y")],
+        [ints("big", [10**12])],
+        "'ConstantOfShape'",
+    ),
     "of another domain": ([node("Relu", ["scalars"], "y", domain="evil")], [], "'evil.Relu'"),
     "weights elsewhere": ([], [tensor("w", [1], (), EXTERNAL)], "its weights lie in other files"),
     "weights elsewhere, in a layer": (
@@ -138,7 +142,6 @@ def test_what_no_error_model_needs_is_not_run(tmp_path, name):
 
 def test_memory_is_bounded_whatever_layers_make_of_it(tmp_path):
     """Two of 60,000 numbers, added row to column, are 14 GB."""
-    long = 60_000
     more = [
         node("ReduceMean", ["scalars"], "mean"),
         node("Add", ["mean", "row"], "a"),
@@ -152,7 +155,7 @@ def test_memory_is_bounded_whatever_layers_make_of_it(tmp_path):
         return str(small(tmp_path / f"{long}.onnx", more=more, weights=weights, first="said"))
 
     assert error_model(made(60))
-    with pytest.raises(DataError, match="is no error model: .*Add"):
+    with pytest.raises(DataError, match=r"is no error model: .*Add"):
         error_model(made(60_000))
 
 
@@ -180,6 +183,6 @@ def test_a_model_that_is_no_file(tmp_path, kind):
     else:
         special(path, kind)
     began = time.process_time()
-    with pytest.raises(ShareError, match="not a regular file|a file of this kind may have"):
+    with pytest.raises(ShareError, match=r"not a regular file|a file of this kind may have"):
         read_model(path)
     assert time.process_time() - began < 5
