@@ -73,7 +73,7 @@ class Untrusted:
 
     def _check(self, table: str, names: tuple[str, ...]) -> None:
         kinds = self.rows(f"SELECT type, sql FROM sqlite_schema WHERE name = '{table}'").fetchall()
-        if [(kind, str(sql).split()[:2]) for kind, sql in kinds] != [("table", ["CREATE", "TABLE"])]:
+        if [(kind, str(sql).upper().split()[:2]) for kind, sql in kinds] != [("table", ["CREATE", "TABLE"])]:
             raise sqlite3.DatabaseError(f"no table {table} as it should be")
         found = self.rows(f"PRAGMA table_xinfo({table})").fetchall()
         if any(hidden for *_, hidden in found):
