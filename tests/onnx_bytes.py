@@ -5,6 +5,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 
+from share.evaluator.features import SHAPES
+
 FLOAT, UINT8 = 1, 2
 
 
@@ -67,3 +69,31 @@ def model(
     parts = [(1, nodes), (5, weights), (11, inputs), (12, outputs)]
     graph = field(2, "g") + b"".join(field(k, one) for k, some in parts for one in some)
     return field(1, 8) + field(7, graph) + field(8, field(2, 17)) + extra
+
+
+INPUTS = [
+    value_info(name, UINT8 if name == "picture" else FLOAT, ["N", *shape]) for name, shape in SHAPES.items()
+]
+OUTPUTS = [
+    value_info("log_error", FLOAT, ["N", 3]),
+    value_info("embedding", FLOAT, ["N", 64]),
+    value_info("distance", FLOAT, ["N"]),
+]
+
+
+def small_error_model(
+    says: Sequence[float] = (0.0, -1.0, 1.0),
+    more: Sequence[bytes] = (),
+    weights: Sequence[bytes] = (),
+    first: str = "log_error",
+) -> bytes:
+    """One that always says the same, with `more` layers, which make of `first` what it says."""
+    nodes = [
+        node("Gemm", ["scalars", "w3", "says"], first),
+        node("Gemm", ["scalars", "w64"], "embedding"),
+        node("ReduceL2", ["embedding"], "distance", numbers("axes", [1]), number("keepdims", 0)),
+        node("Cast", ["picture"], "seen", number("to", FLOAT)),
+        *(node("ReduceMean", [name], f"of {name}") for name in ("seen", "psd", "recent")),
+    ]
+    own = [tensor("w3", [8, 3], [0.0] * 24), tensor("says", [3], says), tensor("w64", [8, 64], [0.0] * 512)]
+    return model([*nodes, *more], [*own, *weights], INPUTS, OUTPUTS)

@@ -46,7 +46,7 @@ def _figures(trial: Trial) -> RunFigures:
             terms.seed,
             trial.clock,
             trial.told,
-            trial.record.get("code", ""),
+            trial.record.get("code") or "",
         ),
         agents,
         in_one_map=0 if found.joint is None else len(found.joint.agents),

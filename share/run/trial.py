@@ -106,8 +106,8 @@ def read_trial(folder: Path) -> Trial:
         terms = from_mapping(Terms, {name: record[name] for name in _TERMS if name in record}, "terms")
     except ConfigError as error:
         raise DataError(f"{path}: is damaged: {error}") from None
-    session, told = record.get("session"), [record.get(name) or "" for name in ("error_model", "code")]
-    if not isinstance(session, str) or not all(isinstance(one, str) for one in told):
+    session, told = record.get("session"), [record.get(name) for name in ("error_model", "code")]
+    if not isinstance(session, str) or not all(isinstance(one, str | None) for one in told):
         raise DataError(f"{path}: is damaged: session, error_model or code is no text")
     if not Path(session).is_dir():
         raise UsageError(f"{path}: its session {session} is not there any more, and with it the truth")

@@ -6,7 +6,6 @@ process with bounds on memory and time. A run ends well with a result or a Share
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import resource
@@ -24,26 +23,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from live import RIG, live
-from map_changes import small_map
-from recordings import make_euroc, make_tum
+from file_seeds import seeds
 
-from share import config
-from share.cli.options import load_config
-from share.core.sequencer import SequencerCounters
 from share.errors import ShareError
-from share.io.calibration import read_calibration
-from share.io.describe import describe
-from share.io.imu_table import read_imu
-from share.io.kalibr import kalibr_texts
-from share.io.map_describe import describe_map
-from share.io.map_store import MapStore
-from share.io.mcap.recorder import Recorder
-from share.io.mcap.recover import recover
-from share.io.mocap_file import read_bodies
-from share.io.session import read_session
-from share.io.source import open_source
-from share.run.pipeline import frames_of, tracker_for
 
 MEMORY = 3 * 2**30  # of addresses: Python, OpenCV and NumPy take 1.5 of them
 SECONDS = 30  # of CPU time, for one case
@@ -54,114 +36,13 @@ EXTREMES = (
 )  # fmt: skip
 
 
-def _tracked(source: object) -> None:
-    tracker = tracker_for(source, config.Config())
-    for frame in frames_of(source, config.Config(), SequencerCounters()):
-        if tracker.track(frame).keyframe:
-            tracker.keyframe(frame)
-            tracker.settle()
-
-
-def read_recording(path: Path) -> None:
-    source = open_source(str(path))
-    with contextlib.suppress(ShareError):
-        describe(source)
-    with contextlib.suppress(ShareError):
-        source.truth()
-    with contextlib.suppress(ShareError):
-        read_imu(str(path))
-    source.losses.lines()
-    _tracked(source)
-
-
-def read_mcap(path: Path) -> None:
-    with contextlib.suppress(ShareError):
-        recover(path, path.with_name("saved.mcap"))
-    read_recording(path)
-
-
-def read_a_session(path: Path) -> None:
-    session = read_session(path)
-    for name in session.agents:
-        read_recording(path / name)
-
-
-def read_map(path: Path) -> None:
-    with contextlib.suppress(ShareError):
-        describe_map(MapStore.read(path))
-    with MapStore.open(path) as store:
-        store.load()
-    assert MapStore.read(path).load() is not None
-
-
-def read_settings(path: Path) -> None:
-    load_config(str(path))
-
-
-Seed = tuple[Callable[[Path], None], Path]
-
-
-def seeds(root: Path) -> dict[str, Seed]:
-    """What is damaged, and by whom it is read."""
-    make_euroc(root / "euroc", frames=12)
-    make_tum(root / "tum", frames=12)
-    with Recorder(root / "a.mcap", RIG) as recorder:
-        for m in live(12):
-            recorder.write(m)
-    (root / "session" / "truth").mkdir(parents=True)
-    shutil.copyfile(root / "a.mcap", root / "session" / "ann.mcap")
-    texts = kalibr_texts(RIG, "a rig")
-    chain = "".join("      " + line + "\n" for text in texts.values() for line in text.splitlines())
-    (root / "session" / "session.yaml").write_text(
-        f"schema: 1\nprovenance: {{a: 1}}\nagents:\n  ann:\n    kind: ar\n    sensors: rgbd+imu\n    rate_hz: 20.0\n"  # noqa: E501
-        f"    clock_offset_ns: 5\n    calibration:\n{chain}"
-    )
-    (root / "session" / "truth" / "ann.tum").write_text("1.0 0 0 0 0 0 0 1\n1.1 0 0 0 0 0 0 1\n")
-    (root / "calib").mkdir()
-    for name, text in texts.items():
-        (root / "calib" / name).write_text(text)
-    with MapStore.open(root / "map.sqlite") as store:
-        store.write(small_map(12, points=10))
-    (root / "map.sqlite.lock").unlink()
-    (root / "config.yaml").write_text("tracker: {}\nedge: {}\ncontrol:\n  kp: 0.8\n  agents: {}\n")
-    (root / "motive.csv").write_text(_MOTIVE)
-    (root / "vicon.csv").write_text(_VICON)
-    return {
-        "euroc": (read_recording, root / "euroc"),
-        "tum": (read_recording, root / "tum"),
-        "mcap": (read_mcap, root / "a.mcap"),
-        "session": (read_a_session, root / "session"),
-        "calib": (read_calibration, root / "calib"),  # type: ignore[dict-item]
-        "map": (read_map, root / "map.sqlite"),
-        "config": (read_settings, root / "config.yaml"),
-        "motive": (read_bodies, root / "motive.csv"),  # type: ignore[dict-item]
-        "vicon": (read_bodies, root / "vicon.csv"),  # type: ignore[dict-item]
-    }
-
-
-_MOTIVE = """Format Version,1.23,Rotation Type,Quaternion,Length Units,Meters,Coordinate Space,Global
-
-,Type,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body
-,Name,A,A,A,A,A,A,A
-,ID,1,1,1,1,1,1,1
-,,Rotation,Rotation,Rotation,Rotation,Position,Position,Position
-Frame,Time (Seconds),X,Y,Z,W,X,Y,Z
-""" + "".join(f"{k},{k / 100},0,0,0,1,{k / 10},0,1\n" for k in range(20))
-_VICON = """Objects
-100
-,,Ann:Ann,,,,,
-Frame,Sub Frame,RX,RY,RZ,TX,TY,TZ
-,,deg,deg,deg,mm,mm,mm
-""" + "".join(f"{k},0,0.1,0.2,0.3,{k},2,3\n" for k in range(1, 20))
-
-
 # ------------------------------------------------------------------ damage
 
 
 def damage(path: Path, rng: np.random.Generator) -> str:
     """One file of `path`, damaged in one to three ways; what was done."""
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    text = [p for p in files if p.suffix in (".yaml", ".csv", ".txt", ".tum")]
+    text = [p for p in files if p.suffix in (".yaml", ".csv", ".txt", ".tum", ".json", ".jsonl", ".gltf")]
     pool = text if text and rng.random() < 0.6 else files
     file = pool[int(rng.integers(len(pool)))]
     said = []

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from onnx_bytes import FLOAT, UINT8, field, ints, model, node, number, numbers, tensor, value_info
+from onnx_bytes import FLOAT, field, ints, model, node, number, small_error_model, tensor, value_info
 from special_files import KINDS, special
 
 from share.errors import DataError, ShareError
@@ -64,37 +64,9 @@ def test_a_file_that_is_no_network_is_named(tmp_path):
 
 # ------------------------------------------------------------------ files from anywhere
 
-INPUTS = [
-    value_info(name, UINT8 if name == "picture" else FLOAT, ["N", *shape]) for name, shape in SHAPES.items()
-]
-OUTPUTS = [
-    value_info("log_error", FLOAT, ["N", 3]),
-    value_info("embedding", FLOAT, ["N", 64]),
-    value_info("distance", FLOAT, ["N"]),
-]
 
-
-def small(
-    path: Path,
-    says: Sequence[float] = (0.0, -1.0, 1.0),
-    more: Sequence[bytes] = (),
-    weights: Sequence[bytes] = (),
-    first: str = "log_error",
-) -> Path:
-    """One that always says the same, with `more` layers, which make of `first` what it says."""
-    nodes = [
-        node("Gemm", ["scalars", "w3", "says"], first),
-        node("Gemm", ["scalars", "w64"], "embedding"),
-        node("ReduceL2", ["embedding"], "distance", numbers("axes", [1]), number("keepdims", 0)),
-        node("Cast", ["picture"], "seen", number("to", FLOAT)),
-        *(node("ReduceMean", [name], f"of {name}") for name in ("seen", "psd", "recent")),
-    ]
-    own = [
-        tensor("w3", [8, 3], [0.0] * 24),
-        tensor("says", [3], says),
-        tensor("w64", [8, 64], [0.0] * 512),
-    ]
-    path.write_bytes(model([*nodes, *more], [*own, *weights], INPUTS, OUTPUTS))
+def small(path: Path, **given: Any) -> Path:
+    path.write_bytes(small_error_model(**given))
     return path
 
 
@@ -104,7 +76,7 @@ def test_one_written_by_hand_is_an_error_model(tmp_path):
 
 @pytest.mark.parametrize("says", [(np.inf, 0, 0), (np.nan, 0, 0), (0, -np.inf, 0), (1e38, -1e38, 1e38)])
 def test_one_that_says_no_number(tmp_path, says):
-    network = error_model(str(small(tmp_path / "a.onnx", says)))
+    network = error_model(str(small(tmp_path / "a.onnx", says=says)))
     if np.isfinite(says).all():
         assert told(network, 80, 78, 0.4).error_cm == MOST_CM
         return

@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from made_gltf import DATA, tree, write
 from special_files import KINDS, special
 
 from share.emulate.world.gltf import load_gltf
@@ -22,11 +23,6 @@ from share.errors import DataError, ShareError
 pytest.importorskip("trimesh")
 
 SOON_S = 10.0  # of CPU time, generous: most take milliseconds
-CORNERS = np.array([(x, y, z) for x in (0, 4) for y in (0, 3) for z in (0, 5)], np.float32)  # of a room
-FACES = np.array(
-    [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6)], np.uint16
-)
-DATA = CORNERS.tobytes() + FACES.tobytes()
 
 
 @pytest.fixture(autouse=True)
@@ -34,31 +30,6 @@ def soon():
     began = time.process_time()
     yield
     assert time.process_time() - began < SOON_S
-
-
-def tree() -> dict[str, Any]:
-    """A room of eight triangles, whose numbers lie in room.bin."""
-    return {
-        "asset": {"version": "2.0"},
-        "buffers": [{"uri": "room.bin", "byteLength": len(DATA)}],
-        "bufferViews": [
-            {"buffer": 0, "byteLength": CORNERS.nbytes},
-            {"buffer": 0, "byteOffset": CORNERS.nbytes, "byteLength": FACES.nbytes},
-        ],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3"},
-            {"bufferView": 1, "componentType": 5123, "count": FACES.size, "type": "SCALAR"},
-        ],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
-        "nodes": [{"mesh": 0}],
-        "scenes": [{"nodes": [0]}],
-    }
-
-
-def write(folder: Path, made: Any, data: bytes = DATA) -> Path:
-    (folder / "room.bin").write_bytes(data)
-    (folder / "room.gltf").write_text(made if isinstance(made, str) else json.dumps(made))
-    return folder / "room.gltf"
 
 
 def glb(folder: Path, made: Any, data: bytes = DATA, length: int | None = None) -> Path:
