@@ -6,11 +6,13 @@ process with bounds on memory and time. A run ends well with a result or a Share
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import resource
 import shutil
 import signal
+import sqlite3
 import sys
 import tempfile
 import time
@@ -117,6 +119,26 @@ def nest(file: Path, rng: np.random.Generator) -> None:
     file.write_bytes(data[:at] + (b"[", b"{a: ", b"- ", b"'", b"?")[int(rng.integers(5))] * 3000 + data[at:])
 
 
+def row(file: Path, rng: np.random.Generator) -> None:
+    """One message of an SDK recording, damaged as a file is: SQLite sees nothing of it."""
+    if file.suffix != ".db3":
+        return flip(file, rng)
+    with (
+        contextlib.suppress(sqlite3.Error, TypeError, ValueError),  # it is damaged already
+        contextlib.closing(sqlite3.connect(file)) as connection,
+    ):
+        (last,) = connection.execute("SELECT max(id) FROM messages").fetchone()
+        number = int(rng.integers(1, last + 1))
+        (data,) = connection.execute("SELECT data FROM messages WHERE id = ?", (number,)).fetchone()
+        part = file.with_name("message")
+        part.write_bytes(data)
+        (flip, cut, remove, double, extreme)[int(rng.integers(5))](part, rng)
+        connection.execute("UPDATE messages SET data = ? WHERE id = ?", (part.read_bytes(), number))
+        connection.commit()
+        part.unlink()
+    return None
+
+
 def shuffle(file: Path, rng: np.random.Generator) -> None:
     lines = file.read_bytes().splitlines(keepends=True)
     a, b = sorted(int(k) for k in rng.integers(0, len(lines) + 1, 2))
@@ -135,7 +157,7 @@ def pipe(file: Path, rng: np.random.Generator) -> None:
     os.mkfifo(file)
 
 
-_WAYS = (flip, flip, cut, remove, double, move, extreme, extreme, extreme, nest, shuffle)
+_WAYS = (flip, flip, cut, remove, double, move, extreme, extreme, extreme, nest, shuffle, row, row)
 _SPECIAL = (endless, pipe)
 
 

@@ -48,7 +48,7 @@ ALLOWED = {
     ("cli/edge.py", "open"): "MapStore.open",
     ("emulate/session.py", "open"): "a folder, for its lock",
     ("emulate/session.py", "save"): MEMORY,
-    ("emulate/world/files.py", "load"): "mapped, after open_regular; where it is not whole, it is built again",
+    ("emulate/world/files.py", "load"): "mapped, after open_regular; what is not whole is built again",
     ("emulate/world/files.py", "save"): OURS,
     ("emulate/world/files.py", "write_text"): OURS,
     ("emulate/world/gltf.py", "load_scene"): "from memory, after gltf_file has measured it",
