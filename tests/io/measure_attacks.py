@@ -176,7 +176,18 @@ def model(data: Callable[[], bytes]) -> Attack:
         (folder / "m.onnx").write_bytes(data())
         (folder / "c.yaml").write_text(f"agent: {{error_model: {folder}/m.onnx}}\n")
         source, config = str(make_tum(folder / "room", frames=30)), str(folder / "c.yaml")
-        return ["agent", source, "--name", "ann", "--edge", "tcp://127.0.0.1:9", "--config", config]
+        return [
+            "agent",
+            source,
+            "--name",
+            "ann",
+            "--kind",
+            "ar",
+            "--edge",
+            "tcp://127.0.0.1:9",
+            "--config",
+            config,
+        ]
 
     return made
 
