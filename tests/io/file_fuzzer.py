@@ -1,7 +1,7 @@
 """A small fuzzer of files: valid recordings, calibrations and maps, damaged by chance, each read in a child
 process with bounds on memory and time. A run ends well with a result or a ShareError, else with a complaint.
 
-    python tests/io/file_fuzzer.py SECONDS [SEED]
+    python tests/io/file_fuzzer.py SECONDS [SEED [NAME,NAME]]
 """
 
 from __future__ import annotations
@@ -200,19 +200,26 @@ def _bound() -> None:
 
 
 def fuzz(
-    seconds: float, seed: int, keep: Path | None = None, only: str = ""
+    seconds: float,
+    seed: int,
+    keep: Path | None = None,
+    only: str = "",
+    stopped: Callable[[], bool] = lambda: False,
 ) -> tuple[Counter[str], list[str]]:
-    """Cases for so long (CPU time of children): how many ended how, and what failed."""
+    """Cases for so long (CPU time of children): how many ended how, and what failed. only: names of `seeds`,
+    with commas between."""
     counts: Counter[str] = Counter()
     failures: list[str] = []
     with tempfile.TemporaryDirectory(prefix="fuzz-") as name:
         root = Path(name)
-        made = {what: found for what, found in seeds(root).items() if only in what}
+        wanted = only.split(",")
+        made = {what: found for what, found in seeds(root).items() if only == "" or what in wanted}
         for what, (read, path) in made.items():
             how, why = attempt(read, _copied(path, root / "case"))
             assert how == "well" or what in ("mcap", "session", "euroc", "tum"), f"{what}: {how} {why}"
         number = 0
-        while _spent() < seconds:
+        began_s = _spent()
+        while _spent() - began_s < seconds and not stopped():
             what = list(made)[number % len(made)]
             rng = np.random.default_rng([seed, number])
             case = _copied(made[what][1], root / "case")
@@ -252,11 +259,14 @@ def _copied(path: Path, folder: Path) -> Path:
 
 
 if __name__ == "__main__":
+    stop: list[object] = []
+    signal.signal(signal.SIGINT, lambda *_: stop.append(True))
     told, failed = fuzz(
         float(sys.argv[1]),
         int(sys.argv[2]) if len(sys.argv) > 2 else 1,
         Path(tempfile.mkdtemp(prefix="fuzz-kept-")),
         "".join(sys.argv[3:4]),
+        lambda: bool(stop),
     )
     print(dict(sorted(told.items())))
     sys.exit(bool(failed))
