@@ -26,7 +26,7 @@ import zstandard
 from made_db3 import make_db3
 from made_gltf import tree, write
 from map_changes import small_map
-from onnx_bytes import ints, node, small_error_model, tensor
+from onnx_bytes import ints, node, number, small_error_model, tensor
 from recordings import make_euroc, make_tum
 
 from share.io.map_store import MapStore
@@ -196,20 +196,21 @@ def model(data: Callable[[], bytes]) -> Attack:
 
 
 def outer() -> bytes:
-    more = [
-        node("ReduceMean", ["scalars"], "mean"),
-        node("Add", ["mean", "row"], "a"),
-        node("Add", ["a", "column"], "b"),
-        node("ReduceMax", ["b"], "most"),
-    ]
+    """What is made of weights alone is made when a network is opened."""
     long = 30_000
     weights = [tensor("row", [1, long], [0.0] * long), tensor("column", [long, 1], [0.0] * long)]
-    return small_error_model(more=more, weights=weights)
+    return using(node("Add", ["row", "column"], "y"), weights)
 
 
 def sized() -> bytes:
-    more = [node("ConstantOfShape", ["big"], "y"), node("ReduceMax", ["y"], "most")]
-    return small_error_model(more=more, weights=[ints("big", [10**9])])
+    return using(node("ConstantOfShape", ["big"], "y"), [ints("big", [10**9])])
+
+
+def using(layer: bytes, weights: list[bytes]) -> bytes:
+    """An error model that needs the largest of what `layer` makes."""
+    most = node("ReduceMax", ["y"], "most", number("keepdims", 0))
+    added = node("Add", ["said", "most"], "log_error")
+    return small_error_model(more=[layer, most, added], weights=weights, first="said")
 
 
 ZEROS = {"componentType": 5126, "count": 60_000, "type": "MAT4"}
