@@ -30,6 +30,10 @@ def from_mapping(cls: type[T], data: Any, where: str) -> T:
             hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(hints)}"
             raise ConfigError(f"{where}: unknown key '{key}'{hint}")
         values[key] = _convert(hints[key], value, f"{where}: {key}")
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+        given = field.default, field.default_factory
+        if field.name not in values and given == (dataclasses.MISSING, dataclasses.MISSING):
+            raise ConfigError(f"{where}: key '{field.name}' is missing")
     try:
         return cls(**values)
     except ValueError as error:

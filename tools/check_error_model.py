@@ -25,7 +25,7 @@ from tool_main import exit_code, line  # noqa: E402
 from share.config import Config  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 from share.evaluator.model import Network, estimate  # noqa: E402
-from share.io.network import open_network  # noqa: E402
+from share.io.network import open_network, read_model  # noqa: E402
 from share.io.source import open_source  # noqa: E402
 from share.run.labels import keyframes  # noqa: E402
 from share.types import F64  # noqa: E402
@@ -62,7 +62,7 @@ def main() -> int:
 
 
 def check(options: argparse.Namespace) -> None:
-    network = open_network(options.model)
+    network = open_network(read_model(options.model))
     print("\n".join(line(cells) for cells in (HEAD, ["---"] * len(HEAD))), flush=True)
     found = []
     for name in options.sources:

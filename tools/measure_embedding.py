@@ -34,7 +34,7 @@ from share.core.sequencer import SequencerCounters  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 from share.evaluator.features import SHAPES, picture  # noqa: E402
 from share.geometry import se3  # noqa: E402
-from share.io.network import SHIPPED, open_network  # noqa: E402
+from share.io.network import SHIPPED, open_network, read_model  # noqa: E402
 from share.io.session import read_session  # noqa: E402
 from share.io.source import open_source  # noqa: E402
 from share.io.trajectory import Trajectory  # noqa: E402
@@ -72,7 +72,7 @@ def main() -> int:
 
 
 def measure(options: argparse.Namespace) -> None:
-    network = open_network(options.model)
+    network = open_network(read_model(options.model))
     for folder in options.sessions:
         seen = [one for agent in read_session(folder).agents for one in keyframes(folder, agent)]
         pictures = np.array([one.picture for one in seen])

@@ -74,6 +74,7 @@ def camera_imu(
     from share.io.files import atomic_write, writable_dir
     from share.io.json_file import known
     from share.io.rig_pictures import open_rig_pictures
+    from share.io.section import text_of
     from share.io.stated_noise import chain_file, stated_noise
 
     pictures = open_rig_pictures(source, camera)
@@ -88,7 +89,7 @@ def camera_imu(
     atomic_write(chain, report.camchain_text(outcome, source, told.name))
     warnings = _warnings(outcome)
     if not imu_chain.exists():
-        as_given = None if imu is None else chain_file(imu, "--imu").read_text(encoding="utf-8")
+        as_given = None if imu is None else text_of(chain_file(imu, "--imu"))
         atomic_write(imu_chain, as_given or report.imu_chain_text(outcome, source))
     elif not says_noise(imu_chain, noise):
         used = "the recording's own" if imu is None else f"that of --imu {imu}"

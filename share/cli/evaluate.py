@@ -191,6 +191,7 @@ def ablation(
 
 def _write(out: Path, trials: list[Trial], failed: list[str], also: list[Annex]) -> None:
     from share.io.files import atomic_write
+    from share.io.images import read_picture
     from share.io.page import page
     from share.metrics.comparison import policies
     from share.run.figures import figures
@@ -203,7 +204,7 @@ def _write(out: Path, trials: list[Trial], failed: list[str], also: list[Annex])
     shown = draw(out, found, trials, base)
     report = "\n".join([markdown(found, trials, base, failed, shown), *(one.text for one in also)])
     for name, path in (named for one in also for named in one.pictures.items()):
-        atomic_write(out / name, path.read_bytes())
+        atomic_write(out / name, read_picture(path))
     atomic_write(out / "agents.csv", agents_csv(found))
     atomic_write(out / "runs.csv", runs_csv(found))
     atomic_write(out / "report.md", report)

@@ -81,17 +81,10 @@ frames = click.option(
 
 def load_config(path: str | None) -> Config:
     """The settings of a YAML file, or the defaults. Raises ConfigError or UsageError."""
-    from share import config as settings
-    from share.io.regular_file import SETTINGS, read_text
+    from share.config import Config
+    from share.io.settings_file import read_settings
 
-    if path is None:
-        return settings.Config()
-    try:
-        text = read_text(Path(path), SETTINGS)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not a text file"
-        raise UsageError(f"{path}: cannot read the configuration: {reason}") from None
-    return settings.load(text, path)
+    return Config() if path is None else read_settings(Path(path))
 
 
 def agent_name(value: str) -> str:

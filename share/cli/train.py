@@ -102,14 +102,14 @@ def fit(labels: Path, epochs: int, seed: int, base: Path | None, out: Path) -> N
     """
     _need_extra()
     from share.io.files import writable_dir
-    from share.io.network import deep_of, open_network
+    from share.io.network import deep_of, open_network, read_model
     from share.train.fit import FitOptions
     from share.train.fitted import write_fitted
     from share.train.graph import backbone_id
     from share.train.table import collect
     from share.train.teach import teach
 
-    collection, live, taken = collect(labels, seed), LiveLine(), _base(base)
+    collection, live, taken = collect(labels, seed), LiveLine(), read_model(_base(base))
     writable_dir(out)
     live.write(f"{len(collection.table.error_cm)} pictures go through the backbone")
     deep = deep_of(open_network(taken), collection.table.picture)
@@ -118,7 +118,7 @@ def fit(labels: Path, epochs: int, seed: int, base: Path | None, out: Path) -> N
         live.write(f"epoch {epoch}: loss {learnt:.4f} where it learns, {stopped:.4f} where it stops")
 
     wanted = FitOptions(epochs=epochs, seed=seed)
-    backbone = backbone_id(taken.read_bytes())
+    backbone = backbone_id(taken)
     fitted = teach(collection, deep, backbone, wanted, out / "checkpoint.pt", show)
     live.end()
     write_fitted(out / "fit.npz", fitted)

@@ -12,6 +12,7 @@ from share.core.measurement import DEPTH, Measurement
 from share.errors import DataError
 from share.io.files import atomic_write
 from share.io.images import EncodedImage
+from share.io.regular_file import ARRAYS, read_bytes
 
 DEPTH_SCALE = 1000.0  # millimetres
 
@@ -34,8 +35,8 @@ def write_chunk(path: Path, pictures: list[Picture]) -> None:
 def read_chunk(path: Path) -> Iterator[Measurement]:
     """In the order in which they were written. Raises DataError if it is damaged."""
     try:
-        pictures = msgspec.msgpack.decode(path.read_bytes(), type=list[Picture])
-    except (msgspec.DecodeError, msgspec.ValidationError) as error:
+        pictures = msgspec.msgpack.decode(read_bytes(path, ARRAYS), type=list[Picture])
+    except (OSError, msgspec.DecodeError, msgspec.ValidationError) as error:
         raise DataError(f"{path}: is damaged ({error}); delete it and run the command again") from None
     for p in pictures:
         yield Measurement(p.stream, p.stamp_ns, encoded(p, str(path)))

@@ -8,6 +8,7 @@ import numpy as np
 
 from share.emulate.stage import Actor
 from share.emulate.world.layout import Layout
+from share.io.figure import save
 from share.types import F64
 
 _COLOURS = ("#d1495b", "#00798c", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
@@ -45,8 +46,7 @@ def draw_plan(path: Path, layout: Layout, actors: tuple[Actor, ...]) -> None:
     )
     axes.set_title(f"{layout.name}, seed {layout.seed}, {length:g} x {width:g} x {height:g} m")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=6, frameon=False)
-    figure.savefig(path, dpi=100)
-    pyplot.close(figure)
+    save(figure, path, 100)
 
 
 def _furniture(layout: Layout) -> F64:

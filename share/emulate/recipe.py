@@ -12,6 +12,7 @@ from typing import Any
 from share.emulate.motion.spec import RecordedSpec, parse
 from share.emulate.sensor.effects import Effects
 from share.errors import UsageError
+from share.io.regular_file import TABLE, read_bytes
 
 GENERATOR_VERSION = 2  # raise it when any picture, motion or file changes: cached sessions are made anew
 SENSORS = ("stereo", "rgbd", "mono")
@@ -59,7 +60,10 @@ class Recipe:
         for a motion that cannot be understood."""
         digest = hashlib.sha256(json.dumps(self.plain(), sort_keys=True).encode())
         for path in self._own_files():
-            digest.update(path.read_bytes())
+            try:
+                digest.update(read_bytes(path, TABLE))
+            except OSError as error:
+                raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
         return digest.hexdigest()[:12]
 
     def _own_files(self) -> Iterator[Path]:

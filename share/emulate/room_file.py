@@ -9,6 +9,7 @@ from share.emulate.types import Renderer
 from share.emulate.world.layout import Layout
 from share.emulate.world.mesh import Shape
 from share.io.files import atomic_write
+from share.io.json_file import as_we_write_it, read_json
 
 PLAIN = "plain"
 _PLAIN_FILE = "plain.json"
@@ -30,13 +31,15 @@ def keep(layout: Layout, movers: dict[str, tuple[Shape, ...]], folder: Path) -> 
 
 
 def open_renderer(folder: Path) -> Renderer:
-    """Raises RenderError where nothing can be drawn here."""
+    """Raises RenderError where nothing can be drawn here, DataError where what was kept is damaged."""
     plain = folder / _PLAIN_FILE
     if plain.exists():
         from share.emulate.plain.scene import PlainRenderer
 
-        data = json.loads(plain.read_text())
-        return PlainRenderer(data["seed"], tuple(data["size"]))
+        data = read_json(plain)
+        with as_we_write_it(plain):
+            x, y, z = (float(side) for side in data["size"])
+            return PlainRenderer(int(data["seed"]), (x, y, z))
     from share.emulate.render.gl import GlRenderer
     from share.emulate.world.files import load_room
 

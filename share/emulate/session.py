@@ -28,6 +28,7 @@ from share.emulate.stage import Actor, Stage
 from share.emulate.takes import write_recording, write_truth
 from share.emulate.types import START_NS
 from share.errors import ShareError
+from share.io.arrays import read_array
 from share.io.files import atomic_write, writable_dir, writing
 from share.io.kalibr import to_kalibr
 from share.io.pool import Pool
@@ -100,7 +101,7 @@ def _exposures(pool: Pool, stage: Stage, who: int, work: Path, progress: Progres
     actor, kept = stage.actors[who], work / f"{stage.actors[who].name}.brightness.npy"
     jobs = shooting.looks(who, actor)
     if kept.exists():
-        brightness = np.load(kept)
+        brightness = read_array(kept)
     else:
         values: dict[int, F64] = {}
         for job, seen in pool.run(shooting.meter, jobs):

@@ -10,11 +10,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from share.errors import DataError
 from share.evaluator.features import Features
 from share.types import F32
 
 OUTPUTS = ("log_error", "embedding", "distance")
 MOST_CM = 20.0  # from where on a tracker is as good as lost: more is neither taught nor told
+_MOST_LOG = 10.0  # of what a network says, either way: e^10 cm is far above MOST_CM
 _WIDER = 2.0  # times as wide, by logarithms, where the network has seen nothing alike
 
 
@@ -41,10 +43,12 @@ class Estimate:
 
 
 def estimate(network: Network, features: Features) -> Estimate:
-    """Of one keyframe."""
+    """Of one keyframe. Raises DataError where the network says no number."""
     inputs = {name: value[None] for name, value in features.named().items()}
     log_error, embedding, distance = network.run(OUTPUTS, inputs)
-    expected, low, high = log_error[0].tolist()
+    if not (np.isfinite(log_error).all() and np.isfinite(distance).all()):
+        raise DataError("the error model says no number of a keyframe")
+    expected, low, high = np.clip(log_error[0], -_MOST_LOG, _MOST_LOG).tolist()  # exp of more may be none
     strange = bool(distance[0] > 1)
     if strange:
         low, high = expected + _WIDER * (low - expected), expected + _WIDER * (high - expected)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from share.io.figure import save
 from share.io.trajectory import Trajectory
 from share.mocap.align import Aligned
 from share.mocap.offset import WINDOW_NS, imu_turning, mocap_turning
@@ -38,8 +39,7 @@ def draw_alignment(path: Path, devices: Mapping[str, tuple[Aligned, Trajectory]]
     above.set_aspect("equal", adjustable="datalim")
     above.grid(alpha=0.3)
     above.legend()
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    save(figure, path, 110)
 
 
 def _broken(truth: Trajectory) -> F64:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from share.io.figure import save
 from share.metrics.bootstrap import Interval
 from share.types import F64
 
@@ -47,8 +48,7 @@ def draw_bars(
     axes[-1, 0].set_xticks(at, groups, rotation=30, ha="right")
     handles, names = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper right", ncols=len(names), fontsize=8)
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    save(figure, path, 110)
 
 
 def draw_parts(
@@ -76,8 +76,7 @@ def draw_parts(
     axis.grid(axis="x", alpha=0.3)
     axis.set_axisbelow(True)
     figure.legend(loc="outside upper right", ncols=len(series), fontsize=8)
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    save(figure, path, 110)
 
 
 def draw_lines(
@@ -97,8 +96,7 @@ def draw_lines(
     axes[-1, 0].set_xlabel(across)
     handles = [pyplot.Line2D([], [], color=_COLOURS[k % len(_COLOURS)]) for k in range(len(names))]
     figure.legend(handles, names, loc="outside upper right", ncols=max(1, len(names)), fontsize=8)
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    save(figure, path, 110)
 
 
 def draw_ways(path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]]) -> None:
@@ -126,8 +124,7 @@ def draw_ways(path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]]) -
     figure.supylabel("m")
     handles = [pyplot.Line2D([], [], color=colour, marker="o") for colour in colours.values()]
     figure.legend(handles, names, loc="outside upper right", ncols=max(1, len(names)), fontsize=8)
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    save(figure, path, 110)
 
 
 def draw_heat(
@@ -149,8 +146,7 @@ def draw_heat(
         for (i, j), cell in np.ndenumerate(cells):
             dark = np.isfinite(cell) and image.norm(cell) > 0.5
             axis.text(j, i, f"{cell:.3g}", ha="center", va="center", color="white" if dark else "black")
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    save(figure, path, 110)
 
 
 def _pyplot() -> Any:

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from share.io.regular_file import MB, open_regular
+
+_PIECE = 10 * MB  # the rest the next time
+
 
 class GrowingFile:
     """Its lines, each once. partial: the name that it has until it is whole; what has the other name before
@@ -24,8 +28,8 @@ class GrowingFile:
 
     def _beyond(self, path: Path) -> bytes:
         try:
-            with path.open("rb") as file:
+            with open_regular(path) as file:
                 file.seek(self._read)
-                return file.read()
+                return file.read(_PIECE)
         except OSError:
             return b""

@@ -75,8 +75,9 @@ def _of_db3(path: Path, told: Callable[[int, int], None]) -> ImuTable:
     from share.io.realsense.recorded import recorded_imu  # rosbags only where it is needed
 
     told(0, 1)
-    file = Db3(path)
-    table = _table(path.stem, *recorded_imu(file), serial=file.serial)
+    file, losses = Db3(path), Losses()
+    stamps, values = recorded_imu(file, losses)
+    table = _table(path.stem, stamps, values, file.serial, sum(losses.counts.values()))
     told(1, 1)
     return table
 

@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 from share.errors import UsageError
 from share.io.files import atomic_write, writing
+from share.io.regular_file import KEYS, read_text
 
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
 _Z85 = r"[0-9a-zA-Z.:+=^!/*?&<>()\[\]{}@%$#-]{40}"
@@ -282,7 +283,7 @@ def _checked(name: str) -> str:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text("ascii")
+        return read_text(path, KEYS, "ascii")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise UsageError(f"{path}: cannot be read: {reason}") from None

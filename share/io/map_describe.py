@@ -8,7 +8,7 @@ from typing import Any
 from share.core.keeping import Kept, placed
 from share.io.map_export import file_names
 from share.io.map_store import MapStore
-from share.io.map_store.connect import log_of
+from share.io.sqlite_file import log_of
 
 
 def describe_map(store: MapStore) -> dict[str, Any]:

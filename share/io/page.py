@@ -8,6 +8,9 @@ import re
 from functools import partial
 from pathlib import Path
 
+from share.io.images import read_picture
+from share.io.inside import inside
+
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem;
   color: #222; }
@@ -39,7 +42,7 @@ def page(title: str, text: str, folder: Path) -> str:
 
 def _figure(folder: Path, found: re.Match[str]) -> str:
     said, name = found[1], html.unescape(found[2])
-    data = base64.b64encode((folder / name).read_bytes()).decode()
+    data = base64.b64encode(read_picture(inside(folder, name, "a report"))).decode()
     return (
         f'<figure>\n<img alt="{said}" src="data:image/png;base64,{data}">\n'
         f"<figcaption>{said}</figcaption>\n</figure>"

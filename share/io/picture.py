@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from share.geometry.se3 import transform
+from share.io.figure import save
 from share.io.trajectory import Trajectory
 from share.types import F64
 
@@ -50,5 +51,4 @@ def draw_trajectories(
         if axes.get_legend_handles_labels()[0]:
             axes.legend()
     figure.suptitle(title)
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    save(figure, path, 110)

@@ -15,7 +15,11 @@ from typing import BinaryIO
 MB = 10**6
 SETTINGS = 2 * MB  # YAML that a person or a calibration wrote; ours with all provenance has 0.1
 TABLE = 4000 * MB  # of numbers as text: half a day of a 1 kHz IMU
-REPORT = 1000 * MB  # JSON that our own commands wrote; the events of a day
+REPORT = 100 * MB  # one JSON object that our own commands wrote; of a day of eight agents 30
+EVENTS = 1000 * MB  # a JSON object a line; the events of a day
+KEYS = 10 * MB  # public keys, a line each: 100,000 machines
+ARRAYS = 2000 * MB  # labels of a run, weights; a run of an hour at 5 keyframes a second has 300
+LOG = 100 * MB  # what a child process said
 _FLAGS = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY
 _KINDS = {
     stat.S_IFDIR: "it is a folder",
@@ -63,6 +67,16 @@ def read_bytes(path: Path, most: int) -> bytes:
 def read_text(path: Path, most: int, encoding: str = "utf-8") -> str:
     """Likewise, with \\n at the end of every line. Raises OSError, UnicodeDecodeError."""
     return read_bytes(path, most).decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
+
+
+def is_hollow(path: Path) -> bool:
+    """Whether a file is nearly all holes: it says a size that takes no disk. File systems that pack what is
+    in a file do not get as far. Raises OSError."""
+    found = os.stat(path)
+    return found.st_size > MB + _PACKED * _BLOCK * found.st_blocks
+
+
+_BLOCK, _PACKED = 512, 50
 
 
 def _refused(path: Path, kind: int) -> OSError:

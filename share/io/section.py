@@ -82,16 +82,22 @@ class Section:
         return numbers
 
 
-def read_yaml(path: Path) -> Section:
-    """The top mapping of a YAML file, also of one that OpenCV wrote (`%YAML:1.0`, `!!opencv-matrix`)."""
+def text_of(path: Path) -> str:
+    """What a YAML file says. Raises ConfigError."""
     try:
-        text = read_text(path, SETTINGS)
+        return read_text(path, SETTINGS, "utf-8-sig")  # some editors begin with a byte-order mark
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give the calibration with --calib") from None
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: is not a text file") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def read_yaml(path: Path) -> Section:
+    """The top mapping of a YAML file, also of one that OpenCV wrote (`%YAML:1.0`, `!!opencv-matrix`). Raises
+    ConfigError."""
+    text = text_of(path)
     lines = text.replace("!!opencv-matrix", "").split("\n")
     if lines[0].startswith("%YAML"):  # not valid YAML: the directive needs a space, and a `---` after it
         lines[0] = ""

@@ -21,20 +21,23 @@ from share.types import F64, I64
 
 Row = TypeVar("Row", bound=tuple[Any, ...])
 MOST_NS = 2**62  # of a stamp, to either side: 146 years, and differences still fit 64 bits
-_HEAD = 4096  # characters in which a binary file shows itself
+_HEAD = 4096  # bytes in which a binary file shows itself
 
 
 def read_text(path: Path) -> str:
     """The text of a file. Raises DataError if it is missing, unreadable or binary."""
     try:
-        text = regular_file.read_text(path, TABLE, "utf-8-sig")  # spreadsheets begin with a byte-order mark
+        with regular_file.open_regular(path, TABLE) as file:  # before all of it is in memory
+            binary = b"\0" in file.read(_HEAD)
+        # spreadsheets begin with a byte-order mark
+        text = "" if binary else regular_file.read_text(path, TABLE, "utf-8-sig")
     except FileNotFoundError:
         raise DataError(f"{path}: no such file; the recording is not complete") from None
     except UnicodeDecodeError:
         raise DataError(f"{path}: is not a text file; the recording is damaged") from None
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from None
-    if "\0" in text[:_HEAD]:
+    if binary:
         raise DataError(f"{path}: is not a text file; the recording is damaged")
     return text
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from share.errors import UsageError
+from share.errors import DataError, UsageError
+from share.io.regular_file import SETTINGS, read_text
 from share.run.as_text import picture
 from share.train.score import read_scores, table
 
@@ -31,8 +32,16 @@ def annex(path: Path, number: int) -> Annex:
             f"or a file by `share train compare --json`"
         )
     heat = path / HEAT
-    text = f"## Settings tried: {path.name}\n\n{(path / SWEEP).read_text()}"
+    text = f"## Settings tried: {path.name}\n\n{_text(path / SWEEP)}"
     if not heat.is_file():
         return Annex(text, {})
     name = f"heat-{number}.png"
     return Annex(f"{text}\n{picture('Means over the first two settings', name)}\n", {name: heat})
+
+
+def _text(path: Path) -> str:
+    try:
+        return read_text(path, SETTINGS)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not a text file"
+        raise DataError(f"{path}: cannot be read: {reason}") from None

@@ -17,6 +17,7 @@ from share.config import Config, load
 from share.errors import DataError, ShareError, UsageError
 from share.io.pool import Pool
 from share.io.session import Session
+from share.io.settings_file import read_settings
 from share.run.play import Progress, Terms
 from share.run.trial import RUN, SETTINGS, Trial, read_trial, run_trial, settings_of
 
@@ -117,7 +118,7 @@ def _as_planned(planned: Planned) -> Trial:
     """A setting that the run did not know yet counts as it is shipped."""
     trial = read_trial(planned.out)
     text = settings_of(planned.config, planned.terms.seed)
-    settings = load((planned.out / SETTINGS).read_text(), str(planned.out / SETTINGS))
+    settings = read_settings(planned.out / SETTINGS)
     played = trial.session.folder.resolve(), trial.terms, settings
     wanted = planned.session.folder.resolve(), planned.terms, load(text)
     if played != wanted:

@@ -9,7 +9,7 @@ from typing import Any
 
 from share.core.world import Cost, Costs
 from share.errors import DataError, UsageError
-from share.io.json_file import read_json
+from share.io.json_file import as_we_write_it, read_json
 
 _USUAL = Costs()
 
@@ -23,6 +23,11 @@ def costs_of(run: Path) -> Costs:
     edge, agents = run / "edge" / "edge.json", sorted(run.glob("*/report.json"))
     if not edge.is_file() or not agents:
         raise UsageError(f"--costs {run}: is not a run by `share evaluate run`")
+    with as_we_write_it(run):
+        return _costs(edge, agents)
+
+
+def _costs(edge: Path, agents: Sequence[Path]) -> Costs:
     told = read_json(edge)
     frame = _cost([read_json(path)["track_ms"] for path in agents], edge)
     query, verify, solve = (

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from share.errors import DataError
-from share.io.json_file import read_json, read_json_lines
+from share.io.json_file import as_we_write_it, read_json, read_json_lines
 from share.io.trajectory import Trajectory
 from share.metrics.ate import Ate
 from share.metrics.figures import AgentFigures, Conditions, RunFigures
@@ -24,6 +24,11 @@ from share.types import F64
 
 def figures(trial: Trial) -> RunFigures:
     """Raises DataError on damaged files."""
+    with as_we_write_it(trial.folder):
+        return _figures(trial)
+
+
+def _figures(trial: Trial) -> RunFigures:
     found = score(trial.session, trial.folders)
     edge = read_json(trial.folder / "edge" / "edge.json")
     joined_s = _joined(trial.folder / "edge" / "events.jsonl")
@@ -41,7 +46,7 @@ def figures(trial: Trial) -> RunFigures:
             terms.seed,
             trial.clock,
             trial.told,
-            trial.record.get("code", ""),
+            trial.record.get("code") or "",
         ),
         agents,
         in_one_map=0 if found.joint is None else len(found.joint.agents),

@@ -67,8 +67,8 @@ def make(jobs: Sequence[Job], config: Config, workers: int) -> Iterator[tuple[Jo
     for job in jobs:
         if job.out.exists():
             found = read_labels(job.out)
-            if found.about["seed"] != job.seed:
-                raise UsageError(f"{job.out}: is of seed {found.about['seed']}; give another --out")
+            if (seed := found.about.get("seed")) != job.seed:
+                raise UsageError(f"{job.out}: is of seed {seed}; give another --out")
             yield job, found
     if workers == 1:
         for job in left:

@@ -16,6 +16,7 @@ from share.config import STREAMED
 from share.errors import ShareError
 from share.io.files import writable_dir
 from share.io.growing_file import GrowingFile
+from share.io.regular_file import LOG, read_bytes
 from share.io.session import Session
 from share.io.transport.links import Links
 from share.metrics.together import Together
@@ -107,7 +108,7 @@ def _address(edge: subprocess.Popen[bytes], log: Path) -> str:
     """Where the edge listens, as it says itself."""
     deadline = time.monotonic() + START_S
     while time.monotonic() < deadline:
-        found = re.search(r"listening on (tcp://\S+?),", log.read_text())
+        found = re.search(r"listening on (tcp://\S+?),", _said(log))
         if found:
             return found[1]
         if edge.poll() is not None:
@@ -153,5 +154,9 @@ class _Onlooker:
 
 
 def _last_line(log: Path) -> str:
-    lines = [line for line in log.read_text().splitlines() if line.strip()]
+    lines = [line for line in _said(log).splitlines() if line.strip()]
     return lines[-1] if lines else "it said nothing"
+
+
+def _said(log: Path) -> str:
+    return read_bytes(log, LOG).decode(errors="replace")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from share.io.json_file import read_json, read_json_lines
+from share.io.json_file import as_we_write_it, read_json, read_json_lines
 from share.io.trajectory import Trajectory, read_tum
 from share.run.trial import Trial
 from share.types import F64
@@ -33,8 +33,10 @@ class Trace:
 
 def traces(trial: Trial) -> dict[str, Trace]:
     """By agent. Raises DataError on damaged files."""
-    series = read_json(trial.folder / "edge" / "edge.json")["series"]
-    return {name: Trace.of(series.get(name, {})) for name in trial.session.agents}
+    path = trial.folder / "edge" / "edge.json"
+    with as_we_write_it(path):
+        series = read_json(path)["series"]
+        return {name: Trace.of(series.get(name, {})) for name in trial.session.agents}
 
 
 def began_s(events: list[dict[str, Any]]) -> float:
@@ -53,7 +55,12 @@ class Merges:
 
 def merges(trial: Trial) -> Merges:
     """Where they were done. Raises DataError on damaged files."""
-    events = read_json_lines(trial.folder / "edge" / "events.jsonl")
+    path = trial.folder / "edge" / "events.jsonl"
+    with as_we_write_it(path):
+        return _merges(trial, read_json_lines(path))
+
+
+def _merges(trial: Trial, events: list[dict[str, Any]]) -> Merges:
     began = began_s(events)
     done = [event for event in events if event["event"] in _MERGES]
     done_s = np.array([event["t_s"] - began for event in done], float)

@@ -16,7 +16,7 @@ from typing import Any
 from share import __version__
 from share.config import Config
 from share.core.measurement import CAM0
-from share.errors import DataError, UsageError
+from share.errors import ConfigError, DataError, UsageError
 from share.io.code_state import code_state
 from share.io.files import atomic_write, new_folder
 from share.io.json_file import plain, read_json
@@ -25,7 +25,7 @@ from share.io.session import Session, read_session
 from share.io.source import open_source
 from share.run.play import Progress, Terms, play
 from share.run.virtual import play_virtually
-from share.strict import to_mapping
+from share.strict import from_mapping, to_mapping
 
 RUN = "run.json"
 SETTINGS = "config.yaml"
@@ -103,10 +103,12 @@ def read_trial(folder: Path) -> Trial:
         raise UsageError(f"{folder}: has no {RUN}; it is not a run by `share evaluate run`")
     record = read_json(path)
     try:
-        terms = Terms(**{name: record[name] for name in _TERMS if name in record})
-        session = record["session"]
-    except (KeyError, TypeError) as error:
-        raise DataError(f"{path}: is damaged: {error!r}") from None
+        terms = from_mapping(Terms, {name: record[name] for name in _TERMS if name in record}, "terms")
+    except ConfigError as error:
+        raise DataError(f"{path}: is damaged: {error}") from None
+    session, told = record.get("session"), [record.get(name) for name in ("error_model", "code")]
+    if not isinstance(session, str) or not all(isinstance(one, str | None) for one in told):
+        raise DataError(f"{path}: is damaged: session, error_model or code is no text")
     if not Path(session).is_dir():
         raise UsageError(f"{path}: its session {session} is not there any more, and with it the truth")
     opened = read_session(Path(session))

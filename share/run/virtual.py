@@ -25,6 +25,7 @@ from share.io.files import atomic_write, writable_dir
 from share.io.line_file import LineFile
 from share.io.network import error_model
 from share.io.session import Session, read_session
+from share.io.settings_file import read_settings
 from share.io.source import Source, open_source
 from share.io.transport.links import Links
 from share.metrics.local_error import LocalError
@@ -49,7 +50,7 @@ def play_virtually(
 
     Raises UsageError where an agent's recording cannot be tracked or the policy is one that streams.
     """
-    settings = config.load(Path(terms.config).read_text(), terms.config) if terms.config else Config()
+    settings = read_settings(Path(terms.config)) if terms.config else Config()
     settings = dataclasses.replace(settings, edge=dataclasses.replace(settings.edge, policy=terms.policy))
     if terms.policy == config.STREAMED:
         raise UsageError("policy streamed is not played in virtual time: its agents do not track")

@@ -9,7 +9,8 @@ from typing import Any
 
 from share.errors import UsageError
 from share.evaluator.model import Network
-from share.io.network import deep_of, open_network
+from share.io.json_file import as_we_write_it
+from share.io.network import deep_of, open_network, read_model
 from share.train.fitted import Fitted, read_fitted
 from share.train.graph import backbone_id, with_heads
 from share.train.rivals import Rows
@@ -36,13 +37,17 @@ class Assembly:
 def assemble(fit: Path, labels: Path, base: Path) -> Assembly:
     """fit: a folder by `share train fit`. Raises UsageError where labels or base are not what it was taught
     on, DataError."""
-    fitted = read_fitted(fit / "fit.npz")
-    collection = collect(labels, fitted.about["options"]["seed"])
-    _check_rooms(collection, fitted.about, labels)
-    given = base.read_bytes()
-    if backbone_id(given) != fitted.about["backbone"]:
+    fitted = read_fitted(file := fit / "fit.npz")
+    with as_we_write_it(file):
+        seed, backbone = int(fitted.about["options"]["seed"]), fitted.about["backbone"]
+    collection = collect(labels, seed)
+    with as_we_write_it(file):
+        _check_rooms(collection, fitted.about, labels)
+    given = read_model(base)
+    if backbone_id(given) != backbone:
         raise UsageError(f"{base}: has another backbone than the one that {fit} was taught for")
-    model = with_heads(given, fitted)
+    with as_we_write_it(file):
+        model = with_heads(given, fitted)
     network = open_network(model)
     return Assembly(fitted, collection, model, network, deep_of(network, collection.table.picture))
 

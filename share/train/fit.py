@@ -13,10 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from share.errors import DataError
 from share.io.files import atomic_write
+from share.io.regular_file import MB, read_bytes
 from share.train.network import Heads, loss
 from share.types import F32
 
+_MOST_BYTES = 200 * MB  # of a checkpoint: four heads and their moments have 5
 Show = Callable[[int, float, float], None]  # epoch, loss where it learns, loss where it stops
 
 
@@ -76,11 +79,16 @@ def fit(learn: Inputs, stop: Inputs, options: FitOptions, checkpoint: Path | Non
     at, best = _Progress(), _copy(heads)
     what = {**dataclasses.asdict(options), "learn": learn.crc, "stop": stop.crc}
     if checkpoint is not None and checkpoint.is_file():
-        kept = torch.load(checkpoint, map_location=device, weights_only=True)
-        if kept["what"] == what:
-            heads.load_state_dict(kept["heads"])
-            optimiser.load_state_dict(kept["optimiser"])
-            at, best = _Progress(**kept["at"]), kept["best"]
+        try:
+            kept = torch.load(
+                io.BytesIO(read_bytes(checkpoint, _MOST_BYTES)), map_location=device, weights_only=True
+            )
+            if kept["what"] == what:
+                heads.load_state_dict(kept["heads"])
+                optimiser.load_state_dict(kept["optimiser"])
+                at, best = _Progress(**kept["at"]), kept["best"]
+        except Exception as error:  # torch, pickle and zip each have their own
+            raise DataError(f"{checkpoint}: is damaged; remove it to begin anew ({error!r:.200})") from None
     rows, checked = learn.tensors(device), stop.tensors(device)
     while at.epoch < options.epochs and at.epoch - at.best_epoch < options.patience:
         learnt = _epoch(heads, optimiser, rows, options, at.epoch)

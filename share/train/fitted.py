@@ -13,11 +13,15 @@ from typing import Any
 import numpy as np
 
 from share.errors import DataError
+from share.io.arrays import read_arrays
 from share.io.files import atomic_write
+from share.io.json_file import parse_json
+from share.io.regular_file import MB
 from share.types import F32, F64
 
 COVERED = 0.9  # of all errors lie in their intervals
 KNOWN = 0.99  # of what it was calibrated on is no further than what it knows
+_MOST_BYTES = 200 * MB  # four heads have 1.6
 _RIDGE = 1e-3  # of a variance, added
 
 
@@ -74,14 +78,14 @@ def write_fitted(path: Path, fitted: Fitted) -> None:
 
 def read_fitted(path: Path) -> Fitted:
     """Raises DataError that names it."""
+    found = read_arrays(path, "is not by `share train fit`", _MOST_BYTES)
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as found:
-            heads: defaultdict[str, dict[str, F32]] = defaultdict(dict)
-            for number, _, name in (key.partition("/") for key in found if "/" in key):
-                heads[number][name] = found[f"{number}/{name}"]
-            about = json.loads(str(found["about"]))
-            return Fitted(
-                list(heads.values()), float(found["margin"]), found["mean"], found["whitening"], about
-            )
-    except Exception as error:  # numpy, zip and json each have their own
-        raise DataError(f"{path}: is not by `share train fit`, or damaged: {error}") from None
+        about = parse_json(str(found.pop("about")))
+        if bad := [name for name, value in found.items() if not np.isfinite(value).all()]:
+            raise ValueError(f"{bad[0]} is not finite")
+        heads: defaultdict[str, dict[str, F32]] = defaultdict(dict)
+        for number, _, name in (key.partition("/") for key in found if "/" in key):
+            heads[number][name] = found[f"{number}/{name}"]
+        return Fitted(list(heads.values()), float(found["margin"]), found["mean"], found["whitening"], about)
+    except (KeyError, ValueError, TypeError) as error:
+        raise DataError(f"{path}: is not by `share train fit`, or damaged: {error!r:.200}") from None

@@ -17,7 +17,9 @@ import numpy as np
 
 from share.errors import DataError
 from share.evaluator.features import SHAPES, Features, kind_of
+from share.io.arrays import read_arrays
 from share.io.files import atomic_write
+from share.io.json_file import parse_json
 from share.types import F32, I64, U8
 
 SCHEMA = 4
@@ -53,7 +55,12 @@ class Labels:
         )
 
 
-_COLUMNS = ("stamps_ns", "error_cm", *SHAPES)
+_KINDS: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
+    "stamps_ns": ((), np.int64),
+    "error_cm": ((), np.float32),
+    **{name: (shape, kind_of(name)) for name, shape in SHAPES.items()},
+}
+_COLUMNS = tuple(_KINDS)
 
 
 def write_labels(path: Path, labels: Labels) -> None:
@@ -66,14 +73,19 @@ def write_labels(path: Path, labels: Labels) -> None:
 
 def read_labels(path: Path) -> Labels:
     """Raises DataError that names it."""
+    found = read_arrays(path, "is no file of labels")
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as found:
-            about = json.loads(str(found["about"]))
-            columns = [found[name] for name in _COLUMNS]
-    except Exception as error:  # numpy, zip and json each have their own
-        raise DataError(f"{path}: is no file of labels, or damaged: {error}") from None
-    if about.pop("schema", None) != SCHEMA:
-        raise DataError(f"{path}: is of another schema than {SCHEMA}; make it anew with `share train labels`")
-    if len({len(column) for column in columns}) != 1:
-        raise DataError(f"{path}: is damaged: its columns differ in length")
+        about = parse_json(str(found["about"]))
+        columns = [found[name] for name in _COLUMNS]
+        if about.pop("schema", None) != SCHEMA:
+            raise DataError(
+                f"{path}: is of another schema than {SCHEMA}; make it anew with `share train labels`"
+            )
+        count = len(columns[0])
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        raise DataError(f"{path}: is no file of labels, or damaged: {error!r:.200}") from None
+    for name, column in zip(_COLUMNS, columns, strict=True):
+        shape, kind = _KINDS[name]
+        if column.shape != (count, *shape) or column.dtype != kind:
+            raise DataError(f"{path}: is damaged: {name} is {column.shape} of {column.dtype}")
     return Labels(about, *columns)

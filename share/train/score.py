@@ -8,9 +8,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from share.errors import DataError
-from share.io.json_file import known, with_nan
+from share.io.json_file import known, parse_json, with_nan
+from share.io.regular_file import SETTINGS, read_text
 
 
 @dataclass(frozen=True)
@@ -50,12 +52,19 @@ def to_json(scores: Sequence[Score]) -> str:
 def read_scores(path: Path) -> list[Score]:
     """What `to_json` wrote. Raises DataError."""
     try:
-        rows = json.loads(path.read_text())
+        rows = parse_json(read_text(path, SETTINGS))
         if not isinstance(rows, list):
             raise ValueError("it is no list")
-        return [Score(**with_nan(row)) for row in rows]
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+        return [_score(with_nan(row)) for row in rows]
+    except (OSError, ValueError, TypeError, AttributeError, KeyError) as error:
         raise DataError(f"{path}: is not by `share train compare --json`, or damaged: {error}") from None
+
+
+def _score(row: dict[str, Any]) -> Score:
+    numbers = (value for name, value in row.items() if name != "name")
+    if not isinstance(row["name"], str) or not all(isinstance(value, int | float) for value in numbers):
+        raise ValueError("it has text where numbers should be")
+    return Score(**row)
 
 
 def _percent(value: float) -> str:

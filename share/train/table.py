@@ -14,6 +14,7 @@ from share.columns import Columns
 from share.errors import UsageError
 from share.evaluator.features import SHAPES, Features
 from share.evaluator.model import MOST_CM
+from share.io.json_file import as_we_write_it
 from share.train.label_file import Labels, read_labels
 from share.train.split import groups, split
 from share.types import F32, I64, U8
@@ -68,7 +69,11 @@ def collect(folder: Path, seed: int) -> Collection:
     paths = sorted(folder.glob("*.npz"))
     if not paths:
         raise UsageError(f"{folder}: has no labels; make them with `share train labels`")
-    found = [read_labels(path) for path in paths]
+    found = []
+    for path in paths:
+        found.append(read_labels(path))
+        with as_we_write_it(path):
+            groups([found[-1].about])
     abouts = [labels.about for labels in found]
     group = groups(abouts)
     if len(np.unique(group)) < 4:

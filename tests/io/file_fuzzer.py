@@ -1,7 +1,7 @@
 """A small fuzzer of files: valid recordings, calibrations and maps, damaged by chance, each read in a child
 process with bounds on memory and time. A run ends well with a result or a ShareError, else with a complaint.
 
-    python tests/io/file_fuzzer.py SECONDS [SEED]
+    python tests/io/file_fuzzer.py SECONDS [SEED [NAME,NAME]]
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import re
 import resource
 import shutil
 import signal
+import sqlite3
 import sys
 import tempfile
 import time
@@ -24,26 +25,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from live import RIG, live
-from map_changes import small_map
-from recordings import make_euroc, make_tum
+from file_seeds import seeds
 
-from share import config
-from share.cli.options import load_config
-from share.core.sequencer import SequencerCounters
 from share.errors import ShareError
-from share.io.calibration import read_calibration
-from share.io.describe import describe
-from share.io.imu_table import read_imu
-from share.io.kalibr import kalibr_texts
-from share.io.map_describe import describe_map
-from share.io.map_store import MapStore
-from share.io.mcap.recorder import Recorder
-from share.io.mcap.recover import recover
-from share.io.mocap_file import read_bodies
-from share.io.session import read_session
-from share.io.source import open_source
-from share.run.pipeline import frames_of, tracker_for
 
 MEMORY = 3 * 2**30  # of addresses: Python, OpenCV and NumPy take 1.5 of them
 SECONDS = 30  # of CPU time, for one case
@@ -54,114 +38,13 @@ EXTREMES = (
 )  # fmt: skip
 
 
-def _tracked(source: object) -> None:
-    tracker = tracker_for(source, config.Config())
-    for frame in frames_of(source, config.Config(), SequencerCounters()):
-        if tracker.track(frame).keyframe:
-            tracker.keyframe(frame)
-            tracker.settle()
-
-
-def read_recording(path: Path) -> None:
-    source = open_source(str(path))
-    with contextlib.suppress(ShareError):
-        describe(source)
-    with contextlib.suppress(ShareError):
-        source.truth()
-    with contextlib.suppress(ShareError):
-        read_imu(str(path))
-    source.losses.lines()
-    _tracked(source)
-
-
-def read_mcap(path: Path) -> None:
-    with contextlib.suppress(ShareError):
-        recover(path, path.with_name("saved.mcap"))
-    read_recording(path)
-
-
-def read_a_session(path: Path) -> None:
-    session = read_session(path)
-    for name in session.agents:
-        read_recording(path / name)
-
-
-def read_map(path: Path) -> None:
-    with contextlib.suppress(ShareError):
-        describe_map(MapStore.read(path))
-    with MapStore.open(path) as store:
-        store.load()
-    assert MapStore.read(path).load() is not None
-
-
-def read_settings(path: Path) -> None:
-    load_config(str(path))
-
-
-Seed = tuple[Callable[[Path], None], Path]
-
-
-def seeds(root: Path) -> dict[str, Seed]:
-    """What is damaged, and by whom it is read."""
-    make_euroc(root / "euroc", frames=12)
-    make_tum(root / "tum", frames=12)
-    with Recorder(root / "a.mcap", RIG) as recorder:
-        for m in live(12):
-            recorder.write(m)
-    (root / "session" / "truth").mkdir(parents=True)
-    shutil.copyfile(root / "a.mcap", root / "session" / "ann.mcap")
-    texts = kalibr_texts(RIG, "a rig")
-    chain = "".join("      " + line + "\n" for text in texts.values() for line in text.splitlines())
-    (root / "session" / "session.yaml").write_text(
-        f"schema: 1\nprovenance: {{a: 1}}\nagents:\n  ann:\n    kind: ar\n    sensors: rgbd+imu\n    rate_hz: 20.0\n"  # noqa: E501
-        f"    clock_offset_ns: 5\n    calibration:\n{chain}"
-    )
-    (root / "session" / "truth" / "ann.tum").write_text("1.0 0 0 0 0 0 0 1\n1.1 0 0 0 0 0 0 1\n")
-    (root / "calib").mkdir()
-    for name, text in texts.items():
-        (root / "calib" / name).write_text(text)
-    with MapStore.open(root / "map.sqlite") as store:
-        store.write(small_map(12, points=10))
-    (root / "map.sqlite.lock").unlink()
-    (root / "config.yaml").write_text("tracker: {}\nedge: {}\ncontrol:\n  kp: 0.8\n  agents: {}\n")
-    (root / "motive.csv").write_text(_MOTIVE)
-    (root / "vicon.csv").write_text(_VICON)
-    return {
-        "euroc": (read_recording, root / "euroc"),
-        "tum": (read_recording, root / "tum"),
-        "mcap": (read_mcap, root / "a.mcap"),
-        "session": (read_a_session, root / "session"),
-        "calib": (read_calibration, root / "calib"),  # type: ignore[dict-item]
-        "map": (read_map, root / "map.sqlite"),
-        "config": (read_settings, root / "config.yaml"),
-        "motive": (read_bodies, root / "motive.csv"),  # type: ignore[dict-item]
-        "vicon": (read_bodies, root / "vicon.csv"),  # type: ignore[dict-item]
-    }
-
-
-_MOTIVE = """Format Version,1.23,Rotation Type,Quaternion,Length Units,Meters,Coordinate Space,Global
-
-,Type,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body
-,Name,A,A,A,A,A,A,A
-,ID,1,1,1,1,1,1,1
-,,Rotation,Rotation,Rotation,Rotation,Position,Position,Position
-Frame,Time (Seconds),X,Y,Z,W,X,Y,Z
-""" + "".join(f"{k},{k / 100},0,0,0,1,{k / 10},0,1\n" for k in range(20))
-_VICON = """Objects
-100
-,,Ann:Ann,,,,,
-Frame,Sub Frame,RX,RY,RZ,TX,TY,TZ
-,,deg,deg,deg,mm,mm,mm
-""" + "".join(f"{k},0,0.1,0.2,0.3,{k},2,3\n" for k in range(1, 20))
-
-
 # ------------------------------------------------------------------ damage
 
 
 def damage(path: Path, rng: np.random.Generator) -> str:
     """One file of `path`, damaged in one to three ways; what was done."""
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    text = [p for p in files if p.suffix in (".yaml", ".csv", ".txt", ".tum")]
+    text = [p for p in files if p.suffix in (".yaml", ".csv", ".txt", ".tum", ".json", ".jsonl", ".gltf")]
     pool = text if text and rng.random() < 0.6 else files
     file = pool[int(rng.integers(len(pool)))]
     said = []
@@ -236,6 +119,26 @@ def nest(file: Path, rng: np.random.Generator) -> None:
     file.write_bytes(data[:at] + (b"[", b"{a: ", b"- ", b"'", b"?")[int(rng.integers(5))] * 3000 + data[at:])
 
 
+def row(file: Path, rng: np.random.Generator) -> None:
+    """One message of an SDK recording, damaged as a file is: SQLite sees nothing of it."""
+    if file.suffix != ".db3":
+        return flip(file, rng)
+    with (
+        contextlib.suppress(sqlite3.Error, TypeError, ValueError),  # it is damaged already
+        contextlib.closing(sqlite3.connect(file)) as connection,
+    ):
+        (last,) = connection.execute("SELECT max(id) FROM messages").fetchone()
+        number = int(rng.integers(1, last + 1))
+        (data,) = connection.execute("SELECT data FROM messages WHERE id = ?", (number,)).fetchone()
+        part = file.with_name("message")
+        part.write_bytes(data)
+        (flip, cut, remove, double, extreme)[int(rng.integers(5))](part, rng)
+        connection.execute("UPDATE messages SET data = ? WHERE id = ?", (part.read_bytes(), number))
+        connection.commit()
+        part.unlink()
+    return None
+
+
 def shuffle(file: Path, rng: np.random.Generator) -> None:
     lines = file.read_bytes().splitlines(keepends=True)
     a, b = sorted(int(k) for k in rng.integers(0, len(lines) + 1, 2))
@@ -254,7 +157,7 @@ def pipe(file: Path, rng: np.random.Generator) -> None:
     os.mkfifo(file)
 
 
-_WAYS = (flip, flip, cut, remove, double, move, extreme, extreme, extreme, nest, shuffle)
+_WAYS = (flip, flip, cut, remove, double, move, extreme, extreme, extreme, nest, shuffle, row, row)
 _SPECIAL = (endless, pipe)
 
 
@@ -297,19 +200,26 @@ def _bound() -> None:
 
 
 def fuzz(
-    seconds: float, seed: int, keep: Path | None = None, only: str = ""
+    seconds: float,
+    seed: int,
+    keep: Path | None = None,
+    only: str = "",
+    stopped: Callable[[], bool] = lambda: False,
 ) -> tuple[Counter[str], list[str]]:
-    """Cases for so long (CPU time of children): how many ended how, and what failed."""
+    """Cases for so long (CPU time of children): how many ended how, and what failed. only: names of `seeds`,
+    with commas between."""
     counts: Counter[str] = Counter()
     failures: list[str] = []
     with tempfile.TemporaryDirectory(prefix="fuzz-") as name:
         root = Path(name)
-        made = {what: found for what, found in seeds(root).items() if only in what}
+        wanted = only.split(",")
+        made = {what: found for what, found in seeds(root).items() if only == "" or what in wanted}
         for what, (read, path) in made.items():
             how, why = attempt(read, _copied(path, root / "case"))
             assert how == "well" or what in ("mcap", "session", "euroc", "tum"), f"{what}: {how} {why}"
         number = 0
-        while _spent() < seconds:
+        began_s = _spent()
+        while _spent() - began_s < seconds and not stopped():
             what = list(made)[number % len(made)]
             rng = np.random.default_rng([seed, number])
             case = _copied(made[what][1], root / "case")
@@ -349,11 +259,14 @@ def _copied(path: Path, folder: Path) -> Path:
 
 
 if __name__ == "__main__":
+    stop: list[object] = []
+    signal.signal(signal.SIGINT, lambda *_: stop.append(True))
     told, failed = fuzz(
         float(sys.argv[1]),
         int(sys.argv[2]) if len(sys.argv) > 2 else 1,
         Path(tempfile.mkdtemp(prefix="fuzz-kept-")),
         "".join(sys.argv[3:4]),
+        lambda: bool(stop),
     )
     print(dict(sorted(told.items())))
     sys.exit(bool(failed))

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import time
+from pathlib import Path
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
+from onnx_bytes import FLOAT, field, ints, model, node, number, small_error_model, tensor, value_info
+from special_files import KINDS, special
 
-from share.errors import DataError
+from share.errors import DataError, ShareError
 from share.evaluator.features import SHAPES, features
 from share.evaluator.model import MOST_CM, Estimate, estimate
 from share.evaluator.odometer import Fared, Lately
-from share.io.network import SHIPPED, error_model
+from share.io.network import SHIPPED, deep_of, error_model, open_network, read_model
 from share.types import Footing, TrackState
 
 
@@ -54,3 +60,101 @@ def test_a_file_that_is_no_network_is_named(tmp_path):
     path.write_bytes(b"not a network")
     with pytest.raises(DataError, match=r"mine\.onnx: is no network"):
         error_model(str(path))
+
+
+# ------------------------------------------------------------------ files from anywhere
+
+
+def small(path: Path, **given: Any) -> Path:
+    path.write_bytes(small_error_model(**given))
+    return path
+
+
+def test_one_written_by_hand_is_an_error_model(tmp_path):
+    assert told(error_model(str(small(tmp_path / "a.onnx"))), 80, 78, 0.4).error_cm == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("says", [(np.inf, 0, 0), (np.nan, 0, 0), (0, -np.inf, 0), (1e38, -1e38, 1e38)])
+def test_one_that_says_no_number(tmp_path, says):
+    network = error_model(str(small(tmp_path / "a.onnx", says=says)))
+    if np.isfinite(says).all():
+        assert told(network, 80, 78, 0.4).error_cm == MOST_CM
+        return
+    with pytest.raises(DataError, match="says no number"):
+        told(network, 80, 78, 0.4)
+
+
+BRANCH = field(1, "body") + field(6, field(1, node("Identity", ["x"], "y"))) + field(20, 5)
+EXTERNAL = field(13, field(1, "location") + field(2, "../../../etc/passwd")) + field(14, 1)
+LAYERS = {
+    "a loop": ([node("Loop", ["n"], "y", BRANCH)], [], "a layer of it holds a graph"),
+    "a loop without a body": ([node("Loop", ["n"], "y")], [], "'Loop' is none that an error model may have"),
+    "a size out of nothing": (
+        [node("ConstantOfShape", ["big"], "y")],
+        [ints("big", [10**12])],
+        "'ConstantOfShape'",
+    ),
+    "of another domain": ([node("Relu", ["scalars"], "y", domain="evil")], [], "'evil.Relu'"),
+    "weights elsewhere": ([], [tensor("w", [1], (), EXTERNAL)], "its weights lie in other files"),
+    "weights elsewhere, in a layer": (
+        [node("Constant", [], "y", field(1, "value") + field(5, tensor("w", [1], (), EXTERNAL)))],
+        [],
+        "its weights lie in other files",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LAYERS)
+def test_what_no_error_model_needs_is_not_run(tmp_path, name):
+    more, weights, says = LAYERS[name]
+    with pytest.raises(DataError, match=says) as error:
+        error_model(str(small(tmp_path / "a.onnx", more=more, weights=weights)))
+    assert "\n" not in str(error.value)
+
+
+def test_memory_is_bounded_whatever_layers_make_of_it(tmp_path):
+    """Two of 60,000 numbers, added row to column, are 14 GB."""
+    more = [
+        node("ReduceMean", ["scalars"], "mean"),
+        node("Add", ["mean", "row"], "a"),
+        node("Add", ["a", "column"], "b"),
+        node("ReduceMax", ["b"], "most", number("keepdims", 0)),
+        node("Add", ["said", "most"], "log_error"),
+    ]
+
+    def made(long: int) -> str:
+        weights = [tensor("row", [1, long], [0.0] * long), tensor("column", [long, 1], [0.0] * long)]
+        return str(small(tmp_path / f"{long}.onnx", more=more, weights=weights, first="said"))
+
+    assert error_model(made(60))
+    with pytest.raises(DataError, match=r"is no error model: .*Add"):
+        error_model(made(60_000))
+
+
+def test_cut_short_or_not_of_this_kind(tmp_path):
+    whole = small(tmp_path / "a.onnx").read_bytes()
+    for k in (0, 1, 5, 100, len(whole) // 2, len(whole) - 1):
+        (tmp_path / "b.onnx").write_bytes(whole[:k])
+        with pytest.raises(DataError, match="is no "):
+            error_model(str(tmp_path / "b.onnx"))
+    (tmp_path / "c.onnx").write_bytes(
+        model([node("Relu", ["x"], "y")], [], [value_info("x", FLOAT, [1])], [value_info("y", FLOAT, [1])])
+    )
+    with pytest.raises(DataError, match="is no error model: it takes x, not"):
+        error_model(str(tmp_path / "c.onnx"))
+    with pytest.raises(DataError, match="has no backbone"):
+        deep_of(open_network((tmp_path / "c.onnx").read_bytes()), np.zeros((2, 128, 128), np.uint8))
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "huge"])
+def test_a_model_that_is_no_file(tmp_path, kind):
+    path = tmp_path / "a.onnx"
+    if kind == "huge":
+        with path.open("wb") as file:
+            file.truncate(10**12)
+    else:
+        special(path, kind)
+    began = time.process_time()
+    with pytest.raises(ShareError, match=r"not a regular file|a file of this kind may have"):
+        read_model(path)
+    assert time.process_time() - began < 5

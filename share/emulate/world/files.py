@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from share.emulate.types import Mesh, Room
 from share.errors import DataError, UsageError
+from share.io.json_file import read_json
+from share.io.regular_file import open_regular
 
 _VERSION = 1
 _MESH = ("vertices", "normals", "uv", "layer", "faces")
@@ -40,7 +42,7 @@ def load_room(folder: Path) -> Room:
     """The room saved in `folder`, its arrays mapped read-only. Raises DataError where it is not whole."""
     folder = Path(folder)
     try:
-        head = json.loads((folder / "room.json").read_text())
+        head = read_json(folder / "room.json")
         if head["version"] != _VERSION:
             raise ValueError(f"version {head['version']}, expected {_VERSION}")
         movers = {
@@ -55,7 +57,7 @@ def load_room(folder: Path) -> Room:
             mover_light=float(head["mover_light"]),
             **{key: _load(folder, key) for key in _ROOM},
         )
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (DataError, OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{folder}: not a whole room ({error}): remove it, it will be built again") from None
 
 
@@ -87,7 +89,9 @@ def _publish(part: Path, folder: Path) -> None:
 
 
 def _load(folder: Path, name: str) -> NDArray[Any]:
-    return np.asarray(np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False))
+    path = folder / f"{name}.npy"
+    with open_regular(path):  # a pipe would wait; what is mapped is read only where it is looked at
+        return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
 
 
 def _load_mesh(folder: Path, name: str) -> Mesh:

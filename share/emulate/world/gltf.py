@@ -8,6 +8,7 @@ ceiling, on a grid, because few files carry any.
 from __future__ import annotations
 
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from share.emulate.types import Mesh
 from share.emulate.world.facing import faced
+from share.emulate.world.gltf_file import MOST_TRIANGLES, read_gltf
 from share.emulate.world.layout import Layout, Light, Piece
 from share.emulate.world.materials import Given
 from share.emulate.world.mesh import Shape, concat
@@ -24,9 +26,9 @@ from share.emulate.world.rays import Scene
 from share.errors import DataError, UsageError, not_installed
 from share.types import F32, F64, U8
 
-MOST_TRIANGLES = 300_000
 MOST_PICTURES = 400
 SMALLEST, LARGEST = 1.0, 200.0  # m, along any axis
+_ROWS = 256  # of a texture
 _STEPS = 16  # gray levels of vertex colours
 _LAMP_PITCH = 2.5  # m
 _Z_UP = np.array([(1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1.0)])
@@ -39,7 +41,13 @@ def load_gltf(path: Path) -> Layout:
     path = Path(path)
     if not path.is_file():
         raise UsageError(f"{path}: no such file")
-    pieces = _pieces(_read(path), path)
+    try:
+        pieces = _pieces(_read(path), path)
+    except (DataError, UsageError):
+        raise
+    except Exception as error:  # trimesh and its decoders of pictures raise whatever they do
+        said = str(error).splitlines() or [type(error).__name__]
+        raise DataError(f"{path}: not a readable glTF 2.0 file: {said[0]:.200}") from None
     low, high = concat([p.shape for p in pieces]).bounds
     _check(path, pieces, high - low)
     there = np.eye(4)
@@ -58,11 +66,8 @@ def _read(path: Path) -> Any:
         raise UsageError(f"a glTF room: {not_installed('trimesh', 'emulate')}") from None
     if path.suffix.lower() not in (".gltf", ".glb"):
         raise UsageError(f"{path}: expected a glTF file (.gltf or .glb)")
-    try:
-        return trimesh.load_scene(path)
-    except Exception as error:  # trimesh raises whatever its parsers do
-        said = str(error).splitlines() or [type(error).__name__]
-        raise DataError(f"{path}: not a readable glTF 2.0 file: {said[0]}") from None
+    file = read_gltf(path)
+    return trimesh.load_scene(BytesIO(file.data), path.suffix[1:].lower(), resolver=file.files)
 
 
 def _pieces(scene: Any, path: Path) -> list[Piece]:
@@ -142,8 +147,12 @@ def _linear(texture: Any) -> F32:
     """Luminance (P, P) 0..1 of an sRGB texture (IEC 61966-2-1)."""
     import cv2
 
-    rgb = np.asarray(texture.convert("RGB"), np.float32) / 255
-    light = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4) @ _LUMINANCE
+    pixels = np.asarray(texture.convert("RGB"))
+    light = np.empty(pixels.shape[:2])
+    for top in range(0, len(light), _ROWS):  # some at a time: 50 bytes a pixel
+        rgb = pixels[top : top + _ROWS].astype(np.float32) / 255
+        some = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4) @ _LUMINANCE
+        light[top : top + _ROWS] = some
     smaller = min(light.shape) >= P
     how = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(light.astype(np.float32), (P, P), interpolation=how), np.float32)

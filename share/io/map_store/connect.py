@@ -8,11 +8,11 @@ import sqlite3
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from urllib.parse import quote
 
 from share.errors import StoreError, UsageError
 from share.io.map_store.schema import PAGE_BYTES, first_page
-from share.io.regular_file import open_regular
+from share.io.regular_file import is_hollow, open_regular, read_bytes
+from share.io.sqlite_file import distrust, log_of, read_only
 
 BUSY_S = 5.0  # how long a commit waits for a reader of another process
 WAL_PAGES = 512  # after as many (4 MiB) the log is moved into the file
@@ -46,7 +46,7 @@ class DamageError(StoreError):
 def for_writing(path: Path, power_cut: bool) -> sqlite3.Connection:
     """The one writer. power_cut: a commit waits for the disk, so that not even that costs one."""
     connection = sqlite3.connect(path, BUSY_S, isolation_level=None, check_same_thread=False)
-    _distrust(connection)
+    distrust(connection, _MOST_BYTES)
     connection.execute(f"PRAGMA page_size = {PAGE_BYTES}")
     connection.execute("PRAGMA journal_mode = WAL")
     connection.execute(f"PRAGMA synchronous = {'FULL' if power_cut else 'NORMAL'}")
@@ -56,31 +56,20 @@ def for_writing(path: Path, power_cut: bool) -> sqlite3.Connection:
 
 
 def for_reading(path: Path) -> sqlite3.Connection:
-    """Beside a living writer too. Without a log nobody writes, and no file beside it is needed."""
-    mode = "mode=ro" if log_of(path).exists() else "immutable=1"
-    uri = f"file:{quote(str(path.resolve()))}?{mode}"
-    connection = sqlite3.connect(uri, BUSY_S, uri=True, isolation_level=None, check_same_thread=False)
+    """Beside a living writer too."""
+    connection = sqlite3.connect(
+        read_only(path), BUSY_S, uri=True, isolation_level=None, check_same_thread=False
+    )
     return for_so_long(connection, path)
 
 
 def for_so_long(connection: sqlite3.Connection, path: Path) -> sqlite3.Connection:
     """`connection` to a file from anywhere: after the time that reading so large a file takes on a slow disk,
     whatever it does ends with an error."""
-    _distrust(connection)
+    distrust(connection, _MOST_BYTES)
     until = time.monotonic() + _PATIENCE_S + path.stat().st_size / _BYTES_A_SECOND
     connection.set_progress_handler(lambda: time.monotonic() > until, _STEPS)
     return connection
-
-
-def _distrust(connection: sqlite3.Connection) -> None:
-    connection.execute("PRAGMA trusted_schema = OFF")
-    connection.execute("PRAGMA cell_size_check = ON")
-    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MOST_BYTES)
-
-
-def log_of(path: Path) -> Path:
-    """Where SQLite keeps what is committed, but not yet in the file."""
-    return path.with_name(path.name + "-wal")
 
 
 @contextlib.contextmanager
@@ -108,6 +97,8 @@ def check_is_map(path: Path) -> bool:
             raise UsageError(f"{log_of(path)}: is a link; the log of a map lies beside it")
         with open_regular(path) as file:
             head = file.read(PAGE_BYTES)
+        if is_hollow(path):
+            raise UsageError(f"{path}: is nearly all holes, which no map is; give another file")
     except FileNotFoundError:
         return False
     except OSError as error:
@@ -121,7 +112,7 @@ def check_is_map(path: Path) -> bool:
 
 def is_bare(path: Path) -> bool:
     """A first page without tables and nothing else."""
-    head = path.read_bytes() if os.stat(path).st_size <= PAGE_BYTES else b"CREATE "
+    head = read_bytes(path, PAGE_BYTES) if os.stat(path).st_size <= PAGE_BYTES else b"CREATE "
     return head.startswith(MAGIC) and b"CREATE " not in head
 
 

@@ -13,11 +13,13 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from share.io.files import sync_folder, writing
+from share.io.files import fresh, sync_folder, writing
 from share.io.map_store import connect, schema
 from share.io.map_store.connect import BROKEN
 from share.io.map_store.rows import insert
 from share.io.map_store.scan import Found, whole_rows, with_copies
+from share.io.regular_file import open_regular
+from share.io.sqlite_file import log_of
 
 # What hangs on rows that are lost. A keyframe that its agent still has may come again under its number.
 _ORPHANS = (
@@ -40,9 +42,10 @@ def copied(path: Path, folder: Path | None = None) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix=".map.", dir=folder) as name:
         copy = Path(name) / path.name
         with writing(Path(name)):
-            shutil.copyfile(path, copy)
-            if connect.log_of(path).exists():
-                shutil.copyfile(connect.log_of(path), connect.log_of(copy))
+            for old, new in ((path, copy), (log_of(path), log_of(copy))):
+                if old == path or old.exists():
+                    with open_regular(old) as source, fresh(new) as sink:
+                        shutil.copyfileobj(source, sink)
         yield copy
 
 
@@ -53,7 +56,7 @@ def whole_of(path: Path, folder: Path | None = None) -> Found:
     """
     with copied(path, folder) as copy:
         as_it_is = _found(copy)
-        connect.log_of(copy).unlink(missing_ok=True)
+        log_of(copy).unlink(missing_ok=True)
         with writing(copy), copy.open("r+b") as file:
             file.write(schema.first_page())
         return max(as_it_is, _found(copy), key=Found.size)
@@ -85,7 +88,7 @@ def set_aside(path: Path) -> Path:
     """A map that nobody has open, and its log, get another name, which is answered. Raises ShareError."""
     kept = _free_name(path)
     with writing(path):
-        for old, new in ((connect.log_of(path), connect.log_of(kept)), (path, kept)):
+        for old, new in ((log_of(path), log_of(kept)), (path, kept)):
             if old.exists():
                 old.replace(new)
         path.with_name(path.name + "-shm").unlink(missing_ok=True)

@@ -11,10 +11,10 @@ from pathlib import Path
 from share.core.keeping import Change, Kept
 from share.errors import StoreError, UsageError
 from share.io.map_store import changes, lock, reading, schema
-from share.io.map_store.connect import log_of
 from share.io.map_store.opening import examine, look, make
 from share.io.map_store.salvage import set_aside
 from share.io.map_store.scan import whole_rows
+from share.io.sqlite_file import log_of
 
 
 class MapStore:

@@ -17,6 +17,7 @@ from share.core.measurement import CAM0, CAM1, DEPTH, IMU
 from share.errors import ConfigError, DataError
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
+from share.io.json_file import parse_json
 from share.io.mcap import types as ros
 from share.types import F64
 
@@ -43,7 +44,7 @@ def to_json(rig: Rig) -> str:
 def from_json(text: str, where: str) -> Rig:
     """The rig that `to_json` wrote. Raises DataError."""
     try:
-        data = json.loads(text)
+        data = parse_json(text)
         for name in (CAM0, CAM1, DEPTH):
             if name in data:
                 data[name] = Camera(**{**data[name], "distortion": tuple(data[name]["distortion"])})

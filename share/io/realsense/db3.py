@@ -6,6 +6,8 @@ those of the metadata beside each sample, as the device gave them; the table's a
 
 from __future__ import annotations
 
+import math
+import re
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
@@ -15,12 +17,20 @@ from typing import Any
 from share.core.intake import ACCEL, GYRO, Sample
 from share.core.measurement import CAM0, CAM1, DEPTH
 from share.errors import DataError
+from share.io.losses import Losses
 from share.io.mcap import types as ros
+from share.io.regular_file import MB
+from share.io.sqlite_file import Untrusted
+from share.io.tables import MOST_NS
 
 STREAMS = {"Infrared_1": CAM0, "Infrared_2": CAM1, "Depth_0": DEPTH, "Accel_0": ACCEL, "Gyro_0": GYRO}
 _DATA = ("/imu/data", "/image/data/compressed", "/image/data/compressedDepth")
 _DEPTH_HEADER = 12  # bytes of compressed_depth_image_transport's ConfigHeader before the PNG
 _HARDWARE = "Hardware Clock"
+_COLUMNS = {"topics": ("id", "name"), "messages": ("id", "topic_id", "timestamp", "data")}  # rosbag2's
+_MOST_TOPICS, _LONGEST = 10_000, 500  # the SDK writes 100 of 60 characters
+_MOST_MESSAGE = 64 * MB  # of bytes; four times as much as a raw image of 8 megapixels
+_MOST_ROW = 4 * _MOST_MESSAGE
 
 
 class Db3:
@@ -28,9 +38,7 @@ class Db3:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._ids: dict[str, int] = {
-            name: number for number, name in self._rows("SELECT id, name FROM topics")
-        }
+        self._ids = self._topics()
         parts = [(name.split("/"), name) for name in self._ids if name.endswith(_DATA)]
         self._data = {STREAMS[p[3]]: name for p, name in parts if len(p) > 3 and p[3] in STREAMS}
         self.streams = {stream: "/".join(name.split("/")[:4]) for stream, name in self._data.items()}
@@ -38,13 +46,26 @@ class Db3:
     @property
     def serial(self) -> str | None:
         """Of the device."""
-        return self.told("/device_0/info").get("Serial Number")
+        told = self.told("/device_0/info").get("Serial Number")
+        return told if told is not None and re.fullmatch(r"[\w-]{1,64}", told) else None
+
+    def number(self, topic: str, key: str | None, default: float, least: float, most: float) -> float:
+        """What `told` says by `key`, or all of it; `default` where it says nothing. Raises DataError where it
+        is no number from `least` to `most`."""
+        told = self.told(topic)
+        text = next(iter(told), None) if key is None else told.get(key)
+        try:
+            value = default if text is None else float(text)
+        except ValueError:
+            value = math.nan
+        if not least <= value <= most:
+            raise DataError(f"{self.path}: {topic}: '{text:.40}' is no number from {least:g} to {most:g}")
+        return value
 
     def told(self, topic: str) -> dict[str, str]:
         """What a text such as `key=value;key=value` says, empty if it is not there."""
-        for (data,) in self._rows(
-            "SELECT data FROM messages WHERE topic_id = ? ORDER BY id LIMIT 1", self._ids.get(topic, -1)
-        ):
+        query = f"SELECT {_DATA_OR_NULL} FROM messages NOT INDEXED WHERE topic_id = ? ORDER BY id LIMIT 1"
+        for (data,) in self._rows(query, self._ids.get(topic, -1)):
             return self._text(data)
         return {}
 
@@ -55,29 +76,54 @@ class Db3:
                 return name
         raise DataError(f"{self.path}: has no {begins}, which the SDK writes")
 
-    def samples(self, images: bool = True) -> Iterator[Sample]:
-        """All of them as they came. images: with pixels, encoded; else an image's payload is None."""
+    def samples(self, losses: Losses, images: bool = True) -> Iterator[Sample]:
+        """All of them as they came; those that are damaged go to `losses`. images: with pixels, encoded; else
+        an image's payload is None. Raises DataError where more than 5 % of a stream are damaged."""
         data = {self._ids[name]: stream for stream, name in self._data.items()}
         metadata = {self._ids[self.topic(_metadata(name))]: s for s, name in self._data.items()}
         read = [n for n, stream in data.items() if images or stream in (ACCEL, GYRO)] + list(metadata)
         marks = ", ".join("?" * len(read))
-        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id"
+        query = (
+            f"SELECT id, topic_id, timestamp, {_DATA_OR_NULL} FROM messages NOT INDEXED "
+            f"WHERE topic_id IN ({marks}) ORDER BY id"
+        )
         waiting: dict[str, Any] = {}
-        for number, at_ns, blob in self._rows(query, *read):
+        total = dict.fromkeys(self._data, 0)
+        for row, number, at_ns, blob in self._rows(query, *read):
             if number in data:
                 waiting[data[number]] = blob
-            else:
-                stream = metadata[number]
-                yield self._sample(stream, waiting.pop(stream, None), self._text(blob), at_ns)
+                continue
+            stream = metadata[number]
+            total[stream] += 1
+            try:
+                whole = images or stream in (ACCEL, GYRO)
+                sample = self._sample(stream, waiting.pop(stream, None), whole, self._text(blob), at_ns)
+            except DataError as error:  # it costs itself
+                losses.add(f"samples of {stream}", str(row), str(error))
+                continue
+            yield sample
+        for stream, count in total.items():
+            losses.check(f"samples of {stream}", count)
 
-    def _sample(self, stream: str, blob: bytes | None, told: dict[str, str], at_ns: int) -> Sample:
+    def _topics(self) -> dict[str, int]:
+        """Their numbers by name."""
+        query = (
+            f"SELECT id, name FROM topics NOT INDEXED "
+            f"WHERE typeof(name) = 'text' AND length(name) <= {_LONGEST} LIMIT {_MOST_TOPICS}"
+        )
+        return {name: number for number, name in self._rows(query)}
+
+    def _sample(
+        self, stream: str, blob: bytes | None, whole: bool, told: dict[str, str], at_ns: int
+    ) -> Sample:
+        """whole: with what was recorded, not only when."""
         try:
             return Sample(
                 stream=stream,
-                stamp_ns=round(float(told["timestamp"]) * 1e3) * 1000,
-                payload=None if blob is None else _payload(stream, blob),
-                arrived_ns=at_ns,
-                number=None if stream in (ACCEL, GYRO) else int(told["Frame number"]),
+                stamp_ns=_bounded(round(float(told["timestamp"]) * 1e3) * 1000),
+                payload=_payload(stream, blob) if whole else None,
+                arrived_ns=_bounded(at_ns),
+                number=None if stream in (ACCEL, GYRO) else _bounded(int(told["Frame number"])),
                 hardware=told["timestamp_domain"] == _HARDWARE,
             )
         except Exception as error:  # rosbags raises many kinds on bytes that are no such message
@@ -92,12 +138,24 @@ class Db3:
 
     def _rows(self, query: str, *values: int) -> Iterator[tuple[Any, ...]]:
         try:
-            with closing(sqlite3.connect(f"file:{self.path}?mode=ro", uri=True)) as connection:
-                yield from connection.execute(query, values)
-        except sqlite3.Error as error:
+            with closing(Untrusted(self.path, _COLUMNS, _MOST_ROW)) as file:
+                yield from file.rows(query, *values)
+        except OSError as error:
+            raise DataError(f"{self.path}: cannot be read: {error.strerror}") from None
+        except (sqlite3.Error, MemoryError, OverflowError, UnicodeError) as error:
             raise DataError(
                 f"{self.path}: is no recording of the RealSense SDK, or damaged: {error}"
             ) from None
+
+
+_DATA_OR_NULL = f"CASE WHEN typeof(data) = 'blob' AND length(data) <= {_MOST_MESSAGE} THEN data END"
+
+
+def _bounded(number: Any) -> int:
+    """A stamp, or number of a frame. Raises ValueError."""
+    if type(number) is not int or abs(number) >= MOST_NS:
+        raise ValueError(f"{number!r:.40} is out of range")
+    return number
 
 
 def _metadata(data: str) -> str:
@@ -105,12 +163,15 @@ def _metadata(data: str) -> str:
     return data[: data.rindex("/data")] + "/metadata"
 
 
-def _payload(stream: str, blob: bytes) -> Any:
-    if stream == ACCEL:
-        a = ros.decode(blob, ros.IMU_MSG).linear_acceleration
-        return [a.x, a.y, a.z]
-    if stream == GYRO:
-        w = ros.decode(blob, ros.IMU_MSG).angular_velocity
-        return [w.x, w.y, w.z]
+def _payload(stream: str, blob: bytes | None) -> Any:
+    """Raises ValueError and what rosbags does."""
+    if blob is None:
+        raise ValueError("its data are missing, or too large")
+    if stream in (ACCEL, GYRO):
+        message = ros.decode(blob, ros.IMU_MSG)
+        v = message.linear_acceleration if stream == ACCEL else message.angular_velocity
+        if not all(map(math.isfinite, (v.x, v.y, v.z))):
+            raise ValueError("it is not finite")
+        return [v.x, v.y, v.z]
     image = ros.decode(blob, ros.COMPRESSED).data.tobytes()
     return image[_DEPTH_HEADER:] if stream == DEPTH else image

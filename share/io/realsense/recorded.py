@@ -18,6 +18,7 @@ from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.io.calibration import Calibration
 from share.io.images import EncodedImage
+from share.io.losses import Losses
 from share.io.mcap.rig import cameras
 from share.io.profile import profile
 from share.io.realsense.db3 import Db3
@@ -25,6 +26,7 @@ from share.io.recording import Source, span_of
 from share.io.trajectory import Trajectory
 from share.types import F64, I64, checked_pose
 
+_UNITS_M, _RATES_HZ = (1e-6, 1.0), (0.1, 1e5)
 _LIKE = "d435i"  # its IMU is believed where the recording says nothing of one
 _NOTE = f"does not say where the IMU sits and how noisy it is: taken from profile {_LIKE}, or give --calib"
 
@@ -51,8 +53,8 @@ class RecordedSource(Source):
         self._file, self._cameras = file, cameras(rig)
         if missing := sorted(self._cameras.keys() - file.streams.keys()):
             raise UsageError(f"{file.path}: has no {missing[0]}, which the calibration has")
-        unit = file.told(f"{file.streams.get(DEPTH, '').rpartition('/')[0]}/option/Depth_Units/value")
-        self._depth_scale = 1 / float(next(iter(unit), 0.001))
+        unit = f"{file.streams.get(DEPTH, '').rpartition('/')[0]}/option/Depth_Units/value"
+        self._depth_scale = 1 / file.number(unit, None, 0.001, *_UNITS_M)
         self._span = span_of(self._all_stamps[CAM0], frames, str(file.path), rig.timeshift_ns)
 
     def stamps(self) -> dict[str, I64]:
@@ -84,7 +86,7 @@ class RecordedSource(Source):
 
     def _repaired(self, images: bool) -> Iterator[Measurement]:
         used = [*self._cameras, *((ACCEL, GYRO) if self.rig.imu else ())]
-        return repaired(self._file, used, images)
+        return repaired(self._file, used, images, self.losses)
 
     def _image(self, m: Measurement) -> EncodedImage:
         camera, scale = self._cameras[m.stream], self._depth_scale if m.stream == DEPTH else 0.0
@@ -92,21 +94,22 @@ class RecordedSource(Source):
         return EncodedImage(m.payload, where, camera.width, camera.height, scale)
 
 
-def repaired(file: Db3, streams: Collection[str], images: bool) -> Iterator[Measurement]:
+def repaired(file: Db3, streams: Collection[str], images: bool, losses: Losses) -> Iterator[Measurement]:
     """These streams of the file as a live camera's: in one time that goes forward, accel and gyro joined.
-    images: with pixels. Raises DataError."""
-    rates = {name: float(file.told(f"{file.streams[name]}/info").get("fps", "30")) for name in streams}
+    images: with pixels. losses: takes what is damaged. Raises DataError."""
+    rates = {name: file.number(f"{file.streams[name]}/info", "fps", 30.0, *_RATES_HZ) for name in streams}
     intake = Intake(rates, SequencerConfig().max_jump_s)
-    for sample in file.samples(images):
+    for sample in file.samples(losses, images):
         yield from intake.feed(sample)
     yield from intake.end()
 
 
-def recorded_imu(file: Db3) -> tuple[I64, F64]:
-    """Stamps (N,) ns and (N, 6) wx wy wz ax ay az, rad/s and m/s^2. Raises DataError."""
+def recorded_imu(file: Db3, losses: Losses) -> tuple[I64, F64]:
+    """Stamps (N,) ns and (N, 6) wx wy wz ax ay az, rad/s and m/s^2. losses: takes what is damaged. Raises
+    DataError."""
     if missing := [name for name in (ACCEL, GYRO) if name not in file.streams]:
         raise DataError(f"{file.path}: has no {' and no '.join(missing)}; record both")
-    samples = [(m.stamp_ns, m.payload) for m in repaired(file, (ACCEL, GYRO), images=False)]
+    samples = [(m.stamp_ns, m.payload) for m in repaired(file, (ACCEL, GYRO), False, losses)]
     if not samples:
         raise DataError(f"{file.path}: has no IMU samples")
     stamps, values = zip(*samples, strict=True)
