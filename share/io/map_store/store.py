@@ -124,6 +124,11 @@ class MapStore:
             os.close(self._lock)
             self._lock = None
 
+    def abandon(self) -> None:
+        """In place of `close`, while another thread waits in `write` for a disk that does not answer: nothing
+        is asked of it any more. The lock ends with the process."""
+        self._db = self._lock = None
+
     def __enter__(self) -> MapStore:
         return self
 
