@@ -150,6 +150,8 @@ class EdgeRun:
         if self._keeper is not None:
             self._incomplete = self._keeper.close()
             self._take_answers()  # what is safe by now is acknowledged
+            if self._incomplete is not None:
+                self._say("map", self._incomplete)
         self._link.close()
 
     def report(self) -> dict[str, Any]:

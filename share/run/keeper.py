@@ -59,7 +59,7 @@ class Keeper:
     def keep(self, keep: Keep) -> None:
         self._new.put(keep)
 
-    def drain(self, patience_s: float = _PATIENCE_S) -> bool:
+    def drain(self, patience_s: float) -> bool:
         """Writes what is left, tries once more what could not be written, says what is not kept, and ends.
         False: the disk has not answered for so long. May be repeated."""
         self._new.put(None)
@@ -72,9 +72,9 @@ class Keeper:
 
     def close(self) -> str | None:
         """The same, and closes the file. What is wrong if not all is in it, or nobody knows."""
-        if not self.drain():
+        if not self.drain(_PATIENCE_S):
             self._store.abandon()
-            return f"the map's disk does not answer: what was not acknowledged {_NOT_IN}"
+            return "the map's disk does not answer: what was not acknowledged may not be in its file"
         self._store.close()
         return f"{self._failing}: {self.held} changes {_NOT_IN}" if self.held else None
 
