@@ -54,8 +54,8 @@ def _held() -> Iterator[None]:
             if callable(handler):
                 signal.signal(number, handler)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        for number in came:
-            signal.raise_signal(number)
+        for one in came:
+            signal.raise_signal(one)
 
 
 def _made(first: None, kind: type[_Process], state: Mapping[str, Any]) -> _Process:
