@@ -58,7 +58,7 @@ from share.run.scribe import Scribe
 from share.run.tracking import Trackers, room
 
 TICK_MS = 50
-_REPORT_S = 0.2  # so that what is shown of agents is true within a second
+_REPORT_S = 0.1  # so that what is shown of agents is true within a second
 _UNWELL_S = 10.0  # how long a death is trouble
 REFUSALS_SAID = 64  # strangers at the door; more are only counted
 _AT_ONCE = 64  # messages, before anything else is looked after
@@ -155,7 +155,7 @@ class EdgeRun:
         self._link.close()
 
     def report(self) -> dict[str, Any]:
-        """As edge.json, 0.2 s old, and `trouble`: what is wrong now. From any thread."""
+        """As edge.json, 0.1 s old, and `trouble`: what is wrong now. From any thread."""
         report, late_s = self._report, time.monotonic() - self._report_at
         if not report or late_s < _STUCK_S:
             return report
