@@ -22,11 +22,8 @@ from share.core.keeping import placed
 from share.io.map_store import MapStore
 
 NAMES = ("ann", "bob", "cy")
-# None is taken out for want of room, or withheld since a busy machine is late: neither is a loss.
-ALL_SENT_AND_KEPT = """
-edge: {max_keyframes: 100000}
-control: {rate_min_hz: 1000, rate_max_hz: 1000}
-"""
+# None is taken out for want of room, or withheld by an agent that is late and has a rate: neither is a loss.
+ALL_SENT_AND_KEPT = "edge: {max_keyframes: 100000, policy: covins-g}\n"
 FOUND_S = 25.0  # after which all that is waited for has come, on a machine that is busy
 
 

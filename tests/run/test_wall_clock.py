@@ -31,7 +31,7 @@ def test_odometry_is_the_same_and_nobody_is_lost(tmp_path: Path, plain_session: 
     assert odometry[0] == odometry[1]
     report = json.loads((tmp_path / "ann" / "report.json").read_text())
     assert (report["frames"], report["protocol"]["open"], report["lost_s"]) == (45, 0, 0)
-    assert report["clock"]["clock_steps"] == 0
+    assert abs(report["clock"]["offset_ms"]) < 1000
     t_s = [json.loads(line)["t_s"] for line in (tmp_path / "edge" / "events.jsonl").read_text().splitlines()]
     assert t_s == sorted(t_s)
     assert t_s[-1] < 300
