@@ -1,8 +1,14 @@
-"""Processes of multiprocessing that end with their parent, and leave a terminal's signals to it."""
+"""Processes of multiprocessing that end with their parent, and leave a terminal's signals to it.
+
+A parent that ends in good order does not wait for those that it has not closed, as multiprocessing would: a
+signal may have come before anybody knew of them.
+"""
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import multiprocessing.util  # before `_kill_left` is registered, so that it is called before theirs
 import os
 import signal
 from collections.abc import Iterator, Mapping
@@ -12,7 +18,7 @@ from typing import Any
 from share import children
 
 _GROUP = {signal.SIGINT, signal.SIGHUP}  # a terminal sends them to all: the parent handles them
-_WAITING = {*_GROUP, signal.SIGTERM}  # until the child can handle them
+_WAITING = {*_GROUP, signal.SIGTERM, signal.SIGALRM}  # until they can be handled; ALRM: `share.cli.unwinding`
 
 
 def _begin(parent: int, kernel: bool) -> None:
@@ -71,6 +77,13 @@ class _Process(SpawnProcess):
 
 class _Context(SpawnContext):
     Process = _Process
+
+
+@atexit.register
+def _kill_left() -> None:
+    for process in multiprocessing.active_children():
+        if isinstance(process, _Process):
+            process.kill()
 
 
 SPAWN = _Context()

@@ -9,6 +9,7 @@ from share.types import TrackState, Wait
 from share.wire.messages import MAX_AGE_MS, MAX_REASON, Status
 
 STALE_S = 0.4  # without a tracked frame, or three usual intervals: the last pose says nothing of now
+_SLOWEST_S = 0.2  # an interval that is usual; so what is stale is said within a second, however slow all is
 LATE_S = 0.5  # a pose that is later than this after its image is said to be late
 _AT_MOST_EACH_S = 0.1  # changes are said at once, but not oftener
 _WORDS = {
@@ -60,7 +61,7 @@ class OwnStatus:
     def tracked(self, frame: FrameTracked, now_ns: int) -> None:
         """A frame is done, with a pose or without."""
         if self._tracked_ns is not None:
-            self._step_ns = smoothed(self._step_ns, min(now_ns - self._tracked_ns, SECOND_NS))
+            self._step_ns = smoothed(self._step_ns, min(now_ns - self._tracked_ns, seconds(_SLOWEST_S)))
         if frame.state is not self._state:
             self._state, self._since_ns = frame.state, now_ns
         self._waits, self._tracked_ns, self._stamp_ns = frame.waits, now_ns, frame.stamp_ns

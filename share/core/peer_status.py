@@ -8,7 +8,7 @@ from share.core.rate import SECOND_NS, seconds
 from share.types import TrackState
 from share.wire.messages import Status
 
-SILENT_S = 1.0  # an agent says something twice a second; after this what it said is not shown as its state
+SILENT_S = 0.7  # an agent says something twice a second; after this what it said is not shown as its state
 SILENT = "SILENT"
 
 

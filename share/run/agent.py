@@ -20,6 +20,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ from share.run.guard import Guard
 from share.run.late import Late
 from share.run.lateness import Lateness
 from share.run.pipeline import frames_of, tracker_for
+from share.run.scribe import Scribe, Written
 from share.strict import to_mapping
 from share.types import Frame, TrackState
 from share.wire import messages as m
@@ -98,8 +100,8 @@ class AgentRun:
         self._guard = Guard(say)
         self._machine = Agent(hello, settings)
         self._prepare()
-        self._files = AgentFiles(out, say)
-        self._log = RunLog(self._files.frames)
+        self._files, self._scribe = AgentFiles(out, say), Scribe(out, say)
+        self._log = RunLog(Written(self._files.frames, self._scribe))
         self._errors, self._poses = Unknown() if errors is None else errors, poses
         self._late = Late(settings.agent.late_ms)
         self._lateness = Lateness(say, "the edge" if hello.streams else "this machine")
@@ -131,16 +133,18 @@ class AgentRun:
         try:
             self._loop()
             self.report = self._report()
-            self._files.finish(self._log, self.report)
+            self._scribe.do(partial(self._files.finish, self._log, self.report))
         finally:
             self.stop()
             self._shared.closed.set()
-            self._files.release()
+            self._scribe.do(self._files.release)
             self._link.close()
             if self._poses is not None:
                 self._poses.close()
             tracker.join(timeout=4)
             self._errors.close()
+            self._scribe.end()
+        self._scribe.check()
         if self._shared.error is not None:
             raise self._shared.error
 
@@ -291,7 +295,7 @@ class AgentRun:
             case ev.Say():
                 self._say(effect.text)
             case ev.Fail():
-                self._files.discard()
+                self._scribe.do(self._files.discard)
                 raise effect.error
             case ev.Stop():
                 self._ended = True
@@ -301,9 +305,9 @@ class AgentRun:
         if self._poses is not None:  # first: somebody waits for it
             age_ms = (time.monotonic_ns() - at.arrived_ns) / 1e6
             self._poses.tell(at.stamp_ns, at.state, age_ms, at.stretch, at.T_odom_body, T_map_body, at.map_id)
-        self._files.odom(at.stamp_ns, at.T_odom_body)
+        self._scribe.do(partial(self._files.odom, at.stamp_ns, at.T_odom_body))
         if T_map_body is not None and at.map_id is not None:
-            self._files.map(at.stamp_ns, T_map_body, at.map_id)
+            self._scribe.do(partial(self._files.map, at.stamp_ns, T_map_body, at.map_id))
 
     def _say_idle(self, said: ev.StatusSaid) -> None:
         """No frame says it: the pose that was told last is not where the agent is now."""

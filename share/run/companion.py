@@ -8,8 +8,6 @@ import signal
 import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
-from multiprocessing.util import Finalize
 from typing import Any
 
 from share import process
@@ -46,8 +44,6 @@ class Companion:
         self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._ours, self._theirs = SPAWN.Pipe()
         self._process = SPAWN.Process(target=_begin, args=(self._theirs, work, arguments), name=name)
-        # An interrupt may come before the caller can close it: Python would wait for the process at its end.
-        self._unclosed = Finalize(None, _kill, args=(self._process,), exitpriority=0)
         if after_s <= 0.0:
             self._start()
         giving = threading.Thread(target=self._give, args=(after_s,), daemon=True)
@@ -83,7 +79,6 @@ class Companion:
             if self._process.is_alive():
                 self._process.kill()
                 self._process.join()
-        self._unclosed.cancel()
         for thread in self._threads:
             thread.join(_PATIENCE_S)
         self._ours.close()
@@ -117,11 +112,6 @@ class Companion:
         if code is not None and code < 0:
             return f"was ended by {signal.Signals(-code).name}"
         return f"ended with exit code {code}"
-
-
-def _kill(process: SpawnProcess) -> None:
-    if process.pid is not None:
-        process.kill()
 
 
 def _begin(line: Connection, work: Work, arguments: tuple[Any, ...]) -> None:

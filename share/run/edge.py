@@ -2,6 +2,7 @@
 
 link -> Edge (core) -> mapper's process (share.run.mapping) -> findings -> Edge -> link
                     -> keeper's thread (share.run.keeper)   -> what is safe -> acknowledgements
+                    -> scribe's thread (share.run.scribe)   -> events.jsonl, edge.json
      or by policy `streamed`
 link -> TrackingEdge -> a process each (share.run.tracking) -> poses -> TrackingEdge -> link
 """
@@ -16,6 +17,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,13 +55,16 @@ from share.run.companion import Companion
 from share.run.keeper import Keeper
 from share.run.mapping import Mapped, Restore, Restored, SolverLost, map_all
 from share.run.restarts import Restarts
+from share.run.scribe import Scribe
 from share.run.tracking import Trackers, room
 
 TICK_MS = 50
-_REPORT_S = 0.2  # so that what is shown of agents is true within a second
+_REPORT_S = 0.1  # so that what is shown of agents is true within a second
 _UNWELL_S = 10.0  # how long a death is trouble
 REFUSALS_SAID = 64  # strangers at the door; more are only counted
 _AT_ONCE = 64  # messages, before anything else is looked after
+_STUCK_S = 1.0  # without a report: what is shown is no longer true
+_DRAIN_S = 0.5  # that the loop waits for the keeper of a life that is over
 
 
 @dataclass(frozen=True)
@@ -91,16 +96,20 @@ class EdgeRun:
         self._settings, self._link, self._tell = settings, link, tell
         self._restarts = Restarts(store, settings.merge.enter_m, lambda text: self._say("map", text))
         self._begin_at: float | None = None  # a life that waits for the disk
+        self._waits_for = ""
         self._inbox: queue.SimpleQueue[object] = queue.SimpleQueue()
         self._out = out
         self._claim: int | None = None
         self._events: LineFile | None = None
+        self._scribe: Scribe | None = None
         if out is not None:
             check_writable(out / "edge.json")
             check_writable(out / "events.jsonl")
             self._claim = claim(out)
             self._events = LineFile(out / "events.jsonl", self._complain)
-        self._stopping = False
+            self._scribe = Scribe(out, self._complain)
+        self._stopping = self._closed = False
+        self._incomplete: str | None = None  # the map's file, at the end
         self._began_ns = time.monotonic_ns()
         self._refused: Counter[str] = Counter()  # handshakes, by what was said of them
         self._trouble: dict[str, float] = {}  # what to say until when
@@ -115,7 +124,8 @@ class EdgeRun:
         self._link.wake()
 
     def go(self) -> dict[str, Any]:
-        """The report, once stopped. Raises ShareError if it could not be written, or not all events."""
+        """The report, once stopped. Raises ShareError if it could not be written, or not all events, or not
+        all of the map."""
         try:
             while not self._stopping:
                 self._step()
@@ -124,34 +134,47 @@ class EdgeRun:
             self._note()
             self._report["series"] = self._machine.series()
             self._finish(self._report)
+        if self._incomplete is not None:
+            raise StoreError(self._incomplete)
         return self._report
 
     def close(self) -> None:
-        """Ends the processes and threads it has started, also where it never came to `go`."""
+        """Ends the processes and threads it has started, also where it never came to `go`. May be
+        repeated."""
         self._stopping = True
+        if self._closed:
+            return
+        self._closed = True
         if self._mapping is not None:
             self._mapping.close()
         self._take_answers()
         self._trackers.close()
         if self._keeper is not None:
-            self._keeper.close()
+            self._incomplete = self._keeper.close()
+            self._take_answers()  # what is safe by now is acknowledged
+            if self._incomplete is not None:
+                self._say("map", self._incomplete)
         self._link.close()
 
     def report(self) -> dict[str, Any]:
-        """As edge.json, 0.2 s old, and `trouble`: what is wrong now. From any thread."""
-        return self._report
+        """As edge.json, 0.1 s old, and `trouble`: what is wrong now. From any thread."""
+        report, late_s = self._report, time.monotonic() - self._report_at
+        if not report or late_s < _STUCK_S:
+            return report
+        stuck = f"the edge has been stuck for {late_s:.0f} s; what is shown of agents is as old as that"
+        return {**report, "trouble": [stuck, *report["trouble"]]}
 
     def _note(self) -> None:
         """A report, and when the next is due."""
         now = time.monotonic()
         self._report_at = now + _REPORT_S
         self._heap.tidy(now)
-        kept = None if self._keeper is None else self._keeper.trouble
+        disks = [writer.trouble for writer in (self._keeper, self._scribe) if writer is not None]
         self._trouble = {text: until for text, until in self._trouble.items() if now < until}
         self._report = {
             **self._machine.report(self._mapped),
             "refused_handshakes": self._refused.total(),
-            "trouble": [*self._trouble, *([] if kept is None else [kept])],
+            "trouble": [*self._trouble, *(text for text in disks if text is not None)],
             "uptime_s": round((time.monotonic_ns() - self._began_ns) * 1e-9, 3),
             **({} if self._solved_at is None else {"last_solve_s": round(now - self._solved_at, 3)}),
         }
@@ -186,10 +209,13 @@ class EdgeRun:
             self._keeper = Keeper(store, self._answered, self._map_said)
 
     def _finish(self, report: dict[str, Any]) -> None:
-        if self._out is None or self._events is None or self._claim is None:
+        if self._out is None or self._events is None or self._claim is None or self._scribe is None:
             return
-        self._events.close()
-        atomic_write(self._out / "edge.json", json.dumps(report, indent=2) + "\n")
+        self._scribe.do(self._events.close)
+        self._scribe.do(partial(atomic_write, self._out / "edge.json", json.dumps(report, indent=2) + "\n"))
+        self._scribe.end()
+        self._forget_answers()
+        self._scribe.check()
         os.close(self._claim)
         self._events.check()
 
@@ -206,7 +232,7 @@ class EdgeRun:
         self._take_answers()
         self._handle(Tick())
         if self._begin_at is not None and time.monotonic() >= self._begin_at:
-            self._begin_anew("the map's file could not be read")
+            self._begin_anew(self._waits_for)
         if time.monotonic() >= self._report_at:
             self._note()
 
@@ -242,15 +268,15 @@ class EdgeRun:
         self._trouble[f"the mapper: {text}"] = time.monotonic() + pause_s + _UNWELL_S
         if self._mapping is not None:
             self._mapping.close()
-        if self._keeper is not None:
-            self._keeper.drain()
-        self._forget_answers()
         try:
+            if self._keeper is not None and not self._keeper.drain(_DRAIN_S):
+                raise StoreError("the map's disk does not answer")
+            self._forget_answers()
             self._begin(pause_s)
             self._begin_at = None
         except StoreError as error:  # nothing is taken in or acknowledged until it can be read
             self._say("map", f"{error}; tried again in {pause_s:g} s")
-            self._begin_at = time.monotonic() + pause_s
+            self._begin_at, self._waits_for = time.monotonic() + pause_s, str(error)
 
     def _forget_answers(self) -> None:
         """Those of the mapper and keeper of a life that is over are no answers to the next."""
@@ -291,8 +317,8 @@ class EdgeRun:
     # ------------------------------------------------------------------ what is said
 
     def _record(self, fields: dict[str, Any]) -> None:
-        if self._events is not None:
-            self._events.write(json.dumps(fields))
+        if self._events is not None and self._scribe is not None:
+            self._scribe.do(partial(self._events.write, json.dumps(fields)))
         self._tell(fields)
 
     def _say(self, event: str, reason: str) -> None:
@@ -300,7 +326,8 @@ class EdgeRun:
         self._record({"t_s": t_s, "event": event, "agent": None, "reason": reason})
 
     def _complain(self, text: str) -> None:
-        self._tell({"t_s": 0.0, "event": "not written", "agent": None, "reason": text})
+        """From any thread."""
+        self._inbox.put(_Said("not written", text))
 
     def _refuse(self, line: str) -> None:
         """Counts a handshake that was refused; says each kind once, for a bounded number of kinds."""

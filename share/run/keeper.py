@@ -17,7 +17,9 @@ from share.io.map_store import MapStore
 _AGAIN_S = 1.0  # after a write that failed
 _SLOW_S = 5.0  # for one write: from then on it is said
 _AT_ONCE = 64  # in one commit
+_PATIENCE_S = 5.0  # for what is left at the end
 _NOT_ACKNOWLEDGED = "keyframes are not acknowledged"
+_NOT_IN = "are not in the map's file"
 
 
 class Keeper:
@@ -57,17 +59,24 @@ class Keeper:
     def keep(self, keep: Keep) -> None:
         self._new.put(keep)
 
-    def drain(self) -> None:
-        """Writes what is left, tries once more what could not be written, says what is not kept, and ends."""
+    def drain(self, patience_s: float) -> bool:
+        """Writes what is left, tries once more what could not be written, says what is not kept, and ends.
+        False: the disk has not answered for so long. May be repeated."""
         self._new.put(None)
-        self._thread.join()
+        self._thread.join(patience_s)
+        if self._thread.is_alive():
+            return False
         if left := self.held:
-            self._said(f"{left} changes are not in the map's file; none of their keyframes was acknowledged")
+            self._said(f"{left} changes {_NOT_IN}; none of their keyframes was acknowledged")
+        return True
 
-    def close(self) -> None:
-        """The same, and closes the file."""
-        self.drain()
+    def close(self) -> str | None:
+        """The same, and closes the file. What is wrong if not all is in it, or nobody knows."""
+        if not self.drain(_PATIENCE_S):
+            self._store.abandon()
+            return "the map's disk does not answer: what was not acknowledged may not be in its file"
         self._store.close()
+        return f"{self._failing}: {self.held} changes {_NOT_IN}" if self.held else None
 
     def _work(self) -> None:
         ended = False

@@ -18,8 +18,19 @@ ENDED = {
     signal.SIGHUP: {129, -signal.SIGHUP},
 }
 STEPS_S = (0.005, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.2, 1.5, 2.0)
-# From SHARE's first line on: what comes while Python itself starts is Python's to handle.
 PROGRAM = "import os; from share.__main__ import run; os.write(1, b'.'); run()"
+# From where SHARE looks after Ctrl-C: what comes while Python itself starts is Python's to handle.
+LOOKED_AFTER = """
+import os, signal
+set_handler = signal.signal
+def first(*given):
+    signal.signal = set_handler
+    set_handler(*given)
+    os.write(1, b'.')
+signal.signal = first
+from share.__main__ import run
+run()
+"""
 
 
 def commands(folder: Path) -> dict[str, list[str]]:
@@ -37,7 +48,7 @@ def commands(folder: Path) -> dict[str, list[str]]:
 def ended(arguments: list[str], after_s: float, number: int) -> tuple[int, str]:
     """Exit code and stderr of a command that gets a signal so long after its beginning."""
     process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, *arguments],
+        [sys.executable, "-c", LOOKED_AFTER, *arguments],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -136,3 +147,47 @@ def test_a_worker_is_not_left_half_started():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30)
     assert (done.returncode, done.stdout, done.stderr) == (0, "worked\ninterrupted\n", "")
+
+
+@pytest.mark.parametrize("number", list(ENDED))
+def test_a_worker_that_nobody_has_taken_charge_of_is_not_waited_for(number):
+    """The signal comes when the edge's mapper runs, and before the edge has it: it went on for ever."""
+    program = (
+        "import os\n"
+        "from share.__main__ import run\n"
+        "from share.run.companion import Companion\n"
+        "begin = Companion.__init__\n"
+        "def interrupted(self, *about):\n"
+        "    begin(self, *about)\n"
+        f"    os.kill(os.getpid(), {int(number)})\n"
+        "Companion.__init__ = interrupted\n"
+        "run()\n"
+    )
+    command = [sys.executable, "-c", program, "edge", "--bind", "tcp://127.0.0.1:0"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20)
+    assert done.returncode in ENDED[number]
+    assert done.stderr == ("share: interrupted\n" if number == signal.SIGINT else "")
+
+
+def test_what_waited_for_an_import_waits_for_a_worker_too():
+    """A signal that came while a module was imported is handled 20 ms later: while a worker is started."""
+    program = (
+        "import os, signal, time\n"
+        "from multiprocessing import popen_spawn_posix as spawning\n"
+        "from share.cli import unwinding as module\n"
+        "from share.spawning import SPAWN\n"
+        "start = spawning.util.spawnv_passfds\n"
+        "def slow(*arguments):\n"
+        "    worker = start(*arguments)\n"
+        "    time.sleep(0.1)\n"
+        "    return worker\n"
+        "worker = SPAWN.Process(target=print, args=('worked',))\n"
+        "spawning.util.spawnv_passfds = slow\n"
+        "importing = iter([True])\n"
+        "module._is_importing = lambda frame: next(importing, False)\n"
+        "try:\n    with module.unwinding():\n"
+        "        os.kill(os.getpid(), signal.SIGTERM)\n        worker.start()\n"
+        "except SystemExit:\n    worker.join()\n    print('ended')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "worked\nended\n", "")

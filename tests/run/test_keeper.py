@@ -45,6 +45,9 @@ class Disk:
     def close(self):
         self.closed = True
 
+    def abandon(self):
+        self.abandoned = True
+
 
 @pytest.fixture
 def kept(monkeypatch):
@@ -149,7 +152,23 @@ def test_what_is_left_at_the_end_is_said(kept):
     keeper, disk, tickets, said = kept
     disk.error = StoreError(FULL)
     keeper.keep(Keep(0, (change(0), change(1))))
-    keeper.close()
+    assert keeper.close() == f"{FULL}: 2 changes are not in the map's file"
     assert disk.closed
     assert not tickets
     assert said[-1] == "2 changes are not in the map's file; none of their keyframes was acknowledged"
+
+
+def test_who_ends_does_not_wait_for_a_disk_that_does_not_answer(kept, monkeypatch):
+    keeper, disk, tickets, _ = kept
+    monkeypatch.setattr(keeper_module, "_PATIENCE_S", 0.05)
+    disk.go_on.clear()
+    keeper.keep(Keep(0, (change(0),)))
+    until(lambda: disk.tries)
+    assert not keeper.drain(0.05)
+    assert "the map's disk does not answer" in keeper.close()
+    assert disk.abandoned
+    assert not disk.closed  # which would wait for the write
+    assert not tickets
+    disk.go_on.set()
+    until(lambda: tickets == [Kept(0)])  # it was written after all
+    assert keeper.drain(1.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from share.io.map_store import changes, lock, reading, schema
 from share.io.map_store.opening import examine, look, make
 from share.io.map_store.salvage import set_aside
 from share.io.map_store.scan import whole_rows
+from share.io.map_store.schema import PAGE_BYTES
 from share.io.sqlite_file import log_of
 
 
@@ -85,7 +87,8 @@ class MapStore:
             with contextlib.suppress(sqlite3.Error):  # a full disk has rolled back by itself
                 db.execute("ROLLBACK")
             if isinstance(error, sqlite3.Error):
-                raise StoreError(f"{self.path}: the map cannot be written: {_words(error)}") from None
+                why = _why(error, self.path)
+                raise StoreError(f"{self.path}: the map cannot be written: {why}") from None
             raise
         self._check_in_place()
 
@@ -124,6 +127,11 @@ class MapStore:
             os.close(self._lock)
             self._lock = None
 
+    def abandon(self) -> None:
+        """In place of `close`, while another thread waits in `write` for a disk that does not answer: nothing
+        is asked of it any more. The lock ends with the process."""
+        self._db = self._lock = None
+
     def __enter__(self) -> MapStore:
         return self
 
@@ -157,7 +165,15 @@ def _which(path: Path) -> dict[Path, tuple[int, int]]:
     return out
 
 
-def _words(error: sqlite3.Error) -> str:
-    """As a person knows them."""
-    full = getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL
-    return "No space left on device" if full else str(error)
+def _why(error: sqlite3.Error, path: Path) -> str:
+    """As a person knows it. SQLite says the same of a quota and of a broken disk: the system is asked."""
+    if getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL:
+        return "No space left on device"
+    try:
+        with tempfile.TemporaryFile(dir=path.parent) as file:
+            file.write(bytes(PAGE_BYTES))
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as system:
+        return system.strerror or str(system)
+    return str(error)
