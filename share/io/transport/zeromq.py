@@ -71,7 +71,9 @@ _ROUTER: dict[int, int] = {
     zmq.TCP_KEEPALIVE_IDLE: 1,
     zmq.TCP_KEEPALIVE_INTVL: 1,
     zmq.TCP_KEEPALIVE_CNT: 2,
+    zmq.SNDBUF: 256 * 1024,  # of a peer that reads nothing
 }
+_RECEIVED_BYTES = 256 * 1024  # in the kernel, of a connection: else up to 32 MB; images need more than that
 
 
 class _Socket:
@@ -238,6 +240,7 @@ class ZmqEdgeLink:
             # libzmq 4.3.5 aborts where a peer resets its connection while a full queue has stopped its input
             # (stream_engine_base.cpp: !_io_error), so it never is full: the guard bounds what waits.
             zmq.RCVHWM: 0,
+            **({} if max_frame_bytes > MAX_FRAME_BYTES else {zmq.RCVBUF: _RECEIVED_BYTES}),
         }
         self._kept_out = KeepOut()
         self.strangers = 0  # messages dropped: their sender is no agent, or was cut off
@@ -262,6 +265,7 @@ class ZmqEdgeLink:
 
     def _receive_now(self) -> Arrival | None:
         for _ in range(_IN_VAIN):
+            self._guard.look()
             parts = self._link.receive_now()
             if parts is None:
                 self._guard.empty(self._link.empty_s)
@@ -281,7 +285,8 @@ class ZmqEdgeLink:
             return ""
         if self._guard.discards(descriptor):
             return None
-        self._guard.took(descriptor, sum(wire_bytes(len(part), sealed) for part in parts[1:]), key)
+        size = sum(wire_bytes(len(part), sealed) for part in parts[1:])
+        self._guard.took(descriptor, size, len(parts) - 1, key)
         if len(parts[0]) != PEER_BYTES:  # libzmq still takes most bytes for ZMTP 1.0
             self._guard.charge(descriptor, "its id is not 8 bytes: no agent")
         elif len(parts) > _MAX_PARTS:
