@@ -158,7 +158,7 @@ def test_a_slow_reader_costs_bounded_memory_and_blocks_nobody(net: Net) -> None:
     assert time.monotonic() - start < 3
     while edge.receive(50):
         pass
-    assert eventually(lambda: agent.send([b"again"]))
+    assert eventually(lambda: (edge.receive(5), agent.send([b"again"]))[1])  # it may have been cut off
 
 
 def test_many_agents_are_told_apart(net: Net) -> None:

@@ -30,7 +30,7 @@ def test_heartbeats_do_not_add_up() -> None:
     account, read = Account(0.0), 0
     for second in range(10_000):
         read += 100 + 500  # heartbeats and a message
-        account.took(500, 1, float(second))
+        account.took(500, 1, 1, float(second))
         account.sample(read, True)
         account.mark()
         account.settle()
@@ -52,7 +52,7 @@ def test_half_a_message_behind_each_is_no_way_to_hide_one() -> None:
     account.sample(read, True)
     for second in range(100):
         read += 1000  # the rest of one, and half of the next
-        account.took(1000, 1, float(second))
+        account.took(1000, 1, 1, float(second))
         account.sample(read + 500, True)
         account.mark()
         account.settle()
@@ -67,7 +67,7 @@ def test_half_a_message_behind_each_is_no_way_to_hide_one() -> None:
 def test_what_is_not_known_exactly_changes_no_more_than_it_says() -> None:
     account = Account(0.0)
     account.sample(1000, True)
-    account.took(100, 1, 1.0)
+    account.took(100, 1, 1, 1.0)
     account.sample(200, False)  # some came while it was asked
     assert account.waiting == 900
 

@@ -14,7 +14,9 @@ from dataclasses import dataclass, field
 
 PART_BYTES = 64  # that libzmq holds for a part, however small it is
 _MEMORY_BYTES = 24_000_000  # that what waits of all together may take
+_BUFFERED = 1.5  # bytes of memory for a byte: parts of less than 8 kB stay in the buffer that they came in
 _LATELY_BYTES = 128_000  # handed over, of which the size of parts is taken
+_USUAL = 1024.0, 8.0  # bytes and parts that count for a connection's own at first: its first may be tiny
 TINY = 8.0  # times its bytes: what takes that much memory is of parts that no agent sends so many of
 _WAITING, _IMAGES_WAITING = 64, 4  # largest messages: an agent has 16 keyframes under way, or 3 frames
 _IMAGE_BYTES = 1_000_000  # from this on frames are images
@@ -51,7 +53,7 @@ class Account:
     handed: int = 0
     messages: int = 0
     smallest: int = 2  # bytes on the wire of the smallest part: all are taken for such until some are known
-    _lately: tuple[float, float] = (0.0, 0.0)  # bytes and parts handed over, the latest count most
+    _lately: tuple[float, float] = _USUAL  # bytes and parts handed over, the latest count most
     _commands: int = 0  # of what was read, as far as is known
     _news: bool = False  # a message since `_commands` was looked at
     _mark: tuple[int, int] = field(default=(0, 0))  # read and messages when marked
@@ -63,8 +65,8 @@ class Account:
     @property
     def weight(self) -> float:
         """Bytes of memory for a byte that waits."""
-        bytes_, parts = self._lately if self._lately[1] else (self.smallest, 1)
-        return 1.0 + PART_BYTES * parts / bytes_
+        bytes_, parts = self._lately if self.messages else (self.smallest, 1)
+        return _BUFFERED + PART_BYTES * parts / bytes_
 
     @property
     def memory(self) -> float:

@@ -107,9 +107,10 @@ class Guard:
         self._ended: dict[int, float] = {}  # when a descriptor was last given back
         self._paused: dict[str, float] = {}  # addresses of which nobody new is let in, until when
         self._to_fail = 0  # handshakes that were cut off
-        self._orphaned = 0  # bytes that waited of connections that ended, since nothing waited
+        self._orphaned = 0.0  # bytes of memory of connections that ended, since nothing waited
         self._homes: set[str] = set()  # addresses from which a key has sent a message
         self._resident = tcp.resident_bytes()  # memory of this process when last little waited
+        self._handed = 0  # bytes handed over since then: whoever took them may have kept them
         self._marked_s = 0.0
         self._since_mark = 0  # messages handed over
         self._thread = Thread(target=self._watch, name="guard", daemon=True)
@@ -186,6 +187,7 @@ class Guard:
     def _look(self) -> None:
         self._is_over = self._is_over or not self._hear()
         if not self._is_over and time.monotonic() >= self._due_s:
+            self._due_s = time.monotonic() + _TICK_MS * 1e-3
             wait_ms = self._check(time.monotonic())
             self._due_s = time.monotonic() + wait_ms * 1e-3
 
@@ -208,8 +210,8 @@ class Guard:
                 self._forget(value)
             elif self._to_fail:
                 self._to_fail -= 1
-            else:
-                with self._lock:
+            elif not any(connection.is_held for connection in self._open.values()):
+                with self._lock:  # who is held may fail for that
                     self._failed += 1
 
     def _accept(self, descriptor: int) -> None:
@@ -268,7 +270,7 @@ class Guard:
         connection = self._open.pop(descriptor, None)
         if connection is not None:
             self._ended[descriptor] = time.monotonic()
-            self._orphaned += max(0, connection.account.waiting)
+            self._orphaned += connection.account.memory
 
     def _check(self, now_s: float) -> int:
         """Milliseconds until the next one is due."""
@@ -285,15 +287,25 @@ class Guard:
         if empty_s > self._cut_off_s + _SETTLES_S:
             self._cut_off = frozenset()
         much = sum(max(0, connection.account.waiting) for connection in self._present())
-        grown = tcp.resident_bytes() - self._resident - much if much > self._bounds.message else 0
-        if grown > GROWTH_BYTES:
-            self._offend(self._worst(now_s), "many small parts", now_s)
+        if much > self._bounds.message:
+            self._weigh(much, now_s)
         self._let_in(now_s)
         if much <= self._bounds.message and not self._cut_off:
-            self._resident = tcp.resident_bytes()
+            self._resident, self._handed = tcp.resident_bytes(), 0
             return _TICK_MS
         self._poke()
         return _ALERT_MS
+
+    def _weigh(self, much: int, now_s: float) -> None:
+        """Whoever hides small parts behind large ones is known by how this process grows."""
+        explained = self._resident + self._handed + self._unclaimed() + much
+        if (grown := tcp.resident_bytes() - explained) > GROWTH_BYTES:
+            self._offend(self._worst(now_s), "many small parts", now_s)
+            self._orphaned += grown  # that is its own: nobody else is to be taken for it
+
+    def _unclaimed(self) -> float:
+        """Bytes of memory of what waits to be thrown away, were none thrown away yet."""
+        return self._orphaned + sum(c.account.memory for c in self._open.values() if c.is_cut)
 
     def _enter(self, now_s: float) -> None:
         """What was handed over since the last time."""
@@ -301,6 +313,7 @@ class Guard:
             taken, self._taken = self._taken, {}
         for descriptor, (size, parts, messages, key) in taken.items():
             self._since_mark += messages
+            self._handed += size
             connection = self._open.get(descriptor)
             if connection is not None:
                 if connection.strange:
@@ -345,7 +358,7 @@ class Guard:
                     self._cut(connection)
                 account.settle()
             account.mark()
-        self._orphaned = 0 if empty else self._orphaned
+        self._orphaned = 0.0 if empty else self._orphaned
         self._marked_s, self._since_mark = time.monotonic(), 0
 
     def _bound(self, now_s: float) -> None:
@@ -353,8 +366,13 @@ class Guard:
         for connection in self._present():
             if connection.account.memory > self._bounds.peer:
                 self._unload(connection, "more than may wait", now_s)
-        while sum(connection.account.memory for connection in self._present()) > self._bounds.total:
-            self._unload(self._worst(now_s), "more than may wait of all together", now_s)
+        unclaimed, share = self._unclaimed(), self._bounds.peer / 8  # which an agent may have in any case
+        while present := self._present():
+            all_of_them = sum(connection.account.memory for connection in present)
+            worst = self._worst(now_s)
+            if all_of_them + (unclaimed if worst.account.memory > share else 0.0) <= self._bounds.total:
+                break
+            self._unload(worst, "more than may wait of all together", now_s)
 
     def _unload(self, connection: _Connection, reason: str, now_s: float) -> None:
         if connection.account.weight > TINY:
