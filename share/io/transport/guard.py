@@ -40,9 +40,12 @@ STRANGERS = 32  # of these, that have not said anything yet
 MUTE_S = 60.0  # without a message; agents ping every half second
 _STRANGE_S = 10.0  # to the first message
 _TICK_MS, _ALERT_MS = 20, 5
+_MANY = 64  # messages in less than _TICK_MS
 _ROUND = 2 * CONNECTIONS  # messages; those of connections that are closed by now wait beside the others
 GROWTH_BYTES = 12_000_000  # of memory, beyond the bytes that wait: small parts take much more than they have
+_TINY_SHARE = 4  # of these much less may wait: the more there are, the longer it takes to throw them away
 _PAUSE_S = 0.3  # without newcomers from where somebody offended of whom no more is known than that
+_AT_ONCE = 4  # that were held are let in: an attacker may have sent many
 _SETTLES_S = 0.05  # until all that libzmq has read of a connection that was cut off is there to be received
 _HOMES = 4096
 _EVENTS = (
@@ -98,8 +101,9 @@ class Guard:
         # let in (who could have such a descriptor next) until nothing waits any more.
         self._cut_off: frozenset[int] = frozenset()
         self._cut_off_s = 0.0  # when the last was
+        self._unlooked = 0  # messages since somebody looked
         self._turn = Lock()  # of who looks, and of what follows
-        self._due_s = 0.0  # when to look again
+        self._due_s, self._looked_s = 0.0, 0.0  # when to look again, and when last
         self._is_over = False
         self._listener: tuple[int, int] | None = None  # descriptor and cookie
         self._is_gated = False  # who is accepted is held from the start
@@ -126,8 +130,11 @@ class Guard:
 
     def look(self) -> None:
         """Between two messages."""
-        if time.monotonic() >= self._due_s and self._turn.acquire(blocking=False):
+        self._unlooked += 1
+        due_s = self._looked_s + _ALERT_MS * 1e-3 if self._unlooked >= _MANY else self._due_s
+        if time.monotonic() >= due_s and self._turn.acquire(blocking=False):
             try:
+                self._due_s = min(self._due_s, time.monotonic())
                 self._look()
             finally:
                 self._turn.release()
@@ -189,7 +196,8 @@ class Guard:
         if not self._is_over and time.monotonic() >= self._due_s:
             self._due_s = time.monotonic() + _TICK_MS * 1e-3
             wait_ms = self._check(time.monotonic())
-            self._due_s = time.monotonic() + wait_ms * 1e-3
+            self._unlooked, self._looked_s = 0, time.monotonic()
+            self._due_s = self._looked_s + wait_ms * 1e-3
 
     def _hear(self) -> bool:
         """Events that have come. False once there will be no more."""
@@ -227,9 +235,9 @@ class Guard:
             self._cut(connection)
             self._cut_off |= {descriptor}
         elif self._holds(connection.address, now_s):
-            connection.is_held = self._is_gated or tcp.hold(descriptor, number)
-        elif self._is_gated:
-            tcp.release(descriptor, number)
+            connection.is_held = tcp.hold(descriptor, number)
+        else:
+            tcp.release(descriptor, number)  # it may have come while the gate was closed
         self._make_room()
 
     def _is_sure(self, descriptor: int) -> bool:
@@ -242,11 +250,11 @@ class Guard:
 
     def _let_in(self, now_s: float) -> None:
         """Those who need not wait any longer; closes or opens the gate for those to come."""
-        for connection in self._open.values():
-            if connection.is_held and not self._holds(connection.address, now_s):
-                tcp.release(connection.descriptor, connection.cookie)
-                connection.is_held, connection.sure = False, self._is_sure(connection.descriptor)
-                connection.account.since_s = now_s
+        held = [c for c in self._open.values() if c.is_held and not self._holds(c.address, now_s)]
+        for connection in held[:_AT_ONCE]:  # who came first
+            tcp.release(connection.descriptor, connection.cookie)
+            connection.is_held, connection.sure = False, self._is_sure(connection.descriptor)
+            connection.account.since_s = now_s
         self._paused = {address: until_s for address, until_s in self._paused.items() if now_s < until_s}
         gate = bool(self._paused) or self._holds("", now_s)
         if gate != self._is_gated and self._listener is not None:
@@ -364,7 +372,8 @@ class Guard:
     def _bound(self, now_s: float) -> None:
         """Whatever it is that waits: who has too much of it goes, then who has the most for the longest."""
         for connection in self._present():
-            if connection.account.memory > self._bounds.peer:
+            tiny = connection.account.weight > TINY
+            if connection.account.memory > self._bounds.peer / (_TINY_SHARE if tiny else 1):
                 self._unload(connection, "more than may wait", now_s)
         unclaimed, share = self._unclaimed(), self._bounds.peer / 8  # which an agent may have in any case
         while present := self._present():
