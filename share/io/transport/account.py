@@ -15,10 +15,11 @@ from dataclasses import dataclass, field
 PART_BYTES = 64  # that libzmq holds for a part, however small it is
 _MEMORY_BYTES = 24_000_000  # that what waits of all together may take
 _BUFFERED = 1.5  # bytes of memory for a byte: parts of less than 8 kB stay in the buffer that they came in
-_LATELY_BYTES = 128_000  # handed over, of which the size of parts is taken
-_USUAL = 1024.0, 8.0  # bytes and parts that count for a connection's own at first: its first may be tiny
+_LATELY_BYTES = 16_000  # handed over, of which the size of parts is taken
+_USUAL = 8 / 1024  # parts a byte, before any are known
 TINY = 8.0  # times its bytes: what takes that much memory is of parts that no agent sends so many of
-_WAITING, _IMAGES_WAITING = 64, 4  # largest messages: an agent has 16 keyframes under way, or 3 frames
+TINY_SHARE = 4  # of these much less may wait: the more there are, the longer it takes to throw them away
+_WAITING, _IMAGES_WAITING = 32, 4  # largest messages: an agent has 16 keyframes under way, or 3 frames
 _IMAGE_BYTES = 1_000_000  # from this on frames are images
 
 
@@ -27,15 +28,13 @@ class Bounds:
     message: int  # the largest message, bytes on the wire
     peer: int  # bytes of memory that what waits of one peer may take
     total: int  # and of all together
-    part: int  # bytes on the wire of the smallest part
 
     @classmethod
-    def of(cls, max_frame_bytes: int, sealed: bool) -> Bounds:
-        """sealed: with keys, by which even an empty part takes its place on the wire."""
+    def of(cls, max_frame_bytes: int) -> Bounds:
         most = _IMAGES_WAITING if max_frame_bytes >= _IMAGE_BYTES else _WAITING
         message = 2 * max_frame_bytes + max_frame_bytes // 8  # two images; the rest of any is less
         total = max(2 * message, _MEMORY_BYTES)
-        return cls(message, min(most * message, total), total, wire_bytes(0, sealed))
+        return cls(message, min(most * message, total), total)
 
 
 def wire_bytes(size: int, sealed: bool) -> int:
@@ -52,8 +51,7 @@ class Account:
     read: int = 0
     handed: int = 0
     messages: int = 0
-    smallest: int = 2  # bytes on the wire of the smallest part: all are taken for such until some are known
-    _lately: tuple[float, float] = _USUAL  # bytes and parts handed over, the latest count most
+    _density: float = _USUAL  # parts a byte, of what was handed over lately
     _commands: int = 0  # of what was read, as far as is known
     _news: bool = False  # a message since `_commands` was looked at
     _mark: tuple[int, int] = field(default=(0, 0))  # read and messages when marked
@@ -65,8 +63,7 @@ class Account:
     @property
     def weight(self) -> float:
         """Bytes of memory for a byte that waits."""
-        bytes_, parts = self._lately if self.messages else (self.smallest, 1)
-        return _BUFFERED + PART_BYTES * parts / bytes_
+        return _BUFFERED + PART_BYTES * self._density
 
     @property
     def memory(self) -> float:
@@ -87,8 +84,7 @@ class Account:
     def took(self, size: int, parts: int, messages: int, now_s: float) -> None:
         """So many bytes in so many parts and messages more were handed over. To be followed by a `sample`."""
         self.handed += size
-        fades = _LATELY_BYTES / (_LATELY_BYTES + size)
-        self._lately = fades * self._lately[0] + size, fades * self._lately[1] + parts
+        self._density += (parts - size * self._density) / (_LATELY_BYTES + size)
         self.messages += messages
         self.since_s = now_s
         self._news = True

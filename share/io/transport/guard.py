@@ -32,7 +32,7 @@ from threading import Lock, Thread
 import zmq
 
 from share.io.transport import tcp
-from share.io.transport.account import TINY, Account, Bounds
+from share.io.transport.account import TINY, TINY_SHARE, Account, Bounds
 from share.io.transport.keep_out import KeepOut
 
 CONNECTIONS = 128  # at a time
@@ -43,7 +43,6 @@ _TICK_MS, _ALERT_MS = 20, 5
 _MANY = 64  # messages in less than _TICK_MS
 _ROUND = 2 * CONNECTIONS  # messages; those of connections that are closed by now wait beside the others
 GROWTH_BYTES = 12_000_000  # of memory, beyond the bytes that wait: small parts take much more than they have
-_TINY_SHARE = 4  # of these much less may wait: the more there are, the longer it takes to throw them away
 _PAUSE_S = 0.3  # without newcomers from where somebody offended of whom no more is known than that
 _AT_ONCE = 4  # that were held are let in: an attacker may have sent many
 _SETTLES_S = 0.05  # until all that libzmq has read of a connection that was cut off is there to be received
@@ -228,8 +227,7 @@ class Guard:
         if number is None or ends is None:
             return
         now_s = time.monotonic()
-        account = Account(now_s, smallest=self._bounds.part)
-        connection = _Connection(descriptor, number, ends[0], account, self._is_sure(descriptor))
+        connection = _Connection(descriptor, number, ends[0], Account(now_s), self._is_sure(descriptor))
         self._open[descriptor] = connection
         if self._kept_out.holds(connection.address, now_s):
             self._cut(connection)
@@ -362,7 +360,9 @@ class Guard:
             if empty or account.quiet():
                 if account.marked > self._bounds.message:
                     self._offend(connection, "a message that does not end", now_s)
-                elif not connection.is_held and now_s - account.since_s > (_STRANGE_S if connection.strange else MUTE_S):
+                elif not connection.is_held and now_s - account.since_s > (
+                    _STRANGE_S if connection.strange else MUTE_S
+                ):
                     self._cut(connection)
                 account.settle()
             account.mark()
@@ -373,7 +373,7 @@ class Guard:
         """Whatever it is that waits: who has too much of it goes, then who has the most for the longest."""
         for connection in self._present():
             tiny = connection.account.weight > TINY
-            if connection.account.memory > self._bounds.peer / (_TINY_SHARE if tiny else 1):
+            if connection.account.memory > self._bounds.peer / (TINY_SHARE if tiny else 1):
                 self._unload(connection, "more than may wait", now_s)
         unclaimed, share = self._unclaimed(), self._bounds.peer / 8  # which an agent may have in any case
         while present := self._present():

@@ -29,7 +29,12 @@ _libc = ctypes.PyDLL(None)
 class _Filter(ctypes.Structure):
     """struct sock_filter: an instruction of classic BPF, linux/filter.h."""
 
-    _fields_ = (("code", ctypes.c_ushort), ("jt", ctypes.c_ubyte), ("jf", ctypes.c_ubyte), ("k", ctypes.c_uint))
+    _fields_ = (
+        ("code", ctypes.c_ushort),
+        ("jt", ctypes.c_ubyte),
+        ("jf", ctypes.c_ubyte),
+        ("k", ctypes.c_uint),
+    )
 
 
 class _Program(ctypes.Structure):
@@ -103,9 +108,7 @@ def cut(descriptor: int, number: int) -> bool:
 def hold(descriptor: int, number: int) -> bool:
     """Lets no data in any more by the socket with the cookie `number`; where that listens, none by what is
     accepted from now on. Whether that could be done."""
-    return _with_copy(
-        descriptor, number, lambda copy: _set(copy, _SO_ATTACH_FILTER, _HEADERS_ONLY)
-    )
+    return _with_copy(descriptor, number, lambda copy: _set(copy, _SO_ATTACH_FILTER, _HEADERS_ONLY))
 
 
 def release(descriptor: int, number: int) -> bool:
