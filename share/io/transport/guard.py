@@ -25,14 +25,13 @@ import struct
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
-from ipaddress import ip_address
 from threading import Lock, Thread
 
 import zmq
 
 from share.io.transport import tcp
 from share.io.transport.account import TINY, TINY_SHARE, Account, Bounds
+from share.io.transport.connection import Connection
 from share.io.transport.keep_out import KeepOut
 
 CONNECTIONS = 128  # at a time
@@ -57,25 +56,6 @@ _EVENTS = (
 )
 
 
-@dataclass(eq=False)
-class _Connection:
-    """cookie: by which its descriptor is known to be still the same. sure: no message of an earlier connection
-    with this descriptor can be waiting."""
-
-    descriptor: int
-    cookie: int
-    address: str
-    account: Account
-    sure: bool
-    key: str = ""
-    is_cut: bool = False
-    is_held: bool = False
-
-    @property
-    def strange(self) -> bool:
-        return self.account.messages == 0
-
-
 class Guard:
     """Of `socket`, before it is bound. A thread of its own, which ends when `close` is called.
 
@@ -88,11 +68,11 @@ class Guard:
         self._monitored, self._bounds, self._kept_out, self._poke = socket, bounds, kept_out, poke
         self._events: zmq.Socket[bytes] = socket.get_monitor_socket(_EVENTS)
         self._events_ready = select.poll()  # which, unlike libzmq's, several threads may use
-        self._events_ready.register(self._events.getsockopt(zmq.FD), select.POLLIN)
+        self._events_ready.register(int(self._events.getsockopt(zmq.FD)), select.POLLIN)
         self._lock = Lock()  # of what several threads use, the next two
         self._taken: dict[int, tuple[int, int, int, str]] = {}  # bytes, parts, messages, key by descriptor
         self._failed = 0
-        self._charges: deque[tuple[_Connection | int, str]] = deque(maxlen=CONNECTIONS)
+        self._charges: deque[tuple[Connection | int, str]] = deque(maxlen=CONNECTIONS)
         self._admitted: deque[tuple[str, str]] = deque(maxlen=CONNECTIONS)  # key and address
         self._lines: deque[str] = deque(maxlen=128)
         self._empty_s = 0.0
@@ -106,7 +86,7 @@ class Guard:
         self._is_over = False
         self._listener: tuple[int, int] | None = None  # descriptor and cookie
         self._is_gated = False  # who is accepted is held from the start
-        self._open: dict[int, _Connection] = {}  # by descriptor
+        self._open: dict[int, Connection] = {}  # by descriptor
         self._ended: dict[int, float] = {}  # when a descriptor was last given back
         self._paused: dict[str, float] = {}  # addresses of which nobody new is let in, until when
         self._to_fail = 0  # handshakes that were cut off
@@ -150,7 +130,7 @@ class Guard:
         """What that connection sent no agent sends."""
         connection = self._open.get(descriptor)
         if connection is not None and connection.sure:  # at once; who it is will be looked at later
-            tcp.cut(descriptor, connection.cookie)
+            connection.cut()
             self._charges.append((connection, reason))
         else:
             self._charges.append((descriptor, reason))
@@ -227,7 +207,7 @@ class Guard:
         if number is None or ends is None:
             return
         now_s = time.monotonic()
-        connection = _Connection(descriptor, number, ends[0], Account(now_s), self._is_sure(descriptor))
+        connection = Connection(descriptor, number, ends[0], Account(now_s), self._is_sure(descriptor))
         self._open[descriptor] = connection
         if self._kept_out.holds(connection.address, now_s):
             self._cut(connection)
@@ -269,7 +249,7 @@ class Guard:
             self._cut(random.choice([connection for connection in strange if connection.address == most]))
             self._lines.append(f"{most}: more connections than may be open at a time")
 
-    def _present(self) -> list[_Connection]:
+    def _present(self) -> list[Connection]:
         return [connection for connection in self._open.values() if not connection.is_cut]
 
     def _forget(self, descriptor: int) -> None:
@@ -326,7 +306,7 @@ class Guard:
                     self._introduce(connection, key)
                 connection.account.took(size, parts, messages, now_s)
 
-    def _introduce(self, connection: _Connection, key: str) -> None:
+    def _introduce(self, connection: Connection, key: str) -> None:
         """Its first message: now it is known whose it is."""
         connection.key = key
         if key and len(self._homes) < _HOMES:
@@ -343,12 +323,8 @@ class Guard:
 
     def _sample(self) -> None:
         for connection in list(self._open.values()):
-            same = tcp.cookie(connection.descriptor) == connection.cookie
-            read = tcp.bytes_read(connection.descriptor) if same else None
-            if read is None:
+            if not connection.sample():
                 self._forget(connection.descriptor)
-            else:
-                connection.account.sample(*read)
 
     def _judge(self, empty_s: float, now_s: float) -> None:
         """No whole message waits of who was quiet since the mark; of nobody if it was empty since."""
@@ -383,53 +359,45 @@ class Guard:
                 break
             self._unload(worst, "more than may wait of all together", now_s)
 
-    def _unload(self, connection: _Connection, reason: str, now_s: float) -> None:
+    def _unload(self, connection: Connection, reason: str, now_s: float) -> None:
         if connection.account.weight > TINY:
             self._offend(connection, "many small parts", now_s)
         else:
             self._shed(connection, reason)
 
-    def _worst(self, now_s: float) -> _Connection:
+    def _worst(self, now_s: float) -> Connection:
         """Who has the most waiting, for the longest."""
         return max(self._present(), key=lambda c: c.account.memory * (now_s - c.account.since_s + 0.1))
 
-    def _convict(self, whom: _Connection | int, reason: str) -> None:
+    def _convict(self, whom: Connection | int, reason: str) -> None:
         connection = self._open.get(whom) if isinstance(whom, int) else whom
         if connection is not None and connection.sure:
             self._offend(connection, reason, time.monotonic())
 
-    def _shed(self, connection: _Connection, reason: str) -> None:
+    def _shed(self, connection: Connection, reason: str) -> None:
         """Too much waits. An honest agent comes to that where the edge is very busy: it may come back."""
         self._end(connection)
         self._lines.append(f"{connection.key or connection.address}: {reason}; cut off")
 
-    def _end(self, connection: _Connection) -> None:
+    def _end(self, connection: Connection) -> None:
         self._cut(connection)
         self._cut_off |= {connection.descriptor}
         self._cut_off_s = time.monotonic()
 
-    def _offend(self, connection: _Connection, reason: str, now_s: float) -> None:
+    def _offend(self, connection: Connection, reason: str, now_s: float) -> None:
         """It sends what no agent does: it is kept out."""
         if connection.is_cut:
             return
         self._end(connection)
-        who = self._culprit(connection)
-        name = f"the key '{connection.key}'" if connection.key else connection.address
-        self._lines.append(f"{name}: {reason}; cut off{' and kept out' if who else ''}")
+        who = connection.culprit(self._homes)
+        self._lines.append(f"{connection.name}: {reason}; cut off{' and kept out' if who else ''}")
         if who is not None:
             self._kept_out.offend(who, now_s)
         elif connection.address in self._paused or len(self._paused) < _HOMES:
             self._paused[connection.address] = now_s + _PAUSE_S
 
-    def _culprit(self, connection: _Connection) -> str | None:
-        """Whom to keep out: the key, if it is known; the address, unless agents live there as well."""
-        if connection.key:
-            return connection.key
-        local = ip_address(connection.address.partition("%")[0]).is_loopback
-        return None if local or connection.address in self._homes else connection.address
-
-    def _cut(self, connection: _Connection) -> None:
+    def _cut(self, connection: Connection) -> None:
         connection.is_cut = True
-        there = tcp.cut(connection.descriptor, connection.cookie)
+        there = connection.cut()
         if there and connection.strange and self._to_fail < CONNECTIONS:
             self._to_fail += 1

@@ -118,7 +118,7 @@ def release(descriptor: int, number: int) -> bool:
 
 def _set(descriptor: int, option: int, value: ctypes.Structure | ctypes.c_int) -> bool:
     size = ctypes.sizeof(value)
-    return _libc.setsockopt(descriptor, socket.SOL_SOCKET, option, ctypes.byref(value), size) == 0
+    return bool(_libc.setsockopt(descriptor, socket.SOL_SOCKET, option, ctypes.byref(value), size) == 0)
 
 
 def _with_copy(descriptor: int, number: int, do: Callable[[int], bool]) -> bool:

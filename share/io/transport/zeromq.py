@@ -49,7 +49,7 @@ _COMMON: dict[int, int] = {
     zmq.SNDHWM: QUEUE_MESSAGES,
     zmq.RCVHWM: 0,  # see ZmqEdgeLink: an edge that resets while a full queue stops the input ends an agent
     zmq.MAXMSGSIZE: MAX_FRAME_BYTES,  # a larger frame closes the connection of its sender
-    zmq.HANDSHAKE_IVL: 2000,
+    zmq.HANDSHAKE_IVL: 4000,  # an edge under attack holds newcomers meanwhile
     zmq.HEARTBEAT_IVL: 500,  # a peer whose network is gone is noticed, and its queue dropped, in 2 s
     zmq.HEARTBEAT_TIMEOUT: 2000,
     zmq.HEARTBEAT_TTL: 2000,
