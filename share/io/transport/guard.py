@@ -4,12 +4,9 @@ It learns of connections from the socket's monitor, of what libzmq has read of e
 what was handed over from whoever receives (`took`, `empty`). It cuts off who has more waiting than may be,
 whose message has too many parts, who is no agent, and who says nothing.
 
-It looks in a thread of its own, and in that of whoever receives, between two messages: on a busy machine the
-thread would wait long for its turn, and libzmq reads on meanwhile.
-
+It looks in a thread of its own, and in that of whoever receives, which on a busy machine has its turn sooner.
 After somebody was cut off, newcomers are held until what still waits of it is thrown away: the kernel lets
-none of their data in, so that who attacks again and again brings nothing with each attempt, and who is honest
-is not turned away.
+none of their data in, so that an attack that is repeated brings nothing, and honest ones are not turned away.
 
 No whole message of a connection waits when `receive` has found nothing at all, and neither when as many
 messages of others were handed over as there can be connections: libzmq takes one of each in turn. What still
