@@ -14,16 +14,35 @@ from share.core.edge import Edge
 from share.core.edge_events import Answered, Event, Lost, Ready, Received, ToTracker
 from share.core.peer import Peer
 from share.core.window import Window
+from share.geometry.camera import Rig
 from share.types import Frame
 from share.wire import messages as wire
 
 
 @dataclass(frozen=True)
 class Room:
-    """How many agents can be tracked at a time, and of what that comes, for a person."""
+    """How many agents can be tracked at a time, and of what that comes, for a person. bytes: of memory, for
+    all their trackers; None: not known."""
 
     agents: int
     why: str
+    bytes: int | None = None
+
+    def objection(self, others: Sequence[Rig], rig: Rig) -> str | None:
+        """Why one more cannot be tracked beside the others; the first always can."""
+        if others and len(others) >= self.agents:
+            most = f"{self.agents} streamed agent{'' if self.agents == 1 else 's'}"
+            return f"this machine can track {most}: {self.why}; wait until one leaves"
+        needs = sum(tracker_bytes(each) for each in (*others, rig))
+        if others and self.bytes is not None and needs > self.bytes:
+            size = f"{rig.cam0.width}x{rig.cam0.height}"
+            return f"no memory to track images of {size} beside the others: {self.why}; wait until one leaves"
+        return None
+
+
+def tracker_bytes(rig: Rig) -> int:
+    """Memory of a tracker's process: 112 MB at 640x480 after 5 s, 320 MB at 3800x2400."""
+    return 100_000_000 + 32 * rig.cam0.width * rig.cam0.height
 
 
 class TrackingEdge(Edge):
@@ -79,15 +98,14 @@ class TrackingEdge(Edge):
 
     def _objection(self, event: Received, hello: wire.Hello, now_ns: int) -> str | None:
         known = self._runs.get(event.peer)
-        return super()._objection(event, hello, now_ns) or self._full(None if known is None else known.key)
+        return super()._objection(event, hello, now_ns) or self._full(
+            None if known is None else known.key, hello.rig
+        )
 
-    def _full(self, key: str | None) -> str | None:
+    def _full(self, key: str | None, rig: Rig) -> str | None:
         """Why no tracker can begin for this run, or for a new one, if none can."""
-        running = [other for other, afar in self._afar.items() if afar.is_running and other != key]
-        if self._room is None or len(running) < self._room.agents:
-            return None
-        most = f"{self._room.agents} streamed agent{'' if self._room.agents == 1 else 's'}"
-        return f"this machine can track {most}: {self._room.why}; wait until one leaves"
+        running = [afar.rig for other, afar in self._afar.items() if afar.is_running and other != key]
+        return None if self._room is None else self._room.objection(running, rig)
 
     def _enter(self, peer_id: bytes, peer: Peer) -> None:
         self._runs.add(peer_id, peer)
@@ -108,7 +126,7 @@ class TrackingEdge(Edge):
     def _heard(self, peer: Peer, now_ns: int) -> None:
         was_gone = peer.gone
         super()._heard(peer, now_ns)
-        if was_gone and (reason := self._full(peer.key)) is not None:
+        if was_gone and (reason := self._full(peer.key, peer.hello.rig)) is not None:
             self._send(self._runs.by_key[peer.key], wire.Refused(reason))
         elif was_gone:
             self._do(self._afar[peer.key].begin())

@@ -260,7 +260,7 @@ class AgentRun:
         if (trouble := self._link.trouble()) != self.trouble:
             self.trouble = trouble
             if trouble is not None:
-                self._say(f"not let in: {trouble}")
+                self._say(trouble)
 
     def _handle(self, event: ev.AgentEvent) -> None:
         """One guarded step: what fails costs this event, and never the run."""

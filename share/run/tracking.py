@@ -22,16 +22,13 @@ from share.wire.messages import Tracked
 
 _PATIENCE_S = 6.0  # for one to end
 _A_CORE = 2  # at 15 frames a second each; a frame takes 15 to 30 ms
-_TRACKER_BYTES = 150_000_000  # 112 MB after 5 s at 640x480
 
 
 def room() -> Room:
     """For trackers, on this machine as it is now."""
     free = free_bytes()
-    by_memory = [] if free is None else [free // _TRACKER_BYTES]
     told = "" if free is None else f", {free / 1e9:.1f} GB free"
-    most = max(1, min(_A_CORE * cores(), *by_memory))
-    return Room(most, f"{cores()} core{'' if cores() == 1 else 's'}{told}")
+    return Room(_A_CORE * cores(), f"{cores()} core{'' if cores() == 1 else 's'}{told}", free)
 
 
 class Trackers:

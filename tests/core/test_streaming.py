@@ -17,6 +17,7 @@ from share.core.edge import Edge
 from share.core.tracking_edge import Room, TrackingEdge
 from share.errors import UsageError
 from share.geometry import se3
+from share.geometry.camera import Camera, Rig
 from share.types import F64, Frame, ImuBatch, TrackState
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -320,3 +321,19 @@ def test_no_more_are_tracked_than_there_is_room_for():
     down, effects = greeted(edge, 1)  # back, but its place is taken
     assert set(down) == {m.Refused(why)}
     assert not [e for e in effects if isinstance(e, ed.BeginTracking)]
+
+
+def test_large_images_need_more_room():
+    """Each tracker of 3800x2400 takes 392 MB of it, of 640x480 110."""
+    edge = TrackingEdge(CONFIG, 1, room=Room(8, "4 cores, 1.0 GB free", 1_000_000_000))
+    large = Rig(Camera(3800, 2400, 3000.0, 3000.0, 1900.0, 1200.0), np.eye(4))
+    begun, refused = 0, []
+    for k in range(12):
+        hello = replace(hello_of(f"agent{k}", 100 + k), streams=True, rig=large)
+        effects = edge.handle(ed.Received(m.peer_id(100 + k), encode(hello)), 0)
+        begun += sum(isinstance(e, ed.BeginTracking) for e in effects)
+        refused += [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.Send)]
+    why = "no memory to track images of 3800x2400 beside the others"
+    why = f"{why}: 4 cores, 1.0 GB free; wait until one leaves"
+    assert begun == 2 and refused == [m.Refused(why)] * 10
+    assert [type(e) for e in greeted(edge, 50)[1]].count(ed.BeginTracking) == 1  # a small one has room

@@ -311,7 +311,7 @@ def test_who_is_not_listed_does_not_until_listed(house: House) -> None:
     assert said.endswith(f"is not authorized; to let it in: share keys authorize NAME '{bob.public}'")
     assert "(127.0.0.1)" in said
     assert agent.trouble() == (
-        f"the edge does not know this key; there: share keys authorize bob '{bob.public}'"
+        f"not let in: the edge does not know this key; there: share keys authorize bob '{bob.public}'"
     )
     keys.authorize(house.folder, "bob", bob.public)
     house.greets(agent, 2)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from share.io.transport.account import Account, Bounds, wire_bytes
+from share.io.transport.account import PART_BYTES, TINY, Account, Bounds, wire_bytes
 from share.io.transport.keep_out import FIRST_S, MOST_S, KeepOut
 from share.types import DESCRIPTOR_BYTES, MAX_KEYPOINTS
 from share.wire.codec import MAX_FRAME_BYTES, MAX_HEADER_BYTES, MAX_IMAGE_BYTES
@@ -12,13 +12,13 @@ def test_the_largest_keyframe_is_less_than_a_message_may_have() -> None:
     poses = 8 * (16 + 36 + 16 + 3)
     points = MAX_KEYPOINTS * (8 + 12 + DESCRIPTOR_BYTES)
     for sealed in (False, True):
-        bounds = Bounds.of(MAX_FRAME_BYTES, sealed)
+        bounds = Bounds.of(MAX_FRAME_BYTES)
         assert MAX_HEADER_BYTES + poses + points + 10 * wire_bytes(0, sealed) < bounds.message
         assert 16 * bounds.message <= bounds.peer <= bounds.total  # the ledger's window
 
 
 def test_two_of_the_largest_images_are_less_too() -> None:
-    assert Bounds.of(MAX_IMAGE_BYTES, True).message > 2 * MAX_IMAGE_BYTES + 20_000 * 56 + MAX_HEADER_BYTES
+    assert Bounds.of(MAX_IMAGE_BYTES).message > 2 * MAX_IMAGE_BYTES + 20_000 * 56 + MAX_HEADER_BYTES
 
 
 def test_part_sizes_on_the_wire() -> None:
@@ -26,11 +26,29 @@ def test_part_sizes_on_the_wire() -> None:
     assert [wire_bytes(size, True) for size in (0, 222, 223)] == [35, 257, 265]
 
 
+def test_small_parts_weigh_more_than_their_bytes() -> None:
+    keyframes, pings, empty = Account(0.0), Account(0.0), Account(0.0)
+    keyframes.took(16 * 25_000, 16 * 9, 16, 0.0)
+    pings.took(100 * 32, 100, 100, 0.0)
+    empty.took(100_000, 50_000, 50_000, 0.0)
+    assert keyframes.weight < 2.0 < pings.weight < TINY < empty.weight
+    empty.sample(200_000, True)
+    assert empty.memory > 50_000 * PART_BYTES * 0.9
+
+
+def test_large_parts_of_before_hide_small_ones_not_for_long() -> None:
+    account = Account(0.0)
+    account.took(100_000_000, 1000, 100, 0.0)
+    assert account.weight < 2.0
+    account.took(200_000, 100_000, 100_000, 0.0)
+    assert account.weight > TINY
+
+
 def test_heartbeats_do_not_add_up() -> None:
     account, read = Account(0.0), 0
     for second in range(10_000):
         read += 100 + 500  # heartbeats and a message
-        account.took(500, 1, float(second))
+        account.took(500, 1, 1, float(second))
         account.sample(read, True)
         account.mark()
         account.settle()
@@ -52,7 +70,7 @@ def test_half_a_message_behind_each_is_no_way_to_hide_one() -> None:
     account.sample(read, True)
     for second in range(100):
         read += 1000  # the rest of one, and half of the next
-        account.took(1000, 1, float(second))
+        account.took(1000, 1, 1, float(second))
         account.sample(read + 500, True)
         account.mark()
         account.settle()
@@ -67,7 +85,7 @@ def test_half_a_message_behind_each_is_no_way_to_hide_one() -> None:
 def test_what_is_not_known_exactly_changes_no_more_than_it_says() -> None:
     account = Account(0.0)
     account.sample(1000, True)
-    account.took(100, 1, 1.0)
+    account.took(100, 1, 1, 1.0)
     account.sample(200, False)  # some came while it was asked
     assert account.waiting == 900
 

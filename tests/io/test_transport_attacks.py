@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
@@ -30,7 +30,9 @@ from share.io.transport import connect
 from share.wire.messages import peer_id
 
 GROWTH_BYTES = 100_000_000
+FLOOD_BYTES = 40_000_000  # of one peer after the other; without the guard's weights it takes 180 to 300 MB
 ROUND_TRIP_S = 2.0  # at most, on a busy machine; without the guard it is as long as the attack
+NEWCOMER_S = 6.0  # until the first answer, on a busy machine; without the guard's gate it is 10 and more
 IDS = count(1000)
 PING = frame(b"\x04PING\0\0abc", command=True)
 
@@ -208,6 +210,17 @@ def empty_parts(peer: RawPeer) -> bytes:
     return parts(32_768)
 
 
+def whole_messages(*bodies: bytes) -> Callable[[RawPeer], bytes]:
+    """A hundred kB of the same small one."""
+
+    def say(peer: RawPeer) -> bytes:
+        if isinstance(peer, CurvePeer):
+            return b"".join(peer.sealed_message(*bodies) for _ in range(3000 // len(bodies)))
+        return message(*bodies) * (100_000 // len(message(*bodies)))
+
+    return say
+
+
 def many_parts(peer: RawPeer) -> bytes:
     """Half a million bytes and more: a whole message each time."""
     if isinstance(peer, CurvePeer):
@@ -235,6 +248,50 @@ def test_messages_without_end(front: Front, say: Callable[[RawPeer], bytes], las
     assert took_s < 3.0
     assert any("cut off" in line for line in said["said"])
     assert len(said["said"]) < 10
+
+
+SMALL = {"empty": [b""], "a ping": [bytes(24)], "a pose": [bytes(300)], "empty parts": [b""] * 9}
+
+
+@pytest.mark.parametrize("lasts_s", DURATIONS)
+@pytest.mark.parametrize("front", ["zmq"], indirect=True)
+@pytest.mark.parametrize("bodies", SMALL.values(), ids=SMALL)
+def test_floods_of_small_whole_messages(front: Front, bodies: list[bytes], lasts_s: float) -> None:
+    """Each takes 64 bytes and more for 2 on the wire, and the front takes them one by one."""
+    with Agent(front) as agent, under(front, whole_messages(*bodies)) as attack:
+        began = time.monotonic()
+        wait_for(lambda: attack.sent)
+        time.sleep(lasts_s)
+        print(f"growth {front.growth / 1e6:.1f} MB, sent until cut off {attack.sent[:4]}")
+        print(f"round trips: 95 % {1e3 * agent.p95(began):.1f} ms, most {1e3 * agent.longest(began):.0f} ms")
+        assert front.growth < FLOOD_BYTES
+        assert agent.longest(began) < ROUND_TRIP_S
+        said, _ = front.end()
+    assert any("cut off" in line for line in said["said"]) and len(said["said"]) < 10
+
+
+@pytest.mark.parametrize("front", ["zmq"], indirect=True)
+@pytest.mark.parametrize("number", [3, pytest.param(30, marks=pytest.mark.slow)])
+def test_newcomers_get_in_beside_an_attack_that_is_repeated(front: Front, number: int) -> None:
+    """From the same address, so that it cannot be kept out."""
+    took = []
+    with Agent(front), under(front, whole_messages(b"")) as attack:
+        wait_for(lambda: attack.sent)
+        for at in range(number):
+            took.append(joining_s(front, 100 + at))
+    print(f"newcomers waited {sorted(round(s, 2) for s in took)} s")
+    assert sorted(took)[number // 2] < NEWCOMER_S
+
+
+def joining_s(front: Front, run_id: int) -> float:
+    """How long it takes a new agent to get its first answer; it says hello again and again, as they do."""
+    began = again = time.monotonic()
+    with closing(connect(front.endpoint, run_id, front.agent)) as link:
+        while not link.receive(20):
+            assert time.monotonic() < began + 30.0, "did not get in"
+            if time.monotonic() >= again and link.send([b"hello"]):
+                again = time.monotonic() + 0.4
+    return time.monotonic() - began
 
 
 @pytest.mark.parametrize("front", ["curve"], indirect=True)
@@ -276,7 +333,8 @@ def test_a_flood_of_connections_that_say_nothing(front: Front, number: int) -> N
     with Agent(front) as agent, ExitStack() as stack:
         began, used_s, most = time.monotonic(), front.cpu_s, 0
         for at in range(number):
-            stack.enter_context(closing(socket.create_connection((host, int(port)), timeout=10)))
+            with suppress(ConnectionResetError):  # cut off before it knew that it was connected
+                stack.enter_context(closing(socket.create_connection((host, int(port)), timeout=10)))
             if at % 20 == 0:
                 most = max(most, front.descriptors - usual)
         print(f"{number} in {time.monotonic() - began:.2f} s, {front.cpu_s - used_s:.2f} s of CPU time")

@@ -35,7 +35,7 @@ class AgentLink(Protocol):
         ...
 
     def trouble(self) -> str | None:
-        """Why the edge did not let us in when last tried, and what to do; None if it did or is silent."""
+        """Why the edge did not let us in, and what to do, or why we left it; None if neither."""
         ...
 
     def connected(self) -> bool:

@@ -3,6 +3,9 @@
 libzmq gathers a whole message, however many parts it has, before it hands it over. What it has gathered is
 told by two counters: bytes that it has read from the connection, and bytes of the messages that it handed
 over. Their difference is what waits, and commands (handshake, heartbeats), which are never handed over.
+
+Small parts take more memory than they have bytes. How small those are that wait is taken from those that the
+connection had handed over last.
 """
 
 from __future__ import annotations
@@ -10,30 +13,28 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 PART_BYTES = 64  # that libzmq holds for a part, however small it is
-_EMPTY_PART_BYTES = 2  # on the wire
-_SEALED_PART_BYTES = 35  # with CURVE
-_MEMORY_BYTES = 200_000_000  # that may wait in all, were it all of the smallest parts
-_WAITING, _IMAGES_WAITING = 64, 4  # largest messages: an agent has 16 keyframes under way, or 3 frames
+_MEMORY_BYTES = 24_000_000  # that what waits of all together may take
+_BUFFERED = 1.5  # bytes of memory for a byte: parts of less than 8 kB stay in the buffer that they came in
+_LATELY_BYTES = 16_000  # handed over, of which the size of parts is taken
+_USUAL = 8 / 1024  # parts a byte, before any are known
+TINY = 8.0  # times its bytes: what takes that much memory is of parts that no agent sends so many of
+TINY_SHARE = 4  # of these much less may wait: the more there are, the longer it takes to throw them away
+_WAITING, _IMAGES_WAITING = 32, 4  # largest messages: an agent has 16 keyframes under way, or 3 frames
 _IMAGE_BYTES = 1_000_000  # from this on frames are images
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bytes on the wire."""
-
-    message: int  # the largest message
-    peer: int  # all that may wait of one peer
+    message: int  # the largest message, bytes on the wire
+    peer: int  # bytes of memory that what waits of one peer may take
     total: int  # and of all together
 
     @classmethod
-    def of(cls, max_frame_bytes: int, sealed: bool) -> Bounds:
-        """sealed: with keys, by which even an empty part takes its place on the wire."""
+    def of(cls, max_frame_bytes: int) -> Bounds:
         most = _IMAGES_WAITING if max_frame_bytes >= _IMAGE_BYTES else _WAITING
         message = 2 * max_frame_bytes + max_frame_bytes // 8  # two images; the rest of any is less
-        peer = most * message
-        part = _SEALED_PART_BYTES if sealed else _EMPTY_PART_BYTES
-        total = max(2 * message, _MEMORY_BYTES * part // PART_BYTES)
-        return cls(message, min(peer, total), total)
+        total = max(2 * message, _MEMORY_BYTES)
+        return cls(message, min(most * message, total), total)
 
 
 def wire_bytes(size: int, sealed: bool) -> int:
@@ -50,6 +51,7 @@ class Account:
     read: int = 0
     handed: int = 0
     messages: int = 0
+    _density: float = _USUAL  # parts a byte, of what was handed over lately
     _commands: int = 0  # of what was read, as far as is known
     _news: bool = False  # a message since `_commands` was looked at
     _mark: tuple[int, int] = field(default=(0, 0))  # read and messages when marked
@@ -57,6 +59,16 @@ class Account:
     @property
     def waiting(self) -> int:
         return self.read - self.handed - self._commands
+
+    @property
+    def weight(self) -> float:
+        """Bytes of memory for a byte that waits."""
+        return _BUFFERED + PART_BYTES * self._density
+
+    @property
+    def memory(self) -> float:
+        """Bytes that what waits is thought to take."""
+        return max(0, self.waiting) * self.weight
 
     @property
     def marked(self) -> int:
@@ -69,9 +81,10 @@ class Account:
         if exact:
             self._commands = max(0, min(self._commands, self.read - self.handed))
 
-    def took(self, size: int, messages: int, now_s: float) -> None:
-        """So many bytes and messages more were handed over. To be followed by a `sample`."""
+    def took(self, size: int, parts: int, messages: int, now_s: float) -> None:
+        """So many bytes in so many parts and messages more were handed over. To be followed by a `sample`."""
         self.handed += size
+        self._density += (parts - size * self._density) / (_LATELY_BYTES + size)
         self.messages += messages
         self.since_s = now_s
         self._news = True

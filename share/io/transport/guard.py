@@ -4,6 +4,10 @@ It learns of connections from the socket's monitor, of what libzmq has read of e
 what was handed over from whoever receives (`took`, `empty`). It cuts off who has more waiting than may be,
 whose message has too many parts, who is no agent, and who says nothing.
 
+It looks in a thread of its own, and in that of whoever receives, which on a busy machine has its turn sooner.
+After somebody was cut off, newcomers are held until what still waits of it is thrown away: the kernel lets
+none of their data in, so that an attack that is repeated brings nothing, and honest ones are not turned away.
+
 No whole message of a connection waits when `receive` has found nothing at all, and neither when as many
 messages of others were handed over as there can be connections: libzmq takes one of each in turn. What still
 waits then of what had been read before is one message; if it is larger than any may be, it does not end.
@@ -11,19 +15,20 @@ waits then of what had been read before is one message; if it is larger than any
 
 from __future__ import annotations
 
+import math
 import random
+import select
 import struct
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
-from ipaddress import ip_address
 from threading import Lock, Thread
 
 import zmq
 
 from share.io.transport import tcp
-from share.io.transport.account import Account, Bounds
+from share.io.transport.account import TINY, TINY_SHARE, Account, Bounds
+from share.io.transport.connection import Connection
 from share.io.transport.keep_out import KeepOut
 
 CONNECTIONS = 128  # at a time
@@ -31,37 +36,21 @@ STRANGERS = 32  # of these, that have not said anything yet
 MUTE_S = 60.0  # without a message; agents ping every half second
 _STRANGE_S = 10.0  # to the first message
 _TICK_MS, _ALERT_MS = 20, 5
+_MANY = 64  # messages in less than _TICK_MS
 _ROUND = 2 * CONNECTIONS  # messages; those of connections that are closed by now wait beside the others
-GROWTH_BYTES = 16_000_000  # of memory, beyond the bytes that wait: small parts take much more than they have
-_PAUSE_S = 2.0  # without newcomers from where somebody offended of whom no more is known than that
+GROWTH_BYTES = 12_000_000  # of memory, beyond the bytes that wait: small parts take much more than they have
+_PAUSE_S = 0.3  # without newcomers from where somebody offended of whom no more is known than that
+_AT_ONCE = 4  # that were held are let in: an attacker may have sent many
 _SETTLES_S = 0.05  # until all that libzmq has read of a connection that was cut off is there to be received
-_EVENTS_AT_ONCE = 256
 _HOMES = 4096
 _EVENTS = (
-    zmq.EVENT_ACCEPTED
+    zmq.EVENT_LISTENING
+    | zmq.EVENT_ACCEPTED
     | zmq.EVENT_DISCONNECTED
     | zmq.EVENT_MONITOR_STOPPED
     | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
     | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 )
-
-
-@dataclass(eq=False)
-class _Connection:
-    """inode: by which its descriptor is known to be still the same. sure: no message of an earlier connection
-    with this descriptor can be waiting."""
-
-    descriptor: int
-    inode: int
-    address: str
-    account: Account
-    sure: bool
-    key: str = ""
-    is_cut: bool = False
-
-    @property
-    def strange(self) -> bool:
-        return self.account.messages == 0
 
 
 class Guard:
@@ -75,10 +64,12 @@ class Guard:
     ) -> None:
         self._monitored, self._bounds, self._kept_out, self._poke = socket, bounds, kept_out, poke
         self._events: zmq.Socket[bytes] = socket.get_monitor_socket(_EVENTS)
+        self._events_ready = select.poll()  # which, unlike libzmq's, several threads may use
+        self._events_ready.register(int(self._events.getsockopt(zmq.FD)), select.POLLIN)
         self._lock = Lock()  # of what several threads use, the next two
-        self._taken: dict[int, tuple[int, int, str]] = {}  # bytes, messages and key by descriptor
+        self._taken: dict[int, tuple[int, int, int, str]] = {}  # bytes, parts, messages, key by descriptor
         self._failed = 0
-        self._charges: deque[tuple[_Connection | int, str]] = deque(maxlen=CONNECTIONS)
+        self._charges: deque[tuple[Connection | int, str]] = deque(maxlen=CONNECTIONS)
         self._admitted: deque[tuple[str, str]] = deque(maxlen=CONNECTIONS)  # key and address
         self._lines: deque[str] = deque(maxlen=128)
         self._empty_s = 0.0
@@ -86,14 +77,20 @@ class Guard:
         # let in (who could have such a descriptor next) until nothing waits any more.
         self._cut_off: frozenset[int] = frozenset()
         self._cut_off_s = 0.0  # when the last was
-        # The thread's own:
-        self._open: dict[int, _Connection] = {}  # by descriptor
+        self._unlooked = 0  # messages since somebody looked
+        self._turn = Lock()  # of who looks, and of what follows
+        self._due_s, self._looked_s = 0.0, 0.0  # when to look again, and when last
+        self._is_over = False
+        self._listener: tuple[int, int] | None = None  # descriptor and cookie
+        self._is_gated = False  # who is accepted is held from the start
+        self._open: dict[int, Connection] = {}  # by descriptor
         self._ended: dict[int, float] = {}  # when a descriptor was last given back
         self._paused: dict[str, float] = {}  # addresses of which nobody new is let in, until when
         self._to_fail = 0  # handshakes that were cut off
-        self._orphaned = 0  # bytes that waited of connections that ended, since nothing waited
+        self._orphaned = 0.0  # bytes of memory of connections that ended, since nothing waited
         self._homes: set[str] = set()  # addresses from which a key has sent a message
         self._resident = tcp.resident_bytes()  # memory of this process when last little waited
+        self._handed = 0  # bytes handed over since then: whoever took them may have kept them
         self._marked_s = 0.0
         self._since_mark = 0  # messages handed over
         self._thread = Thread(target=self._watch, name="guard", daemon=True)
@@ -101,11 +98,22 @@ class Guard:
 
     # ------------------------------------------------------------------ for other threads
 
-    def took(self, descriptor: int, size: int, key: str) -> None:
-        """A message of so many bytes on the wire was received from that connection."""
+    def took(self, descriptor: int, size: int, parts: int, key: str) -> None:
+        """A message of so many bytes on the wire, in so many parts, was received from that connection."""
         with self._lock:
-            bytes_, messages, _ = self._taken.get(descriptor, (0, 0, ""))
-            self._taken[descriptor] = bytes_ + size, messages + 1, key
+            all_bytes, all_parts, messages, _ = self._taken.get(descriptor, (0, 0, 0, ""))
+            self._taken[descriptor] = all_bytes + size, all_parts + parts, messages + 1, key
+
+    def look(self) -> None:
+        """Between two messages."""
+        self._unlooked += 1
+        due_s = self._looked_s + _ALERT_MS * 1e-3 if self._unlooked >= _MANY else self._due_s
+        if time.monotonic() >= due_s and self._turn.acquire(blocking=False):
+            try:
+                self._due_s = min(self._due_s, time.monotonic())
+                self._look()
+            finally:
+                self._turn.release()
 
     def discards(self, descriptor: int) -> bool:
         """Whether what comes from that connection is to be thrown away."""
@@ -119,7 +127,7 @@ class Guard:
         """What that connection sent no agent sends."""
         connection = self._open.get(descriptor)
         if connection is not None and connection.sure:  # at once; who it is will be looked at later
-            tcp.cut(descriptor, connection.inode)
+            connection.cut()
             self._charges.append((connection, reason))
         else:
             self._charges.append((descriptor, reason))
@@ -147,60 +155,86 @@ class Guard:
             self._monitored.disable_monitor()
         self._thread.join()
 
-    # ------------------------------------------------------------------ the thread
+    # ------------------------------------------------------------------ whose turn it is
 
     def _watch(self) -> None:
-        wait_ms, next_s = -1, 0.0
-        while True:
-            if self._events.poll(wait_ms) and not self._hear():
-                break
-            if time.monotonic() >= next_s:
-                wait_ms = self._check(time.monotonic())
-                next_s = time.monotonic() + max(wait_ms, 0) * 1e-3
+        wait_ms: float | None = None
+        while not self._is_over:
+            self._events_ready.poll(wait_ms)
+            with self._turn:
+                self._look()
+                left_s = max(0.0, self._due_s - time.monotonic())
+                wait_ms = math.ceil(1e3 * left_s) if self._open else None
         self._events.close(linger=0)
+
+    def _look(self) -> None:
+        self._is_over = self._is_over or not self._hear()
+        if not self._is_over and time.monotonic() >= self._due_s:
+            self._due_s = time.monotonic() + _TICK_MS * 1e-3
+            wait_ms = self._check(time.monotonic())
+            self._unlooked, self._looked_s = 0, time.monotonic()
+            self._due_s = self._looked_s + wait_ms * 1e-3
 
     def _hear(self) -> bool:
         """Events that have come. False once there will be no more."""
-        for _ in range(_EVENTS_AT_ONCE):
+        while True:
             try:
                 what, _ = self._events.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
-                break
+                return True
             event, value = struct.unpack("=Hi", what)
             if event == zmq.EVENT_MONITOR_STOPPED:
                 return False
-            if event == zmq.EVENT_ACCEPTED:
+            if event == zmq.EVENT_LISTENING:
+                number = tcp.cookie(value)
+                self._listener = None if number is None else (value, number)
+            elif event == zmq.EVENT_ACCEPTED:
                 self._accept(value)
             elif event == zmq.EVENT_DISCONNECTED:
                 self._forget(value)
             elif self._to_fail:
                 self._to_fail -= 1
-            else:
-                with self._lock:
+            elif not any(connection.is_held for connection in self._open.values()):
+                with self._lock:  # who is held may fail for that
                     self._failed += 1
-        return True
 
     def _accept(self, descriptor: int) -> None:
         self._forget(descriptor)  # libzmq does not tell of connections that another took over
-        number, ends = tcp.inode(descriptor), tcp.addresses(descriptor)
+        number, ends = tcp.cookie(descriptor), tcp.addresses(descriptor)
         if number is None or ends is None:
             return
-        sure = self._ended.get(descriptor, -1.0) < self._empty_s
-        connection = _Connection(descriptor, number, ends[0], Account(time.monotonic()), sure)
+        now_s = time.monotonic()
+        connection = Connection(descriptor, number, ends[0], Account(now_s), self._is_sure(descriptor))
         self._open[descriptor] = connection
-        if self._closed_to(connection.address, time.monotonic()):
+        if self._kept_out.holds(connection.address, now_s):
             self._cut(connection)
             self._cut_off |= {descriptor}
+        elif self._holds(connection.address, now_s):
+            connection.is_held = tcp.hold(descriptor, number)
+        else:
+            tcp.release(descriptor, number)  # it may have come while the gate was closed
         self._make_room()
 
-    def _closed_to(self, address: str, now_s: float) -> bool:
+    def _is_sure(self, descriptor: int) -> bool:
+        return self._ended.get(descriptor, -1.0) < self._empty_s
+
+    def _holds(self, address: str, now_s: float) -> bool:
+        """Whether newcomers from there have to wait."""
         full = self._orphaned > self._bounds.total
-        return (
-            full
-            or bool(self._cut_off)
-            or now_s < self._paused.get(address, now_s)
-            or self._kept_out.holds(address, now_s)
-        )
+        return full or bool(self._cut_off) or now_s < self._paused.get(address, now_s)
+
+    def _let_in(self, now_s: float) -> None:
+        """Those who need not wait any longer; closes or opens the gate for those to come."""
+        held = [c for c in self._open.values() if c.is_held and not self._holds(c.address, now_s)]
+        for connection in held[:_AT_ONCE]:  # who came first
+            tcp.release(connection.descriptor, connection.cookie)
+            connection.is_held, connection.sure = False, self._is_sure(connection.descriptor)
+            connection.account.since_s = now_s
+        self._paused = {address: until_s for address, until_s in self._paused.items() if now_s < until_s}
+        gate = bool(self._paused) or self._holds("", now_s)
+        if gate != self._is_gated and self._listener is not None:
+            (tcp.hold if gate else tcp.release)(*self._listener)
+            self._is_gated = gate
 
     def _make_room(self) -> None:
         """Where there are too many, one that has said nothing goes, by chance among those of the address that
@@ -212,17 +246,17 @@ class Guard:
             self._cut(random.choice([connection for connection in strange if connection.address == most]))
             self._lines.append(f"{most}: more connections than may be open at a time")
 
-    def _present(self) -> list[_Connection]:
+    def _present(self) -> list[Connection]:
         return [connection for connection in self._open.values() if not connection.is_cut]
 
     def _forget(self, descriptor: int) -> None:
         connection = self._open.pop(descriptor, None)
         if connection is not None:
             self._ended[descriptor] = time.monotonic()
-            self._orphaned += max(0, connection.account.waiting)
+            self._orphaned += connection.account.memory
 
     def _check(self, now_s: float) -> int:
-        """Milliseconds until the next one is due; -1: when somebody connects."""
+        """Milliseconds until the next one is due."""
         empty_s = self._empty_s  # first: what was received before is then among what was taken
         while self._admitted:
             self._recognise(*self._admitted.popleft())
@@ -233,32 +267,43 @@ class Guard:
         if empty_s > self._marked_s or self._since_mark >= _ROUND:
             self._judge(empty_s, now_s)
         self._bound(now_s)
-        if not self._open:
-            return -1
-        much = sum(max(0, connection.account.waiting) for connection in self._present())
         if empty_s > self._cut_off_s + _SETTLES_S:
             self._cut_off = frozenset()
+        much = sum(max(0, connection.account.waiting) for connection in self._present())
+        if much > self._bounds.message:
+            self._weigh(much, now_s)
+        self._let_in(now_s)
         if much <= self._bounds.message and not self._cut_off:
-            self._resident = tcp.resident_bytes()
+            self._resident, self._handed = tcp.resident_bytes(), 0
             return _TICK_MS
-        if much > self._bounds.message and tcp.resident_bytes() - self._resident - much > GROWTH_BYTES:
-            self._offend(self._worst(now_s), "many small parts", now_s)
         self._poke()
         return _ALERT_MS
+
+    def _weigh(self, much: int, now_s: float) -> None:
+        """Whoever hides small parts behind large ones is known by how this process grows."""
+        explained = self._resident + self._handed + self._unclaimed() + much
+        if (grown := tcp.resident_bytes() - explained) > GROWTH_BYTES:
+            self._offend(self._worst(now_s), "many small parts", now_s)
+            self._orphaned += grown  # that is its own: nobody else is to be taken for it
+
+    def _unclaimed(self) -> float:
+        """Bytes of memory of what waits to be thrown away, were none thrown away yet."""
+        return self._orphaned + sum(c.account.memory for c in self._open.values() if c.is_cut)
 
     def _enter(self, now_s: float) -> None:
         """What was handed over since the last time."""
         with self._lock:
             taken, self._taken = self._taken, {}
-        for descriptor, (size, messages, key) in taken.items():
+        for descriptor, (size, parts, messages, key) in taken.items():
             self._since_mark += messages
+            self._handed += size
             connection = self._open.get(descriptor)
             if connection is not None:
                 if connection.strange:
                     self._introduce(connection, key)
-                connection.account.took(size, messages, now_s)
+                connection.account.took(size, parts, messages, now_s)
 
-    def _introduce(self, connection: _Connection, key: str) -> None:
+    def _introduce(self, connection: Connection, key: str) -> None:
         """Its first message: now it is known whose it is."""
         connection.key = key
         if key and len(self._homes) < _HOMES:
@@ -275,12 +320,8 @@ class Guard:
 
     def _sample(self) -> None:
         for connection in list(self._open.values()):
-            same = tcp.inode(connection.descriptor) == connection.inode
-            read = tcp.bytes_read(connection.descriptor) if same else None
-            if read is None:
+            if not connection.sample():
                 self._forget(connection.descriptor)
-            else:
-                connection.account.sample(*read)
 
     def _judge(self, empty_s: float, now_s: float) -> None:
         """No whole message waits of who was quiet since the mark; of nobody if it was empty since."""
@@ -292,62 +333,68 @@ class Guard:
             if empty or account.quiet():
                 if account.marked > self._bounds.message:
                     self._offend(connection, "a message that does not end", now_s)
-                elif now_s - account.since_s > (_STRANGE_S if connection.strange else MUTE_S):
+                elif not connection.is_held and now_s - account.since_s > (
+                    _STRANGE_S if connection.strange else MUTE_S
+                ):
                     self._cut(connection)
                 account.settle()
             account.mark()
-        self._orphaned = 0 if empty else self._orphaned
+        self._orphaned = 0.0 if empty else self._orphaned
         self._marked_s, self._since_mark = time.monotonic(), 0
 
     def _bound(self, now_s: float) -> None:
         """Whatever it is that waits: who has too much of it goes, then who has the most for the longest."""
         for connection in self._present():
-            if connection.account.waiting > self._bounds.peer:
-                self._shed(connection, "more than may wait")
-        while sum(connection.account.waiting for connection in self._present()) > self._bounds.total:
-            self._shed(self._worst(now_s), "more than may wait of all together")
+            tiny = connection.account.weight > TINY
+            if connection.account.memory > self._bounds.peer / (TINY_SHARE if tiny else 1):
+                self._unload(connection, "more than may wait", now_s)
+        unclaimed, share = self._unclaimed(), self._bounds.peer / 8  # which an agent may have in any case
+        while present := self._present():
+            all_of_them = sum(connection.account.memory for connection in present)
+            worst = self._worst(now_s)
+            if all_of_them + (unclaimed if worst.account.memory > share else 0.0) <= self._bounds.total:
+                break
+            self._unload(worst, "more than may wait of all together", now_s)
 
-    def _worst(self, now_s: float) -> _Connection:
+    def _unload(self, connection: Connection, reason: str, now_s: float) -> None:
+        if connection.account.weight > TINY:
+            self._offend(connection, "many small parts", now_s)
+        else:
+            self._shed(connection, reason)
+
+    def _worst(self, now_s: float) -> Connection:
         """Who has the most waiting, for the longest."""
-        return max(self._present(), key=lambda c: c.account.waiting * (now_s - c.account.since_s + 0.1))
+        return max(self._present(), key=lambda c: c.account.memory * (now_s - c.account.since_s + 0.1))
 
-    def _convict(self, whom: _Connection | int, reason: str) -> None:
+    def _convict(self, whom: Connection | int, reason: str) -> None:
         connection = self._open.get(whom) if isinstance(whom, int) else whom
         if connection is not None and connection.sure:
             self._offend(connection, reason, time.monotonic())
 
-    def _shed(self, connection: _Connection, reason: str) -> None:
+    def _shed(self, connection: Connection, reason: str) -> None:
         """Too much waits. An honest agent comes to that where the edge is very busy: it may come back."""
         self._end(connection)
         self._lines.append(f"{connection.key or connection.address}: {reason}; cut off")
 
-    def _end(self, connection: _Connection) -> None:
+    def _end(self, connection: Connection) -> None:
         self._cut(connection)
         self._cut_off |= {connection.descriptor}
         self._cut_off_s = time.monotonic()
 
-    def _offend(self, connection: _Connection, reason: str, now_s: float) -> None:
+    def _offend(self, connection: Connection, reason: str, now_s: float) -> None:
         """It sends what no agent does: it is kept out."""
         if connection.is_cut:
             return
         self._end(connection)
-        who = self._culprit(connection)
-        name = f"the key '{connection.key}'" if connection.key else connection.address
-        self._lines.append(f"{name}: {reason}; cut off{' and kept out' if who else ''}")
+        who = connection.culprit(self._homes)
+        self._lines.append(f"{connection.name}: {reason}; cut off{' and kept out' if who else ''}")
         if who is not None:
             self._kept_out.offend(who, now_s)
         elif connection.address in self._paused or len(self._paused) < _HOMES:
             self._paused[connection.address] = now_s + _PAUSE_S
 
-    def _culprit(self, connection: _Connection) -> str | None:
-        """Whom to keep out: the key, if it is known; the address, unless agents live there as well."""
-        if connection.key:
-            return connection.key
-        local = ip_address(connection.address.partition("%")[0]).is_loopback
-        return None if local or connection.address in self._homes else connection.address
-
-    def _cut(self, connection: _Connection) -> None:
+    def _cut(self, connection: Connection) -> None:
         connection.is_cut = True
-        there = tcp.cut(connection.descriptor, connection.inode)
+        there = connection.cut()
         if there and connection.strange and self._to_fail < CONNECTIONS:
             self._to_fail += 1

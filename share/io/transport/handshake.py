@@ -11,6 +11,8 @@ _MECHANISM_MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
 
 
 class Outcome(Enum):
+    CONNECTED = "connected"  # the handshake begins
+    DISCONNECTED = "disconnected"
     JOINED = "joined"
     UNKNOWN_KEY = "unknown key"  # the edge does not let this key in
     NO_KEYS = "no keys"  # one side uses keys, the other none, and libzmq could tell
@@ -18,12 +20,15 @@ class Outcome(Enum):
 
 
 class Handshakes:
-    """The outcomes of one socket's handshakes, as they happen."""
+    """The outcomes of one socket's handshakes, as they happen. descriptor: of its newest connection."""
 
     def __init__(self, socket: zmq.Socket[bytes]) -> None:
         self._monitored = socket
+        self.descriptor: int | None = None
         self.events: zmq.Socket[bytes] = socket.get_monitor_socket(
-            zmq.EVENT_HANDSHAKE_SUCCEEDED
+            zmq.EVENT_CONNECTED
+            | zmq.EVENT_DISCONNECTED
+            | zmq.EVENT_HANDSHAKE_SUCCEEDED
             | zmq.EVENT_HANDSHAKE_FAILED_AUTH
             | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
             | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
@@ -35,6 +40,11 @@ class Handshakes:
             event = recv_monitor_message(self.events, zmq.NOBLOCK)
         except zmq.Again:
             return None
+        if event["event"] == zmq.EVENT_CONNECTED:
+            self.descriptor = int(event["value"])
+            return Outcome.CONNECTED
+        if event["event"] == zmq.EVENT_DISCONNECTED:
+            return Outcome.DISCONNECTED
         if event["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED:
             return Outcome.JOINED
         if event["event"] == zmq.EVENT_HANDSHAKE_FAILED_AUTH:

@@ -1,19 +1,20 @@
 """What the kernel knows of a TCP connection that libzmq owns, and of this process (Linux).
 
 The descriptor is libzmq's: it may close it, and the number may come to mean another connection, at any time.
-So each is known by its inode as well, and is never closed here.
+So each is known by its cookie (SO_COOKIE, which no other socket ever has) as well, and is never closed here.
+
+Calls that cannot wait keep the interpreter's lock: where another thread computes, to take it again may take
+5 ms each time.
 """
 
 from __future__ import annotations
 
-import array
 import ctypes
-import fcntl
 import os
 import socket
-import stat
 import struct
 import termios
+from collections.abc import Callable
 from contextlib import closing
 
 _INFO_BYTES = 136
@@ -21,16 +22,40 @@ _RECEIVED_AT = 128  # tcpi_bytes_received in struct tcp_info, linux/tcp.h
 _TRIES = 4
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 _NOWHERE = bytes(16)  # a sockaddr of AF_UNSPEC: connect(2) to it ends a TCP connection with a reset
-_libc = ctypes.CDLL(None, use_errno=True)
+_SO_ATTACH_FILTER, _SO_DETACH_FILTER, _SO_COOKIE = 26, 27, 57  # asm-generic/socket.h
+_libc = ctypes.PyDLL(None)
 
 
-def inode(descriptor: int) -> int | None:
+class _Filter(ctypes.Structure):
+    """struct sock_filter: an instruction of classic BPF, linux/filter.h."""
+
+    _fields_ = (
+        ("code", ctypes.c_ushort),
+        ("jt", ctypes.c_ubyte),
+        ("jf", ctypes.c_ubyte),
+        ("k", ctypes.c_uint),
+    )
+
+
+class _Program(ctypes.Structure):
+    """struct sock_fprog."""
+
+    _fields_ = (("length", ctypes.c_ushort), ("filter", ctypes.POINTER(_Filter)))
+
+
+# `ret #1`: of each segment one byte may pass, and its header always does. So connections are made and ended,
+# but their data stay with the sender, who sends them again 0.2 s later, then 0.4, 0.8 ...
+_HEADERS_ONLY = _Program(1, ctypes.pointer(_Filter(0x06, 0, 0, 1)))
+
+
+def cookie(descriptor: int) -> int | None:
     """None where it is no socket, or closed."""
-    try:
-        status = os.fstat(descriptor)
-    except OSError:
-        return None
-    return status.st_ino if stat.S_ISSOCK(status.st_mode) else None
+    value = ctypes.c_uint64()
+    size = ctypes.c_uint(8)
+    found = _libc.getsockopt(
+        descriptor, socket.SOL_SOCKET, _SO_COOKIE, ctypes.byref(value), ctypes.byref(size)
+    )
+    return None if found != 0 else value.value
 
 
 def addresses(descriptor: int) -> tuple[str, int] | None:
@@ -47,17 +72,15 @@ def bytes_read(descriptor: int) -> tuple[int, bool] | None:
     closed."""
     before = _received(descriptor)
     for _ in range(_TRIES):
-        queued = array.array("i", [0])
-        try:
-            fcntl.ioctl(descriptor, termios.FIONREAD, queued)
-        except OSError:
+        queued = ctypes.c_int()
+        if _libc.ioctl(descriptor, ctypes.c_ulong(termios.FIONREAD), ctypes.byref(queued)) != 0:
             return None
         after = _received(descriptor)
         if before is None or after is None:
             return None
         if before == after:  # else some of what is queued came since
-            return after - queued[0], True
-        least, before = before - queued[0], after
+            return after - queued.value, True
+        least, before = before - queued.value, after
     return least, False
 
 
@@ -77,13 +100,33 @@ def resident_bytes() -> int:
 
 
 def cut(descriptor: int, number: int) -> bool:
-    """Breaks the connection with the inode `number` off, which also throws away what it sent and nobody has
+    """Breaks the connection with the cookie `number` off, which also throws away what it sent and nobody has
     read: after a shutdown that could still be read, up to 32 MB. Whether it was there."""
-    try:
-        copy = os.dup(descriptor)
-    except OSError:
+    return _with_copy(descriptor, number, lambda copy: _libc.connect(copy, _NOWHERE, len(_NOWHERE)) == 0)
+
+
+def hold(descriptor: int, number: int) -> bool:
+    """Lets no data in any more by the socket with the cookie `number`; where that listens, none by what is
+    accepted from now on. Whether that could be done."""
+    return _with_copy(descriptor, number, lambda copy: _set(copy, _SO_ATTACH_FILTER, _HEADERS_ONLY))
+
+
+def release(descriptor: int, number: int) -> bool:
+    """Lets data in again. Whether they were held."""
+    return _with_copy(descriptor, number, lambda copy: _set(copy, _SO_DETACH_FILTER, ctypes.c_int()))
+
+
+def _set(descriptor: int, option: int, value: ctypes.Structure | ctypes.c_int) -> bool:
+    size = ctypes.sizeof(value)
+    return bool(_libc.setsockopt(descriptor, socket.SOL_SOCKET, option, ctypes.byref(value), size) == 0)
+
+
+def _with_copy(descriptor: int, number: int, do: Callable[[int], bool]) -> bool:
+    """What `do` says of a copy of the descriptor, which stays that socket's; False where it is another's."""
+    copy = _libc.dup(descriptor)
+    if copy < 0:
         return False
     try:
-        return inode(copy) == number and _libc.connect(copy, _NOWHERE, len(_NOWHERE)) == 0
+        return cookie(copy) == number and do(copy)
     finally:
-        os.close(copy)
+        _libc.close(copy)

@@ -13,6 +13,7 @@ from functools import partial
 
 import zmq
 
+from share.core.backoff import Backoff
 from share.errors import TransportError, UsageError
 from share.io.keys import AgentKeys, EdgeKeys
 from share.io.transport import (
@@ -25,6 +26,7 @@ from share.io.transport import (
     parse_address,
 )
 from share.io.transport.account import Bounds, wire_bytes
+from share.io.transport.edge_watch import EdgeWatch
 from share.io.transport.guard import Guard
 from share.io.transport.handshake import Handshakes, Outcome
 from share.io.transport.keep_out import KeepOut
@@ -37,13 +39,17 @@ _SLICE = 2000  # of these, in one call: 3 ms
 _WAKE, _POKE = b"w", b"p"
 _REFUSALS = 128  # lines at a time
 _IN_VAIN = 2000  # messages of strangers, or of who was cut off, in one call
-_REDIAL_S = 1.0  # after a handshake that failed; libzmq itself gives up after most of them
+_LOOK_MS = 20  # how often an agent looks how much of its edge waits
+_WELL_S = 10.0  # an edge that has been connected so long does not send too much
+_REDIAL_S = (
+    1.0  # after a handshake that failed, or a connection; libzmq itself gives up where it was wrong ZMTP
+)
 _COMMON: dict[int, int] = {
     zmq.LINGER: LINGER_MS,
     zmq.SNDHWM: QUEUE_MESSAGES,
     zmq.RCVHWM: 0,  # see ZmqEdgeLink: an edge that resets while a full queue stops the input ends an agent
     zmq.MAXMSGSIZE: MAX_FRAME_BYTES,  # a larger frame closes the connection of its sender
-    zmq.HANDSHAKE_IVL: 2000,
+    zmq.HANDSHAKE_IVL: 4000,  # an edge under attack holds newcomers meanwhile
     zmq.HEARTBEAT_IVL: 500,  # a peer whose network is gone is noticed, and its queue dropped, in 2 s
     zmq.HEARTBEAT_TIMEOUT: 2000,
     zmq.HEARTBEAT_TTL: 2000,
@@ -56,6 +62,7 @@ _DEALER: dict[int, int] = {
     zmq.RECONNECT_IVL_MAX: 400,
     zmq.CONNECT_TIMEOUT: 2000,
     zmq.SNDBUF: 256 * 1024,  # on a slow network poses must not grow old in the kernel
+    zmq.RCVBUF: 256 * 1024,  # an edge sends little; the kernel would take up to 32 MB of it
 }
 _ROUTER: dict[int, int] = {
     zmq.ROUTER_MANDATORY: 1,  # sending to a peer that is gone is an error, not silence
@@ -71,7 +78,9 @@ _ROUTER: dict[int, int] = {
     zmq.TCP_KEEPALIVE_IDLE: 1,
     zmq.TCP_KEEPALIVE_INTVL: 1,
     zmq.TCP_KEEPALIVE_CNT: 2,
+    zmq.SNDBUF: 256 * 1024,  # of a peer that reads nothing
 }
+_RECEIVED_BYTES = 256 * 1024  # in the kernel, of a connection: else up to 32 MB; images need more than that
 
 
 class _Socket:
@@ -101,17 +110,10 @@ class _Socket:
             raise TransportError(f"cannot send: {error.strerror}") from None
         return True
 
-    def receive(self, timeout_ms: int) -> list[zmq.Frame] | None:
-        parts = self.receive_now()
-        if parts is None:
-            self.wait(timeout_ms)
-            parts = self.receive_now()
-        return parts
-
-    def wait(self, timeout_ms: int) -> bool:
-        """Until there is something to receive, or it is woken. Whether it was only poked, to look again."""
+    def wait(self, timeout_ms: int) -> bytes:
+        """Until there is something to receive, or it is woken; by what it was."""
         ready = dict(self._poller.poll(0 if self._too_long else timeout_ms))
-        return self._wake_reader.fileno() in ready and _WAKE not in self._wake_reader.recv(4096)
+        return self._wake_reader.recv(4096) if self._wake_reader.fileno() in ready else b""
 
     def receive_now(self) -> list[zmq.Frame] | None:
         """The next message. Of one with too many parts one too many stays, so that it is refused."""
@@ -157,17 +159,15 @@ class ZmqAgentLink:
 
     def __init__(self, address: str, run_id: int, keys: AgentKeys | None = None) -> None:
         self._target = check_keys(parse_address(address), keys)
-        self._keys = keys
+        self._keys, self._run_id = keys, run_id
         self._trouble: str | None = None
+        self._excess: str | None = None  # what the edge there sent too much of, of late
+        self._watch = EdgeWatch(Bounds.of(MAX_FRAME_BYTES))
+        self._backoff = Backoff(time.monotonic_ns())
         self._redial_s: float | None = None  # when
+        self._well_s = 0.0  # when what the edge sent too much of is forgiven
         self._joined = False  # since last asked
-        self._link = _Socket(zmq.DEALER, _DEALER | (_SEALED if keys else {}), self._target)
-        self._handshakes = Handshakes(self._link.socket)
-        self._link.socket.setsockopt(zmq.ROUTING_ID, peer_id(run_id))
-        if keys is not None:
-            self._link.socket.setsockopt(zmq.CURVE_PUBLICKEY, keys.own.public.encode())
-            self._link.socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret.encode())
-            self._link.socket.setsockopt(zmq.CURVE_SERVERKEY, keys.edge.encode())
+        self._open()
         try:
             self._link.socket.connect(str(self._target))
         except zmq.ZMQError:
@@ -175,16 +175,36 @@ class ZmqAgentLink:
             host = self._target.host
             raise UsageError(f"{self._target}: '{host}' cannot be the name of a machine") from None
 
+    def _open(self) -> None:
+        self._link = _Socket(zmq.DEALER, _DEALER | (_SEALED if self._keys else {}), self._target)
+        self._handshakes = Handshakes(self._link.socket)
+        self._link.socket.setsockopt(zmq.ROUTING_ID, peer_id(self._run_id))
+        if self._keys is not None:
+            self._link.socket.setsockopt(zmq.CURVE_PUBLICKEY, self._keys.own.public.encode())
+            self._link.socket.setsockopt(zmq.CURVE_SECRETKEY, self._keys.own.secret.encode())
+            self._link.socket.setsockopt(zmq.CURVE_SERVERKEY, self._keys.edge.encode())
+
     def send(self, frames: Sequence[Bytes]) -> bool:
         return self._link.send(frames)
 
     def receive(self, timeout_ms: int) -> list[bytes] | None:
-        self._keep_connected()
-        parts = self._link.receive(timeout_ms)
-        return [part.bytes for part in parts] if parts else None
+        end_s, is_over = time.monotonic() + timeout_ms * 1e-3, timeout_ms <= 0
+        while True:
+            self._keep_connected()
+            self._look(self._watch.look())
+            parts = self._link.receive_now()
+            left_ms = round((end_s - time.monotonic()) * 1e3)
+            if parts is not None:
+                size = sum(wire_bytes(len(part), self._keys is not None) for part in parts)
+                self._watch.took(size, len(parts), time.monotonic())
+                return [part.bytes for part in parts]
+            self._look(self._watch.empty())
+            if is_over:
+                return None
+            is_over = bool(self._link.wait(min(max(0, left_ms), _LOOK_MS))) or left_ms <= _LOOK_MS
 
     def trouble(self) -> str | None:
-        return self._trouble
+        return self._trouble or self._excess
 
     def connected(self) -> bool:
         joined, self._joined = self._joined, False
@@ -198,12 +218,35 @@ class ZmqAgentLink:
             self._handshakes.close()
         self._link.close()
 
+    def _look(self, excess: str | None) -> None:
+        """excess: what the edge sends too much of. What it sent is dropped; it is tried again later."""
+        now_ns = time.monotonic_ns()
+        if excess is not None:
+            self._handshakes.close()
+            self._link.close(linger_ms=0)
+            self._open()
+            self._redial_s = (now_ns * 1e-9) + self._backoff.died(now_ns)
+            self._trouble = None
+            self._excess = (
+                f"the edge there sends what no edge does ({excess}): cut off; this run goes on without it, "
+                "and tries again, ever more rarely"
+            )
+        elif self._excess and self._redial_s is None and now_ns * 1e-9 > self._well_s:
+            self._excess = None
+
     def _keep_connected(self) -> None:
         while (outcome := self._handshakes.next()) is not None:
+            if outcome is Outcome.CONNECTED:
+                self._redial_s = None
+                if self._handshakes.descriptor is not None:
+                    self._watch.connected(self._handshakes.descriptor, time.monotonic())
+                continue
             joined = outcome is Outcome.JOINED
-            self._joined = self._joined or joined
-            self._trouble = None if joined else self._reason(outcome)
             self._redial_s = None if joined else time.monotonic() + _REDIAL_S
+            if joined:
+                self._joined, self._trouble, self._well_s = True, None, time.monotonic() + _WELL_S
+            elif outcome is not Outcome.DISCONNECTED:
+                self._trouble = f"not let in: {self._reason(outcome)}"
         if self._redial_s is not None and time.monotonic() >= self._redial_s:
             self._redial_s = None
             with contextlib.suppress(zmq.ZMQError):  # libzmq has forgotten it already
@@ -232,12 +275,13 @@ class ZmqEdgeLink:
     ) -> None:
         self._target = check_keys(parse_address(address, bind=True), keys)
         self._keys = keys
-        self._bounds = Bounds.of(max_frame_bytes, keys is not None)
+        self._bounds = Bounds.of(max_frame_bytes)
         self._options = _ROUTER | {
             zmq.MAXMSGSIZE: max_frame_bytes + (_SEAL_BYTES if keys else 0),
             # libzmq 4.3.5 aborts where a peer resets its connection while a full queue has stopped its input
             # (stream_engine_base.cpp: !_io_error), so it never is full: the guard bounds what waits.
             zmq.RCVHWM: 0,
+            **({} if max_frame_bytes > MAX_FRAME_BYTES else {zmq.RCVBUF: _RECEIVED_BYTES}),
         }
         self._kept_out = KeepOut()
         self.strangers = 0  # messages dropped: their sender is no agent, or was cut off
@@ -256,12 +300,14 @@ class ZmqEdgeLink:
         end_s = time.monotonic() + timeout_ms * 1e-3
         arrival, poked = self._receive_now(), True
         while arrival is None and poked:
-            poked = self._link.wait(max(0, round((end_s - time.monotonic()) * 1e3)))
+            woken = self._link.wait(max(0, round((end_s - time.monotonic()) * 1e3)))
+            poked = bool(woken) and _WAKE not in woken  # only to look again
             arrival = self._receive_now()
         return arrival
 
     def _receive_now(self) -> Arrival | None:
         for _ in range(_IN_VAIN):
+            self._guard.look()
             parts = self._link.receive_now()
             if parts is None:
                 self._guard.empty(self._link.empty_s)
@@ -281,7 +327,8 @@ class ZmqEdgeLink:
             return ""
         if self._guard.discards(descriptor):
             return None
-        self._guard.took(descriptor, sum(wire_bytes(len(part), sealed) for part in parts[1:]), key)
+        size = sum(wire_bytes(len(part), sealed) for part in parts[1:])
+        self._guard.took(descriptor, size, len(parts) - 1, key)
         if len(parts[0]) != PEER_BYTES:  # libzmq still takes most bytes for ZMTP 1.0
             self._guard.charge(descriptor, "its id is not 8 bytes: no agent")
         elif len(parts) > _MAX_PARTS:
