@@ -31,13 +31,15 @@ _CALM = 0.6  # a disagreement ends below this part of what began it
 @dataclass(frozen=True)
 class Standing:
     """Of an agent, for people. state: `agrees`, `set apart`, `disputed` or `unknown`. log_scale, sigma: of
-    its depths against the others'; nis: see `share.merge.consistency`; None where not known."""
+    its depths against the others'; nis: see `share.merge.consistency`; None where not known. doubt: the most
+    that is held against it and another; 1 begins a disagreement."""
 
     state: str = "unknown"
     reason: str = ""
     log_scale: float | None = None
     sigma: float | None = None
     nis: float | None = None
+    doubt: float = 0.0
 
 
 @dataclass(eq=False)
@@ -47,6 +49,7 @@ class _Pair:
     loops: dict[tuple[int, int], list[Witness]] = field(default_factory=dict)
     points: Estimate | None = None
     ways: Comparison | None = None
+    doubt: float = 0.0  # 1 begins a disagreement
     disagrees: bool = False
     what: str = ""  # of the second, against the first
     turned: str = ""  # of the first, against the second
@@ -124,7 +127,12 @@ class Agreement:
             state, reason = "set apart", _reason(agent, bad) + ": check its calibration"
         elif any(frozenset(names) in self.disputed for names, _ in bad):
             state, reason = "disputed", f"{_reason(agent, bad)}; nobody can say which of the two is wrong"
-        return Standing(state, reason, log, sigma, nis)
+        doubt = max((pair.doubt for pair in pairs.values()), default=0.0)
+        return Standing(state, reason, log, sigma, nis, doubt)
+
+    def doubts(self) -> dict[Names, float]:
+        """What is held against every two agents that met, the lesser first; 1 begins a disagreement."""
+        return {names: pair.doubt for names, pair in self._pairs.items()}
 
     # ------------------------------------------------------------ two agents
 
@@ -135,8 +143,8 @@ class Agreement:
         pair.points = points_scale(scales) if len(scales) >= _ENOUGH_POINTS else None
         pair.ways = _compared(most) if len(most) >= _ENOUGH_PATH else None
         found = [*self._by_points(pair), *self._by_ways(pair), *_by_gravity(every)]
-        severe = max((severity for severity, _, _ in found), default=0.0)
-        pair.disagrees = severe >= (_CALM if pair.disagrees else 1.0)
+        pair.doubt = max((severity for severity, _, _ in found), default=0.0)
+        pair.disagrees = pair.doubt >= (_CALM if pair.disagrees else 1.0)
         said = [(text, turned) for severity, text, turned in found if severity >= _CALM]
         pair.what, pair.turned = ", ".join(t for t, _ in said), ", ".join(t for _, t in said)
 

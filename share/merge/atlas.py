@@ -251,6 +251,10 @@ class Atlas:
         """How the agent agrees with the others."""
         return self._parting.agreement.standing(agent)
 
+    def doubts(self) -> dict[tuple[str, str], float]:
+        """What is held against every two agents that met: see `Agreement`."""
+        return self._parting.agreement.doubts()
+
     def are_apart(self, one: str, other: str) -> bool:
         """Whether these agents must not come into one map."""
         return bool(self._parting.agreement.forbids([one], [other]))
