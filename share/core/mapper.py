@@ -270,7 +270,7 @@ class Mapper:
             return [Finding(b.agent, "merge skipped", f"loop {loop}: {objection}")]
         parted = self._atlas.witness(loop, outcome.scale)
         findings = self._parted(parted)
-        decision = self._atlas.propose(loop)
+        decision = self._atlas.propose(self._atlas.put_right(loop, outcome.scale))
         reason = f"{decision.reason} ({outcome.reason})"
         self._note(decision)
         if not decision.accepted:

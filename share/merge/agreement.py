@@ -26,6 +26,8 @@ _NIS = 3.0  # beyond what honest agents are too sure
 _ENOUGH_POINTS, _ENOUGH_PATH = 3, 8  # loops before a comparison by points, or by ways, says anything
 _INSIDE = 0.6  # of the loops must fit, or they are of more than one place
 _CALM = 0.6  # a disagreement ends below this part of what began it
+_TELLS, _TELLS_STILL = 2.5, 1.25  # sigmas from which on, and down to which, a scale is taken into account
+_SCALE_STEP = 0.001  # log scale that it has to change by
 
 
 @dataclass(frozen=True)
@@ -61,11 +63,13 @@ Names = tuple[str, str]
 
 class Agreement:
     """Of all agents. tolerance: log scale that does no harm. apart: agents that must not move others.
-    disputed: pairs of which nobody can say who is wrong."""
+    disputed: pairs of which nobody can say who is wrong. scale: log of how much too long the metres of each
+    are, so far as that is sure; 0 where it is not there."""
 
     def __init__(self, tolerance: float) -> None:
         self.apart: frozenset[str] = frozenset()
         self.disputed: frozenset[frozenset[str]] = frozenset()
+        self.scale: dict[str, float] = {}
         self._tolerance = tolerance
         self._walked: dict[int, Walked] = {}
         self._pairs: dict[Names, _Pair] = {}
@@ -105,7 +109,9 @@ class Agreement:
         pair.news = 0
         was = pair.disagrees
         self._compare(pair, agents)
-        return self._decide() if pair.disagrees or was else False
+        changed = self._decide() if pair.disagrees or was else False
+        self._gauge()
+        return changed
 
     def forbids(self, ones: Collection[str], others: Collection[str]) -> str:
         """Why these must not come into one map with those; empty if nothing is known against it."""
@@ -187,6 +193,16 @@ class Agreement:
         was = self.apart, self.disputed
         self.apart, self.disputed = frozenset(apart), frozenset(left)
         return was != (self.apart, self.disputed)
+
+    def _gauge(self) -> None:
+        """What is sure of everybody's scale; of those who are kept apart nothing, for their maps are theirs."""
+        kept_apart = self.apart.union(*self.disputed)
+        for agent, (log, sigma) in self._scales().items():
+            was = self.scale.get(agent, 0.0)
+            told = abs(log) > (_TELLS_STILL if was else _TELLS) * sigma and agent not in kept_apart
+            now = log if told else 0.0
+            if abs(now - was) > _SCALE_STEP:
+                self.scale[agent] = now
 
     def _scales(self) -> Mapping[str, tuple[float, float]]:
         """Log scale of every agent's depths against the median of those that are not apart, by least squares
