@@ -285,9 +285,9 @@ class Mapper:
         """Who disagrees with the others since now, or no longer."""
         self._changes += [DropLoop(loop.a, loop.b) for loop in parted.dropped]
         return [
-            Finding(
-                who, now.state if now.reason else "agrees again", now.reason or "its claims fit the others'"
-            )
+            Finding(who, now.state, now.reason)
+            if now.state in ("set apart", "disputed")
+            else Finding(who, "agrees again", "its claims fit the others'")
             for who, now in parted.standing.items()
         ]
 

@@ -65,7 +65,10 @@ class Parting:
         founders = self._chart.founder_of(loop.a), self._chart.founder_of(loop.b)
         if founders[0] == founders[1]:
             return ""
-        return self.agreement.forbids(*(self._agents_of(founder) for founder in founders))
+        ones, others = (self._agents_of(founder) for founder in founders)
+        if unproven := self.agreement.unproven & (ones | others):
+            return f"{min(unproven)} has to be compared first, since the edge was started again"
+        return self.agreement.forbids(ones, others)
 
     def put_right(self, loop: Loop, scale: Scale | None) -> Loop:
         """As it is in true metres, so far as they are known. scale: of b's depths over a's, by which T_a_b
@@ -87,6 +90,12 @@ class Parting:
         for agent, log in self.agreement.scale.items():
             if log != self._scale_of(agent):
                 self._chart.rescale(agent, log)
+
+    def restored(self) -> None:
+        """An earlier life's map. Who was set apart is not known, but he was not in the map of most agents."""
+        maps = [self._agents_of(founder) for founder in sorted(set(self._chart.founder))]
+        most = max(maps, key=len, default=set[str]())
+        self.agreement.unproven |= set[str]().union(*maps) - (most if len(most) > 1 else set())
 
     def _part(self) -> tuple[Loop, ...]:
         """Take back what ties agents that are kept apart, until no map has two of them."""
