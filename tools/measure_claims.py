@@ -1,7 +1,7 @@
 """What an agent that is wrong about itself costs the others: sets of keyframes in virtual time, with lies.
 
     python tools/measure_claims.py --scene firestation --motion walk: --motion walk: --motion walk: \\
-        --seeds 14:15 --spacing-m 0.3 --spacing-rad 0.35 [--lies scale-1.01-sure-10,...] [--honest] [--json FILE]
+        --seeds 14:15 --spacing-m 0.3 --spacing-rad 0.35 [--lies "scale 0.99 sure 10,…"] [--honest]
 
 Takes what `make_keyframe_sets.py` takes; sets that it has not made are left out. The last agent lies, see
 `LIES`. ATE is that of the other agents: `final` of their keyframes as the edge has them at the end, `causal`
@@ -33,6 +33,7 @@ from tool_main import exit_code, line  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.core.channel import NETWORKS  # noqa: E402
+from share.core.mapper import Mapper  # noqa: E402
 from share.core.world import Costs, Seen, World  # noqa: E402
 from share.errors import ShareError, UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
@@ -131,7 +132,7 @@ def played(made: KeyframeSet, lie: Lie | None, config: Config, seed: int = 0) ->
     if report["failed_jobs"]:
         raise ShareError(f"{report['failed_jobs']} jobs of the mapper failed")
     return Outcome(
-        _final(made, room, {runs[name]: name for name in honest}),
+        _final(made, mapper, {runs[name]: name for name in honest}),
         _causal(made, room, honest, began_ns),
         _together(room, honest),
         mapper.doubt(names),
@@ -150,8 +151,8 @@ def _rmse_cm(groups: list[tuple[F64, F64]]) -> float:
     return 100 * float(np.sqrt((np.concatenate(gaps) ** 2).sum(1).mean())) if gaps else float("nan")
 
 
-def _final(made: KeyframeSet, room: World, honest: dict[str, str]) -> float:
-    found = room.mapper.poses()
+def _final(made: KeyframeSet, mapper: Mapper, honest: dict[str, str]) -> float:
+    found = mapper.poses()
     by_map: dict[str, list[tuple[F64, F64]]] = {}
     for key, T, map_id in zip(found.keys, found.T_map_body, found.maps, strict=True):
         if key.agent in honest:

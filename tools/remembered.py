@@ -1,4 +1,4 @@
-"""A mapper that verifies each two views once, however many runs look at them, and remembers who was doubted."""
+"""A mapper that verifies each two views once, however many runs look at them, and notes who was doubted."""
 
 from __future__ import annotations
 

@@ -34,8 +34,8 @@ _SCALE_STEP = 0.001  # log scale that it has to change by
 @dataclass(frozen=True)
 class Standing:
     """Of an agent, for people. state: `agrees`, `set apart`, `disputed` or `unknown`. log_scale, sigma: of
-    its depths against the others'; put_right: what is taken out of it; nis: see `share.merge.consistency`; None where not known. doubt: the most
-    that is held against it and another; 1 begins a disagreement."""
+    its depths against the others'; put_right: what of it is taken out; nis: see `share.merge.consistency`;
+    None where not known. doubt: the most that is held against it and another; 1 begins a disagreement."""
 
     state: str = "unknown"
     reason: str = ""
@@ -48,8 +48,8 @@ class Standing:
 
 @dataclass(eq=False)
 class _Pair:
-    """Of two agents, the lesser first. loops: by stretches. scales: of more loops, by which what does no harm is
-    put right. news: loops since it was compared."""
+    """Of two agents, the lesser first. loops: by stretches. scales: of more loops, by which what does no harm
+    is put right. news: loops since it was compared."""
 
     loops: dict[tuple[int, int], list[Witness]] = field(default_factory=dict)
     scales: deque[Scale] = field(default_factory=lambda: deque(maxlen=_MOST_SCALES))
@@ -69,8 +69,8 @@ Names = tuple[str, str]
 class Agreement:
     """Of all agents. tolerance: log scale that does no harm. apart: agents that must not move others.
     disputed: pairs of which nobody can say who is wrong. scale: log of how much too long the metres of each
-    are, so far as that is sure; 0 where it is not there. unproven: agents of an earlier life that may have been
-    set apart; they stay so until they have been compared."""
+    are, so far as that is sure; 0 where it is not there. unproven: agents of an earlier life that may have
+    been set apart; they stay so until they have been compared."""
 
     def __init__(self, tolerance: float) -> None:
         self.apart: frozenset[str] = frozenset()
@@ -209,7 +209,7 @@ class Agreement:
         return was != (self.apart, self.disputed)
 
     def _gauge(self) -> None:
-        """What is sure of everybody's scale; of those who are kept apart nothing, for their maps are theirs."""
+        """What is sure of everybody's scale; nothing of those kept apart, for their maps are theirs."""
         kept_apart = self.apart.union(*self.disputed)
         for agent, (log, sigma) in self._scales().items():
             was = self.scale.get(agent, 0.0)

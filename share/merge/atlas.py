@@ -228,7 +228,9 @@ class Atlas:
         link = out.link
         if link is None or link.reference is None:
             return out
-        return replace(out, link=replace(link, T_ref_body=self._parting.as_told(out.key.agent, link.T_ref_body)))
+        return replace(
+            out, link=replace(link, T_ref_body=self._parting.as_told(out.key.agent, link.T_ref_body))
+        )
 
     def _staying(self) -> set[int]:
         """Keyframes that hold a map's gauge, and the newest of every agent."""
@@ -264,7 +266,7 @@ class Atlas:
         return self._parting.agreement.standing(agent)
 
     def doubts(self) -> dict[tuple[str, str], float]:
-        """What is held against every two agents that met: see `Agreement`."""
+        """See `Agreement`."""
         return self._parting.agreement.doubts()
 
     def are_apart(self, one: str, other: str) -> bool:

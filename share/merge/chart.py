@@ -52,8 +52,8 @@ class Chart:
         return number
 
     def place(self, number: int, T_ref_body: F64, cov: F64, plumb: F64) -> None:
-        """Give a new node its pose, by odometry as its agent told it, and tie it to the one before it, if there is
-        one."""
+        """Give a new node its pose, by odometry as its agent told it, and tie it to the one before it, if
+        there is one."""
         node, before = self.trails.nodes[number], self.trails.before(number)
         T_ref_body = shortened(T_ref_body, self.scale.get(self.trails.stretches[node.stretch].agent, 0.0))
         self.founder += range(len(self.founder), len(self.trails.stretches))

@@ -3,8 +3,8 @@
 Of a matched point both views know a depth. With T_c_q in the candidate's units, a query whose depths are all
 too large by e^l has inverse depths that are too small by it, so y' = h(T, (u, v, rho e^l)) has to meet y_c:
 the residual of `share.place.refine`, with one unknown more. Both a wrong stereo baseline and a wrong focal
-length show here at once, from one pair of views. A pose that takes both as of one scale is off, by some cm where points are 4 m away and
-depths 1 % apart: `Scale.lean` says how.
+length show here at once, from one pair of views. A pose that takes both as of one scale is off, by some mm
+for each percent and metre of depth: `Scale.lean` says how.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _RIDGE = 1e-6 * np.eye(7)
 
 
 class Scale(NamedTuple):
-    """log: of the query's depths over the candidate's; sigma: of log. lean (6,): where T_c_q goes, perturbed on
-    the left, by each unit of log that is taken into account; None where not known."""
+    """log: of the query's depths over the candidate's; sigma: of log. lean (6,): where T_c_q goes, perturbed
+    on the left, by each unit of log that is taken into account; None where not known."""
 
     log: float
     sigma: float

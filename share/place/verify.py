@@ -138,9 +138,7 @@ def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> V
     return Verified(T, cov + _floor(config), fit.matches, fit.inliers, scale)
 
 
-def _scale(
-    fit: _Fit, noises: tuple[Noise, Noise], config: PlaceConfig, T_body_cam_c: F64
-) -> Scale | None:
+def _scale(fit: _Fit, noises: tuple[Noise, Noise], config: PlaceConfig, T_body_cam_c: F64) -> Scale | None:
     """None where the matches do not tell: a pose may be told all the same."""
     try:
         found = relative_scale(fit.T, *fit.beside, *noises, config.inlier_chi2)

@@ -122,7 +122,9 @@ def test_loops_are_put_right_too():
     assert gap == pytest.approx(0.01 * lean, abs=1e-6)
     back = atlas.put_right(loop.reverse(), Scale(-0.01, 0.004, lean))
     leant = (se3.exp(-0.01 * lean) @ loop.reverse().T_a_b)[:3, 3]
-    assert back.T_a_b[:3, 3] == pytest.approx(np.exp(-0.01) * leant)  # in the metres of eve, which are too long
+    assert back.T_a_b[:3, 3] == pytest.approx(
+        np.exp(-0.01) * leant
+    )  # in the metres of eve, which are too long
     assert atlas.put_right(loop, None) is loop
 
 
