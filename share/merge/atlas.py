@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -217,20 +217,11 @@ class Atlas:
         """These keyframes, but for those that have to stay by now."""
         chart, stay = self._chart, self._staying()
         going = [n for n in numbers if n in chart.poses and n not in stay]
-        taken = [self._as_told(take_out(chart, n, self._config.most_loops)) for n in going]
+        taken = [self._parting.as_told(take_out(chart, n, self._config.most_loops)) for n in going]
         chart.find_maps()
         self._judge.forget({out.key for out in taken})
         self._parting.agreement.forget([out.number for out in taken])
         return taken
-
-    def _as_told(self, out: TakenOut) -> TakenOut:
-        """What is kept of an agent's odometry is in its own metres."""
-        link = out.link
-        if link is None or link.reference is None:
-            return out
-        return replace(
-            out, link=replace(link, T_ref_body=self._parting.as_told(out.key.agent, link.T_ref_body))
-        )
 
     def _staying(self) -> set[int]:
         """Keyframes that hold a map's gauge, and the newest of every agent."""

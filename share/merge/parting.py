@@ -15,9 +15,9 @@ from share.merge.agreement import Agreement, Standing, tilt_between
 from share.merge.chart import Chart, shortened
 from share.merge.join import Loop
 from share.merge.judge import Judge
+from share.merge.thinning import TakenOut
 from share.place.scale import Scale
 from share.place.verify import Sight
-from share.types import F64
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +79,13 @@ class Parting:
         T = shortened(se3.exp(scale.lean * (b - a)) @ loop.T_a_b, a)
         return replace(loop, T_a_b=se3.orthonormal(T))
 
-    def as_told(self, agent: str, T: F64) -> F64:
-        """T (4, 4) of this agent's odometry, which is in true metres in the chart, in its own."""
-        return shortened(T, -self._scale_of(agent))
+    def as_told(self, out: TakenOut) -> TakenOut:
+        """What is kept of an agent's odometry is in its own metres."""
+        link = out.link
+        if link is None or link.reference is None:
+            return out
+        T = shortened(link.T_ref_body, -self._scale_of(out.key.agent))
+        return replace(out, link=replace(link, T_ref_body=T))
 
     def _scale_of(self, agent: str) -> float:
         return self._chart.scale.get(agent, 0.0)
