@@ -233,6 +233,8 @@ class MergeConfig:
     odometry_scale: float = 1.0  # agents' sigmas are this much too small
     odometry_floor_deg: float = 0.002  # per edge, added in quadrature
     odometry_floor_m: float = 0.0002  # the same, for the position
+    odometry_floor_per_rad: float = 0.0005  # the same, a part of what the edge turns,
+    odometry_floor_per_m: float = 0.003  # and of what it moves: no agent is surer of itself
     gravity_floor_deg: float = 0.1  # the same, of an agent's up: what its calibration may be wrong
     most_loops: int = 10  # of a keyframe, when those of others that are taken out are moved to it
     max_pending: int = 200  # loops that wait for a witness; the oldest is dropped

@@ -21,6 +21,8 @@ MARKER = "<!-- Below: made by tools/config_table.py from share/config.py. Change
 
 # By how a name ends; the first that fits.
 UNITS = {
+    "_per_rad": "",
+    "_per_m": "",
     "_m_s": "m/s",
     "_rad_s": "rad/s",
     "_ms": "ms",

@@ -270,7 +270,7 @@ class Mapper:
             return [Finding(b.agent, "merge skipped", f"loop {loop}: {objection}")]
         parted = self._atlas.witness(loop, outcome.scale)
         findings = self._parted(parted)
-        decision = self._atlas.propose(loop)
+        decision = self._atlas.propose(self._atlas.put_right(loop, outcome.scale))
         reason = f"{decision.reason} ({outcome.reason})"
         self._note(decision)
         if not decision.accepted:
@@ -285,9 +285,9 @@ class Mapper:
         """Who disagrees with the others since now, or no longer."""
         self._changes += [DropLoop(loop.a, loop.b) for loop in parted.dropped]
         return [
-            Finding(
-                who, now.state if now.reason else "agrees again", now.reason or "its claims fit the others'"
-            )
+            Finding(who, now.state, now.reason)
+            if now.state in ("set apart", "disputed")
+            else Finding(who, "agrees again", "its claims fit the others'")
             for who, now in parted.standing.items()
         ]
 

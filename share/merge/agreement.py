@@ -8,7 +8,7 @@ nobody can say which is wrong, and they keep a map each.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
@@ -20,33 +20,43 @@ from share.place.scale import Scale
 from share.types import F64
 
 _MOST = 32  # loops kept of two stretches
+_MOST_SCALES = 160
 _SIGMAS = 4.5  # that a difference must have: of thousands of comparisons none by chance
 _TURN, _TILT = np.radians(1.5), np.radians(1.0)  # rad, less does no harm
 _NIS = 3.0  # beyond what honest agents are too sure
 _ENOUGH_POINTS, _ENOUGH_PATH = 3, 8  # loops before a comparison by points, or by ways, says anything
 _INSIDE = 0.6  # of the loops must fit, or they are of more than one place
 _CALM = 0.6  # a disagreement ends below this part of what began it
+_TELLS, _TELLS_STILL = 2.5, 1.25  # sigmas from which on, and down to which, a scale is taken into account
+_SCALE_STEP = 0.001  # log scale that it has to change by
 
 
 @dataclass(frozen=True)
 class Standing:
     """Of an agent, for people. state: `agrees`, `set apart`, `disputed` or `unknown`. log_scale, sigma: of
-    its depths against the others'; nis: see `share.merge.consistency`; None where not known."""
+    its depths against the others'; put_right: what of it is taken out; nis: see `share.merge.consistency`;
+    None where not known. doubt: the most that is held against it and another; 1 begins a disagreement."""
 
     state: str = "unknown"
     reason: str = ""
     log_scale: float | None = None
     sigma: float | None = None
+    put_right: float = 0.0
     nis: float | None = None
+    doubt: float = 0.0
 
 
 @dataclass(eq=False)
 class _Pair:
-    """Of two agents, the lesser first. loops: by stretches. news: loops since it was compared."""
+    """Of two agents, the lesser first. loops: by stretches. scales: of more loops, by which what does no harm
+    is put right. news: loops since it was compared."""
 
     loops: dict[tuple[int, int], list[Witness]] = field(default_factory=dict)
+    scales: deque[Scale] = field(default_factory=lambda: deque(maxlen=_MOST_SCALES))
     points: Estimate | None = None
+    gauge: Estimate | None = None  # of `scales`
     ways: Comparison | None = None
+    doubt: float = 0.0  # 1 begins a disagreement
     disagrees: bool = False
     what: str = ""  # of the second, against the first
     turned: str = ""  # of the first, against the second
@@ -58,11 +68,15 @@ Names = tuple[str, str]
 
 class Agreement:
     """Of all agents. tolerance: log scale that does no harm. apart: agents that must not move others.
-    disputed: pairs of which nobody can say who is wrong."""
+    disputed: pairs of which nobody can say who is wrong. scale: log of how much too long the metres of each
+    are, so far as that is sure; 0 where it is not there. unproven: agents of an earlier life that may have
+    been set apart; they stay so until they have been compared."""
 
     def __init__(self, tolerance: float) -> None:
         self.apart: frozenset[str] = frozenset()
         self.disputed: frozenset[frozenset[str]] = frozenset()
+        self.scale: dict[str, float] = {}
+        self.unproven: set[str] = set()
         self._tolerance = tolerance
         self._walked: dict[int, Walked] = {}
         self._pairs: dict[Names, _Pair] = {}
@@ -94,6 +108,8 @@ class Agreement:
         loops = pair.loops.setdefault(stretches, [])
         a, b = self._walked[edge.a], self._walked[edge.b]
         loops.append(Witness(a, b, edge.T_a_b, edge.cov, scale, tilt))
+        if scale is not None:
+            pair.scales.append(scale)
         if len(loops) > _MOST:
             del loops[_least_telling(loops)]
         pair.news += 1
@@ -102,7 +118,9 @@ class Agreement:
         pair.news = 0
         was = pair.disagrees
         self._compare(pair, agents)
-        return self._decide() if pair.disagrees or was else False
+        changed = self._decide() if pair.disagrees or was else False
+        self._gauge()
+        return changed
 
     def forbids(self, ones: Collection[str], others: Collection[str]) -> str:
         """Why these must not come into one map with those; empty if nothing is known against it."""
@@ -124,7 +142,14 @@ class Agreement:
             state, reason = "set apart", _reason(agent, bad) + ": check its calibration"
         elif any(frozenset(names) in self.disputed for names, _ in bad):
             state, reason = "disputed", f"{_reason(agent, bad)}; nobody can say which of the two is wrong"
-        return Standing(state, reason, log, sigma, nis)
+        elif agent in self.unproven:
+            state, reason = "unknown", "not compared with the others since the edge was started again"
+        doubt = max((pair.doubt for pair in pairs.values()), default=0.0)
+        return Standing(state, reason, log, sigma, self.scale.get(agent, 0.0), nis, doubt)
+
+    def doubts(self) -> dict[Names, float]:
+        """What is held against every two agents that met, the lesser first; 1 begins a disagreement."""
+        return {names: pair.doubt for names, pair in self._pairs.items()}
 
     # ------------------------------------------------------------ two agents
 
@@ -133,10 +158,13 @@ class Agreement:
         most = max(pair.loops.values(), key=len)
         scales = [w.scale for w in every if w.scale is not None]
         pair.points = points_scale(scales) if len(scales) >= _ENOUGH_POINTS else None
+        pair.gauge = points_scale(pair.scales) if len(pair.scales) >= _ENOUGH_POINTS else None
         pair.ways = _compared(most) if len(most) >= _ENOUGH_PATH else None
         found = [*self._by_points(pair), *self._by_ways(pair), *_by_gravity(every)]
-        severe = max((severity for severity, _, _ in found), default=0.0)
-        pair.disagrees = severe >= (_CALM if pair.disagrees else 1.0)
+        pair.doubt = max((severity for severity, _, _ in found), default=0.0)
+        pair.disagrees = pair.doubt >= (_CALM if pair.disagrees else 1.0)
+        if self._agrees(pair) or (len(most) >= _ENOUGH_PATH and not pair.disagrees):
+            self.unproven.difference_update(names)
         said = [(text, turned) for severity, text, turned in found if severity >= _CALM]
         pair.what, pair.turned = ", ".join(t for t, _ in said), ", ".join(t for _, t in said)
 
@@ -180,10 +208,20 @@ class Agreement:
         self.apart, self.disputed = frozenset(apart), frozenset(left)
         return was != (self.apart, self.disputed)
 
+    def _gauge(self) -> None:
+        """What is sure of everybody's scale; nothing of those kept apart, for their maps are theirs."""
+        kept_apart = self.apart.union(*self.disputed)
+        for agent, (log, sigma) in self._scales().items():
+            was = self.scale.get(agent, 0.0)
+            told = abs(log) > (_TELLS_STILL if was else _TELLS) * sigma and agent not in kept_apart
+            now = log if told else 0.0
+            if abs(now - was) > _SCALE_STEP:
+                self.scale[agent] = now
+
     def _scales(self) -> Mapping[str, tuple[float, float]]:
         """Log scale of every agent's depths against the median of those that are not apart, by least squares
         over all pairs; and its sigma."""
-        known = [(names, pair.points) for names, pair in self._pairs.items() if pair.points is not None]
+        known = [(names, pair.gauge) for names, pair in self._pairs.items() if pair.gauge is not None]
         agents = sorted({name for names, _ in known for name in names})
         if not agents:
             return {}

@@ -159,7 +159,7 @@ class Atlas:
 
         Raises ValueError for a keyframe known already or whose reference is unknown.
         """
-        cov, plumb = self._believed(keyframe.cov), self._plumb(keyframe)
+        cov, plumb = self._believed(keyframe.T_ref_body, keyframe.cov), self._plumb(keyframe)
         number = self._chart.add(agent, keyframe, cov, plumb, rank)
         self._parting.agreement.walk(number, self._chart.trails.before(number), keyframe.T_ref_body, cov)
         return number
@@ -182,7 +182,7 @@ class Atlas:
             at[chart.trails.stretches[stretch].name] = stretch
         numbers = []
         for found in keyframes:
-            cov = self._believed(found.cov) if found.as_sent else found.cov
+            cov = self._believed(found.T_ref_body, found.cov) if found.as_sent else found.cov
             T_odom_body = found.keyframe.T_odom_body
             numbers.append(chart.trails.put(found.key, at[found.stretch], T_odom_body, found.ordinal))
             chart.place(numbers[-1], found.T_ref_body, cov, self._plumb(found.keyframe))
@@ -190,6 +190,7 @@ class Atlas:
             chart.poses[numbers[-1]] = T_map_body.get(found.key, chart.poses[numbers[-1]])
         for loop in loops:
             chart.tie(loop)
+        self._parting.restored()
         for agent in {agent for agent, _ in stretches}:
             current = chart.trails.current(agent)
             if current is not None and chart.trails.stretches[current].nodes:  # a damaged file may lack them
@@ -216,7 +217,7 @@ class Atlas:
         """These keyframes, but for those that have to stay by now."""
         chart, stay = self._chart, self._staying()
         going = [n for n in numbers if n in chart.poses and n not in stay]
-        taken = [take_out(chart, n, self._config.most_loops) for n in going]
+        taken = [self._parting.as_told(take_out(chart, n, self._config.most_loops)) for n in going]
         chart.find_maps()
         self._judge.forget({out.key for out in taken})
         self._parting.agreement.forget([out.number for out in taken])
@@ -247,9 +248,17 @@ class Atlas:
         """A verified loop, before it is proposed, says how its agents agree: see `Parting`."""
         return self._parting.witness(loop, scale)
 
+    def put_right(self, loop: Loop, scale: Scale | None) -> Loop:
+        """A loop in true metres, so far as they are known: see `Parting`."""
+        return self._parting.put_right(loop, scale)
+
     def standing(self, agent: str) -> Standing:
         """How the agent agrees with the others."""
         return self._parting.agreement.standing(agent)
+
+    def doubts(self) -> dict[tuple[str, str], float]:
+        """See `Agreement`."""
+        return self._parting.agreement.doubts()
 
     def are_apart(self, one: str, other: str) -> bool:
         """Whether these agents must not come into one map."""
@@ -263,11 +272,14 @@ class Atlas:
         """Whether what this keyframe saw speaks against a young join of its map: it is undone."""
         return self._judge.review(number)
 
-    def _believed(self, cov: F64) -> F64:
-        """Agents are surer of themselves than they should be; none is surer than the floor."""
+    def _believed(self, T_ref_body: F64, cov: F64) -> F64:
+        """Agents are surer of themselves than they should be; none is surer than the floor, which grows with
+        the step."""
         c = self._config
-        floor = [np.radians(c.odometry_floor_deg) ** 2] * 3 + [c.odometry_floor_m**2] * 3
-        return c.odometry_scale**2 * cov + np.diag(floor)
+        turn, way = float(se3.angle(T_ref_body)), float(np.linalg.norm(T_ref_body[:3, 3]))
+        rad2 = np.radians(c.odometry_floor_deg) ** 2 + (c.odometry_floor_per_rad * turn) ** 2
+        m2 = c.odometry_floor_m**2 + (c.odometry_floor_per_m * way) ** 2
+        return c.odometry_scale**2 * cov + np.diag([rad2] * 3 + [m2] * 3)
 
     def _plumb(self, keyframe: Keyframe) -> F64:
         """See `share.graph.plumb`: no camera sits on its IMU better than it was calibrated."""

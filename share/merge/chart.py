@@ -7,8 +7,10 @@ is the gauge. Maps are derived from the loops alone, so taking a loop back takes
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,10 +22,16 @@ from share.merge.trails import Trails
 from share.types import F64, Keyframe
 
 
+def shortened(T: F64, log: float) -> F64:
+    """T (4, 4) whose way was too long by this."""
+    return se3.compose(T[:3, :3], T[:3, 3] * np.exp(-log)) if log else T
+
+
 class Chart:
     """poses: T_map_body (4, 4) of every node, by its number. plumb: which way is up there, if it is known
     (`share.graph.plumb`). founder: of the map of each stretch. parted: stretches that were left in another
-    map when loops were taken back, since somebody last asked."""
+    map when loops were taken back, since somebody last asked. scale: log of what each agent's odometry is
+    shortened by; nothing where it is not there."""
 
     def __init__(self) -> None:
         self.trails = Trails()
@@ -33,6 +41,7 @@ class Chart:
         self.founder: list[int] = []
         self.parted: set[int] = set()
         self.bonds: Counter[tuple[int, int]] = Counter()  # loops by the two stretches that they tie
+        self.scale: dict[str, float] = {}
         self.unsolved: dict[int, None] = {}  # founders of maps with news, the oldest first
 
     def add(self, agent: str, keyframe: Keyframe, cov: F64, plumb: F64, rank: int = 0) -> int:
@@ -43,8 +52,10 @@ class Chart:
         return number
 
     def place(self, number: int, T_ref_body: F64, cov: F64, plumb: F64) -> None:
-        """Give a new node its pose, by odometry, and tie it to the one before it, if there is one."""
+        """Give a new node its pose, by odometry as its agent told it, and tie it to the one before it, if
+        there is one."""
         node, before = self.trails.nodes[number], self.trails.before(number)
+        T_ref_body = shortened(T_ref_body, self.scale.get(self.trails.stretches[node.stretch].agent, 0.0))
         self.founder += range(len(self.founder), len(self.trails.stretches))
         if before is None:
             self.poses[number] = node.T_odom_body
@@ -115,6 +126,19 @@ class Chart:
         self.poses.update(zip(numbers, moved, strict=True))
         self.ties.moved(numbers)
 
+    def rescale(self, agent: str, log: float) -> None:
+        """All odometry of this agent is to be shortened by this; its maps are due."""
+        by = log - self.scale.get(agent, 0.0)
+        self.scale[agent] = log
+        for number, stretch in enumerate(self.trails.stretches):
+            if stretch.agent != agent or not stretch.nodes:
+                continue
+            for before, after in itertools.pairwise(stretch.nodes):
+                old, edge = self._step(before, after)
+                self.ties.remove(old)
+                self.ties.add(replace(edge, T_a_b=shortened(edge.T_a_b, by)))
+            self.unsolved.setdefault(self.founder[number])
+
     def follow(self, numbers: Iterable[int]) -> None:
         """These go where odometry takes them from the ones before them."""
         for number in numbers:
@@ -131,10 +155,14 @@ class Chart:
 
     def step(self, before: int, number: int) -> Edge:
         """The odometry edge from a node to the next of its stretch."""
+        _, edge = self._step(before, number)
+        return edge if edge.a == before else edge.reverse()
+
+    def _step(self, before: int, number: int) -> tuple[int, Edge]:
         for n in self.ties.touching(number):
             edge = self.ties.edges[n]
             if n not in self.ties.loops and before in (edge.a, edge.b):
-                return edge if edge.a == before else edge.reverse()
+                return n, edge
         raise ValueError(f"odometry does not lead from node {before} to {number}")
 
     def stretch_of(self, key: Key) -> int:

@@ -1,18 +1,21 @@
-"""Agents that disagree with the others are kept out of their map, or taken out if the evidence is late."""
+"""Agents that disagree with the others are kept out of their map, or taken out if the evidence is late; whose
+metres are a little too long or too short, his are put right."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from share.geometry import se3
 from share.graph.posegraph import Edge
 from share.merge.agreement import Agreement, Standing, tilt_between
-from share.merge.chart import Chart
+from share.merge.chart import Chart, shortened
 from share.merge.join import Loop
 from share.merge.judge import Judge
+from share.merge.thinning import TakenOut
 from share.place.scale import Scale
 from share.place.verify import Sight
 
@@ -43,11 +46,13 @@ class Parting:
         edge = Edge(a, b, loop.T_a_b, loop.cov)
         stretches = self._chart.stretch_of(loop.a), self._chart.stretch_of(loop.b)
         before = self.agreement.apart, self.agreement.disputed
-        if not self.agreement.witness(agents, stretches, edge, scale, self._tilt(edge)):
+        changed = self.agreement.witness(agents, stretches, edge, scale, self._tilt(edge))
+        self._put_right()
+        if not changed:
             return Parted()
         now = self.agreement.apart, self.agreement.disputed
-        changed = (before[0] ^ now[0]).union(*(before[1] ^ now[1]))
-        return Parted({who: self.agreement.standing(who) for who in sorted(changed)}, self._part())
+        who = (before[0] ^ now[0]).union(*(before[1] ^ now[1]))
+        return Parted({name: self.agreement.standing(name) for name in sorted(who)}, self._part())
 
     def kept_apart(self, agent: str) -> tuple[int, ...]:
         """Nodes of agents that must not come into one map with this one."""
@@ -60,7 +65,41 @@ class Parting:
         founders = self._chart.founder_of(loop.a), self._chart.founder_of(loop.b)
         if founders[0] == founders[1]:
             return ""
-        return self.agreement.forbids(*(self._agents_of(founder) for founder in founders))
+        ones, others = (self._agents_of(founder) for founder in founders)
+        if unproven := self.agreement.unproven & (ones | others):
+            return f"{min(unproven)} has to be compared first, since the edge was started again"
+        return self.agreement.forbids(ones, others)
+
+    def put_right(self, loop: Loop, scale: Scale | None) -> Loop:
+        """As it is in true metres, so far as they are known. scale: of b's depths over a's, by which T_a_b
+        leans."""
+        a, b = (self._scale_of(key.agent) for key in (loop.a, loop.b))
+        if scale is None or scale.lean is None or not (a or b):
+            return loop
+        T = shortened(se3.exp(scale.lean * (b - a)) @ loop.T_a_b, a)
+        return replace(loop, T_a_b=se3.orthonormal(T))
+
+    def as_told(self, out: TakenOut) -> TakenOut:
+        """What is kept of an agent's odometry is in its own metres."""
+        link = out.link
+        if link is None or link.reference is None:
+            return out
+        T = shortened(link.T_ref_body, -self._scale_of(out.key.agent))
+        return replace(out, link=replace(link, T_ref_body=T))
+
+    def _scale_of(self, agent: str) -> float:
+        return self._chart.scale.get(agent, 0.0)
+
+    def _put_right(self) -> None:
+        for agent, log in self.agreement.scale.items():
+            if log != self._scale_of(agent):
+                self._chart.rescale(agent, log)
+
+    def restored(self) -> None:
+        """An earlier life's map. Who was set apart is not known, but he was not in the map of most agents."""
+        maps = [self._agents_of(founder) for founder in sorted(set(self._chart.founder))]
+        most = max(maps, key=len, default=set[str]())
+        self.agreement.unproven |= set[str]().union(*maps) - (most if len(most) > 1 else set())
 
     def _part(self) -> tuple[Loop, ...]:
         """Take back what ties agents that are kept apart, until no map has two of them."""

@@ -3,7 +3,8 @@
 Of a matched point both views know a depth. With T_c_q in the candidate's units, a query whose depths are all
 too large by e^l has inverse depths that are too small by it, so y' = h(T, (u, v, rho e^l)) has to meet y_c:
 the residual of `share.place.refine`, with one unknown more. Both a wrong stereo baseline and a wrong focal
-length show here at once, from one pair of views.
+length show here at once, from one pair of views. A pose that takes both as of one scale is off, by some mm
+for each percent and metre of depth: `Scale.lean` says how.
 """
 
 from __future__ import annotations
@@ -23,13 +24,15 @@ _RIDGE = 1e-6 * np.eye(7)
 
 
 class Scale(NamedTuple):
-    """log: of the query's depths over the candidate's; sigma: of log."""
+    """log: of the query's depths over the candidate's; sigma: of log. lean (6,): where T_c_q goes, perturbed
+    on the left, by each unit of log that is taken into account; None where not known."""
 
     log: float
     sigma: float
+    lean: F64 | None = None
 
     def reverse(self) -> Scale:
-        """The same, from the other end."""
+        """The same, from the other end, but for the lean."""
         return Scale(-self.log, self.sigma)
 
 
@@ -57,7 +60,8 @@ def relative_scale(
     if not abs(log) < _MOST:
         return None
     variance = max(1.0, float(d2[inside].sum()) / max(1, 3 * int(inside.sum()) - 7))
-    return Scale(log, float(np.sqrt(np.linalg.inv(normal)[6, 6] * variance)))
+    lean = -np.linalg.solve(normal[:6, :6], normal[:6, 6])
+    return Scale(log, float(np.sqrt(np.linalg.inv(normal)[6, 6] * variance)), lean)
 
 
 def _linear(

@@ -134,16 +134,19 @@ def _verify(query: Sight, candidate: Sight, config: PlaceConfig, seed: int) -> V
     if upright:
         _check_gravity(fit.T, query, candidate, config)
     T, cov = _between_bodies(fit.T, fit.cov, query.T_body_cam0, candidate.T_body_cam0)
-    scale = _scale(fit, noises, config)
+    scale = _scale(fit, noises, config, candidate.T_body_cam0)
     return Verified(T, cov + _floor(config), fit.matches, fit.inliers, scale)
 
 
-def _scale(fit: _Fit, noises: tuple[Noise, Noise], config: PlaceConfig) -> Scale | None:
+def _scale(fit: _Fit, noises: tuple[Noise, Noise], config: PlaceConfig, T_body_cam_c: F64) -> Scale | None:
     """None where the matches do not tell: a pose may be told all the same."""
     try:
-        return relative_scale(fit.T, *fit.beside, *noises, config.inlier_chi2)
+        found = relative_scale(fit.T, *fit.beside, *noises, config.inlier_chi2)
     except np.linalg.LinAlgError:
         return None
+    if found is None or found.lean is None:
+        return found
+    return found._replace(lean=se3.adjoint(T_body_cam_c) @ found.lean)
 
 
 def _noise(sight: Sight, config: PlaceConfig) -> Noise:

@@ -26,6 +26,9 @@ td { border-bottom: 1px solid var(--line) }
 .words th:nth-child(-n+5), .words td:nth-child(-n+5), th:first-child, td:first-child { text-align: left }
 td:first-child { max-width: 14rem; overflow: hidden; text-overflow: ellipsis }
 #maps th:last-child, #maps td:last-child { text-align: left; white-space: normal }
+#claims td { text-align: left; vertical-align: top }
+#claims th { text-align: left }
+#claims td:nth-child(3) { white-space: normal; min-width: 12rem; overflow-wrap: anywhere }
 tr.gone { color: var(--dim) }
 #agents td:nth-child(4) { white-space: normal; min-width: 9rem; max-width: 18rem; overflow-wrap: anywhere }
 .stale { opacity: .45 }
@@ -39,6 +42,7 @@ tr.gone { color: var(--dim) }
 <ul id="trouble"></ul>
 <main>
 <h2>Agents</h2><div class="wide"><table id="agents" class="words"></table></div>
+<h2>Whose claims agree</h2><div class="wide"><table id="claims"></table></div>
 <h2>Maps</h2><div class="wide"><table id="maps"></table></div>
 <h2>Loops</h2><div class="wide"><table id="loops"></table></div>
 <h2>Times, ms</h2><div class="wide"><table id="times"></table></div>
@@ -79,6 +83,17 @@ const lost = a => !a.gone && ["LOST", "SILENT"].includes(a.state);
 const late = a => !a.gone && a.state !== "INITIALISING" && a.pose_age_ms > 1000;
 const aged = ms => typeof ms === "number" ? `${fixed(ms / 1000, 1)} s` : "–";
 
+const apart = a => ["set apart", "disputed"].includes(a.consistency?.state);
+const percent = log => Math.abs(100 * Math.expm1(log)).toFixed(1);
+function claim(c) {
+  if (c.reason) return c.reason;
+  if (typeof c.log_scale !== "number") return "";
+  const sigma = `± ${fixed(100 * c.sigma, 1)} %`;
+  if (!c.put_right && Math.abs(c.log_scale) < 2 * c.sigma) return `depths as the others', ${sigma}`;
+  const off = `depths ${percent(c.log_scale)} ${sigma} too ${c.log_scale > 0 ? "large" : "small"}`;
+  return c.put_right ? `${off}; put right by ${percent(c.put_right)} %` : off;
+}
+
 let before = null, rates = {};
 function rate(name, agent, now) {
   const old = before?.agents[name];
@@ -103,7 +118,10 @@ function show(now) {
   const trouble = now.trouble ?? [];
   const unwell = entries(now.agents).filter(([, a]) => lost(a) || late(a)).length;
   const without = `${unwell} agent${unwell === 1 ? "" : "s"} without a current pose`;
-  mark(trouble.length ? "trouble" : unwell ? without : "ok", trouble.length || unwell);
+  const odd = entries(now.agents).filter(([, a]) => !a.gone && apart(a)).length;
+  const alone = `${odd} agent${odd === 1 ? "" : "s"} kept apart`;
+  const words = [...(unwell ? [without] : []), ...(odd ? [alone] : [])].join(", ");
+  mark(trouble.length ? "trouble" : words || "ok", trouble.length || words);
   at("trouble").replaceChildren(...trouble.concat(now.refused ?? []).map(t => node("li", t)));
   const about = [`up ${lasted(now.uptime_s)}`];
   if (now.waiting !== undefined) about.push(`waiting ${shown(now.waiting)}`);
@@ -118,6 +136,9 @@ function show(now) {
       node("td", a.gone ? "–" : aged(a.pose_age_ms), late(a) ? "bad" : ""),
       a.reason, a.kind, a.keyframes, a.corrections, a.map_id, a.gone ? "–" : fixed(rates[name], 1),
       `${shown(a.loops?.accepted)} of ${shown(a.loops?.tried)}`]})));
+  table("claims", ["name", "it", "why"], agents.filter(([, a]) => a.consistency).map(([name, a]) => ({
+    kind: a.gone ? "gone" : "", cells: [
+      name, node("td", a.consistency.state, apart(a) && !a.gone ? "bad" : ""), claim(a.consistency)]})));
   table("maps", ["map", "keyframes", "agents"], entries(now.maps).map(([id, count]) => ({cells: [
     id, typeof count === "object" ? count?.keyframes : count,
     agents.filter(([, a]) => String(a.map_id) === id).map(([name]) => name).join(", ")]})));

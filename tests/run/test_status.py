@@ -12,6 +12,7 @@ import socket
 import threading
 import time
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,7 @@ from share.core.edge import Edge
 from share.core.edge_events import Join, Received
 from share.core.mapper import Mapper
 from share.errors import TransportError, UsageError
+from share.merge.agreement import Standing
 from share.run import status_metrics, web
 from share.run.status import KEPT_S, StatusServer
 from share.wire.codec import encode
@@ -207,6 +209,17 @@ def test_the_page_needs_nothing_from_elsewhere():
     assert not re.search(r"https?://|(src|href)=|innerHTML|@import|url\(", page)
     assert "default-src 'none'" in headers["Content-Security-Policy"]
     assert 'fetch("snapshot.json"' in page
+
+
+def test_the_page_says_whose_claims_agree_and_the_snapshot_why():
+    """Each field that the page reads is one of the report's."""
+    told = asdict(Standing("set apart", "against ann its depths are larger", 0.03, 0.002))
+    with serving(lambda: {"agents": {"eve": {**AGENT, "consistency": told}}}) as server:
+        assert json.loads(get(server, "/snapshot.json")[2])["agents"]["eve"]["consistency"] == told
+        page = get(server, "/")[2].decode()
+    assert 'id="claims"' in page and '["set apart", "disputed"].includes' in page
+    assert set(re.findall(r"\bc\.(\w+)", page)) - {"consistency"} <= told.keys()
+    assert {"reason", "log_scale", "sigma", "put_right"} <= set(re.findall(r"\bc\.(\w+)", page))
 
 
 # ---------------------------------------------------------------- what goes wrong

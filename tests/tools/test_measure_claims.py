@@ -1,0 +1,97 @@
+"""tools/measure_claims.py: what it makes of a lie, and what lies cost in a room of points."""
+
+from __future__ import annotations
+
+import importlib
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from edge_sim import Person, walls
+
+from share.geometry import se3
+from share.types import AgentKind, Keyframe
+
+TOOLS = Path(__file__).resolve().parents[2] / "tools"
+STEPS = 48
+COSTS = 1.10  # what a lie may cost the others, as a part of their error
+LIES = ["scale 0.99 sure 10", "scale 1.02 sure 10", "scale 0.97 sure 100"]
+
+
+@pytest.fixture(scope="module")
+def tool():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(TOOLS)
+        yield importlib.import_module("measure_claims")
+
+
+@cache
+def room(seed: int):
+    """As a `KeyframeSet`: two headsets and a robot walk round, 0.2 m and 250 ms from keyframe to keyframe."""
+    place, agents = walls(seed), {}
+    for n, (name, kind) in enumerate((("ann", AgentKind.AR), ("bob", AgentKind.AR), ("eve", AgentKind.ROBOT))):
+        person = Person(name, place, 1.5 * n, 1000 * seed + 11 * (n + 1), kind)
+        keyframes = []
+        for k in range(STEPS):
+            T, view = person.step()
+            before = se3.inverse(person.T_odom_body[k - 1]) if k else np.eye(4)
+            keyframes.append(
+                Keyframe(k, k - 1, 250_000_000 * k, before @ T, person.cov, T, np.zeros(3), 0.0, view)
+            )
+        T_world, T_odom = np.array(person.T_world_body), np.array(person.T_odom_body)
+        agents[name] = SimpleNamespace(
+            hello=person.hello, keyframes=keyframes, T_world_body=T_world, T_odom_body=T_odom
+        )
+    return SimpleNamespace(agents=agents)
+
+
+def played(tool, seed: int, lie):
+    return tool.played(room(seed), lie, tool.configured(['edge.policy="covins-g"']))
+
+
+def test_a_lie_is_told_of_the_way_the_depths_the_sureness_and_the_camera(tool):
+    agent = room(1).agents["eve"]
+    hello, honest = tool.told(agent, tool.Lie())
+    assert (hello.name, hello.run_id) == (agent.hello.name, agent.hello.run_id)
+    turned, seen = tool.told(agent, tool.Lie(path=1.1, depth=0.9, sure=10.0, turn_deg=5.0))
+    apart = se3.angle(se3.inverse(hello.rig.T_body_cam0) @ turned.rig.T_body_cam0)
+    assert np.degrees(apart) == pytest.approx(5.0)
+    for k, (one, other) in enumerate(zip(honest, seen, strict=True)):
+        a, b = one.candidate, other.candidate
+        assert b.view.points == pytest.approx(0.9 * a.view.points, rel=1e-5)
+        assert b.cov == pytest.approx(a.cov / 100)
+        if k:
+            assert b.T_last_body[:3, 3] == pytest.approx(1.1 * a.T_last_body[:3, 3])
+            assert a.T_odom_body == pytest.approx(agent.T_odom_body[k], abs=1e-9)
+
+
+def test_a_lie_that_there_is_not_is_said(tool, capsys):
+    words = ["--scene", "empty-hall", "--motion", "walk:", "--lies", "scale 7"]
+    assert tool.main(words) == 2
+    assert "'scale 7' is not known; known: scale 1.005 sure 10" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1, 11))
+def test_honest_agents_are_never_kept_apart(tool, seed):
+    outcome = played(tool, seed, tool.Lie())
+    print(f"room {seed}: {outcome}")
+    assert not outcome.wronged
+    assert not outcome.said
+    assert outcome.liar == "agrees"
+    assert outcome.doubt < 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lie", LIES)
+def test_a_lie_costs_the_others_little(tool, lie):
+    """Of three rooms together, against the same where it is as much too sure, and else right."""
+    seeds = range(1, 4)
+    told = [played(tool, seed, tool.LIES[lie]) for seed in seeds]
+    right = [played(tool, seed, tool.Lie(sure=tool.LIES[lie].sure)) for seed in seeds]
+    ratios = [a.final / b.final for a, b in zip(told, right, strict=True)]
+    print(f"{lie}: {ratios} {told}")
+    assert np.mean(ratios) <= COSTS
+    assert not any(outcome.wronged for outcome in told)

@@ -1,0 +1,75 @@
+"""A mapper that verifies each two views once, however many runs look at them, and notes who was doubted."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection
+from typing import Any
+
+from share.config import Config, PlaceConfig
+from share.core.finding import Finding
+from share.core.mapper import Mapper
+from share.core.steps import Look, Step, Verify
+from share.place.verify import Refusal, Sight, Verified
+from share.wire.messages import Hello
+
+_seen: dict[tuple[bytes, bytes, PlaceConfig], Verified | Refusal] = {}
+
+
+class _Remembered(Verify):
+    """Its result hangs on both views alone."""
+
+    def run(self) -> Verified | Refusal:
+        key = _digest(self.sight), _digest(self.seen), self.config
+        if key not in _seen:
+            _seen[key] = super().run()
+        return _seen[key]
+
+
+class RememberingMapper(Mapper):
+    """runs: by agents' names, what they are called here."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self.runs: dict[str, str] = {}
+        self._doubts: dict[frozenset[str], float] = {}  # the most ever
+        self._were_apart: set[frozenset[str]] = set()  # ever
+
+    def join(self, agent: str, hello: Hello) -> None:
+        self.runs[hello.name] = agent
+        super().join(agent, hello)
+
+    def next_look(self) -> Look | None:
+        look = super().next_look()
+        if not isinstance(look, Verify):
+            return look
+        return _Remembered(look.number, look.sight, look.candidate, look.seen, look.config)
+
+    def done(self, step: Step, result: Any, ms: float) -> list[Finding]:
+        findings = super().done(step, result, ms)
+        if isinstance(step, Verify):
+            self._note_standing()
+        return findings
+
+    def doubt(self, of: Collection[str]) -> float:
+        """The most that was ever held against two of these."""
+        return max((doubt for pair, doubt in self._doubts.items() if pair <= set(of)), default=0.0)
+
+    def wronged(self, honest: Collection[str]) -> bool:
+        """Whether two of these were ever kept apart."""
+        return any(pair <= set(honest) for pair in self._were_apart)
+
+    def _note_standing(self) -> None:
+        for names, doubt in self._atlas.doubts().items():
+            pair = frozenset(names)
+            self._doubts[pair] = max(doubt, self._doubts.get(pair, 0.0))
+            if self._atlas.are_apart(*names):
+                self._were_apart.add(pair)
+
+
+def _digest(sight: Sight) -> bytes:
+    view, made = sight.view, hashlib.blake2b(digest_size=16)
+    for array in (view.uv, view.points, view.descriptors, sight.T_body_cam0, sight.up):
+        made.update(array.tobytes())
+    made.update(repr(sight.focal).encode())
+    return made.digest()
