@@ -222,7 +222,8 @@ class ImuBatch:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One moment of all cameras, and the IMU samples in (previous frame, this frame].
+    """One moment of all cameras, and the IMU samples since those of the previous frame, until the first that
+    is not before this one.
 
     image0, image1: (H, W) uint8. depth: (Hd, Wd) float32 m in the depth camera, 0 = no reading.
     gap_ns: time since the previous frame where that is longer than the stream's rate explains, else 0.

@@ -1,7 +1,8 @@
 """Streams of measurements to frames: one pure iterator, the same for a file and for a live camera.
 
 A frame goes out as soon as it is whole: its partner image is there and the IMU has reached its
-stamp. Nothing waits for a wall clock: the time of the newest measurement is the only clock.
+stamp. Its IMU samples end with the first that is not before it, so that motion can be interpolated to
+the moment of the image. Nothing waits for a wall clock: the time of the newest measurement is the only clock.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class SequencerCounters:
     duplicates: int = 0  # dropped: the stamp was there already
     backward: int = 0  # dropped: older than what its stream had reached
     unpaired: int = 0  # dropped: images without a partner within sync_tolerance_ms
-    imu_silent: int = 0  # frames without an IMU sample although the rig has an IMU
+    imu_silent: int = 0  # frames that no IMU sample reaches although the rig has an IMU
     imu_dropped: int = 0  # samples longer than max_jump_s before their frame
     imu_out_of_range: int = 0  # dropped: beyond what the sensor can measure, or not finite
     imu_spikes: int = 0  # dropped: single samples far from those around them
@@ -133,6 +134,11 @@ class _Buffer:
             return False
         self.items.insert(at, (stamp, payload))
         return True
+
+    def first_from(self, stamp: int) -> int | None:
+        """The stamp of the first item that waits and is not before `stamp`."""
+        at = bisect_left(self.items, stamp, key=itemgetter(0))
+        return self.items[at][0] if at < len(self.items) else None
 
     def pop_until(self, stamp: int) -> list[tuple[int, Any]]:
         """Take everything with a stamp up to `stamp`."""
@@ -225,10 +231,12 @@ class _Merger:
         return at < len(buffer.items) and buffer.items[at][0] <= min(stamp + self._tolerance, buffer.reached)
 
     def _imu_reached(self, stamp: int) -> bool:
+        """The first sample from `stamp` on is there, and none can come before it."""
         imu = self._imu
-        if imu is None or imu.reached >= stamp:
+        if imu is None or imu.taken >= stamp:
             return True
-        return self._dead(imu)
+        first = imu.first_from(stamp)
+        return (first is not None and imu.reached >= first) or self._dead(imu)
 
     def _dead(self, buffer: _Buffer) -> bool:
         """It is silent for so long that nobody waits for it any more."""
@@ -260,10 +268,15 @@ class _Merger:
         return bundle
 
     def _take_imu(self, stamp: int) -> ImuBatch:
-        if self._imu is None:
+        """Samples since the frame before, until the first that is not before `stamp`."""
+        imu = self._imu
+        if imu is None:
             return ImuBatch.empty()
-        self._counters.imu_dropped += len(self._imu.pop_until(stamp - self._keep))
-        batch = self._measured(self._imu.pop_until(stamp))
+        self._counters.imu_dropped += len(imu.pop_until(stamp - self._keep))
+        if imu.taken >= stamp:  # the frame before has the first after both
+            return ImuBatch.empty()
+        first = imu.first_from(stamp)
+        batch = self._measured(imu.pop_until(stamp if first is None or first > stamp + self._wait else first))
         self._counters.imu_samples += len(batch)
         self._counters.imu_silent += not len(batch)
         return batch

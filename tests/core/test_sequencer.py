@@ -28,9 +28,10 @@ def imu(stamps) -> list[Measurement]:
     return [Measurement("imu", int(s), (float(s % 1000), 0.0, 0.0, 0.0, 0.0, 9.81)) for s in stamps]
 
 
-def recording(frames: int, start: int = 0, skew: int = 0) -> list[Measurement]:
-    """Stereo at 20 Hz, cam1 later by `skew`, IMU at 200 Hz; in order of time."""
-    times = start + STEP * np.arange(frames)
+def recording(frames: int, start: int = 0, skew: int = 0, before: int = 0) -> list[Measurement]:
+    """Stereo at 20 Hz, cam1 later by `skew`, IMU at 200 Hz; in order of time. The images are `before` earlier
+    than a sample."""
+    times = start + STEP * np.arange(frames) - before
     samples = start + 5 * MS * np.arange(-10, 10 * frames - 9)
     return in_order(imu(samples) + images("cam0", times) + images("cam1", times + skew))
 
@@ -51,27 +52,42 @@ def plain(bundles) -> list[tuple]:
     ]
 
 
-def test_frames_are_whole_and_imu_lies_between_them():
-    bundles, counters = run(recording(10, skew=2 * MS))
-    assert [b.stamp_ns for b in bundles] == [STEP * i for i in range(10)]
+@pytest.mark.parametrize("before", [0, 1, 1000, MS, 5 * MS - 1])
+def test_frames_are_whole_and_the_imu_reaches_them(before):
+    """Also where no sample is of the moment of the image: then the first after it is the last."""
+    bundles, counters = run(recording(10, skew=2 * MS, before=before))
+    assert [b.stamp_ns for b in bundles] == [STEP * i - before for i in range(10)]
     assert [b.index for b in bundles] == list(range(10))
-    for before, b in itertools.pairwise(bundles):
+    for k, b in enumerate(bundles[1:], 1):
         assert b.image0 == f"cam0@{b.stamp_ns}"
         assert b.image1 == f"cam1@{b.stamp_ns + 2 * MS}"
-        assert b.imu.stamps_ns.tolist() == list(range(before.stamp_ns + 5 * MS, b.stamp_ns + 1, 5 * MS))
+        assert b.imu.stamps_ns.tolist() == list(range(STEP * (k - 1) + 5 * MS, STEP * k + 1, 5 * MS))
         assert b.imu.gyro[:, 0].tolist() == (b.imu.stamps_ns % 1000).tolist()
     assert counters == SequencerCounters(frames=10, imu_samples=10 + 1 + 9 * 10)
+
+
+def test_frames_closer_to_each_other_than_samples():
+    """The second of two frames between the same two samples has none of its own, and none is missing."""
+    times = 2 * MS * np.arange(1, 51)
+    both = in_order(images("cam0", times) + images("cam1", times) + imu(5 * MS * np.arange(21)))
+    bundles, counters = run(both, rate=500.0)
+    given = -1
+    for b in bundles:
+        first = -(-b.stamp_ns // (5 * MS)) * 5 * MS
+        assert b.imu.stamps_ns.tolist() == [s for s in range(given + 1, first + 1) if s % (5 * MS) == 0]
+        given = max(given, first)
+    assert counters == SequencerCounters(frames=50, imu_samples=21)
 
 
 delays = st.lists(st.integers(0, 95 * MS), min_size=400, max_size=400)
 
 
 @settings(max_examples=60, deadline=None)
-@given(delays, st.integers(2, 12), st.integers(-4 * MS, 4 * MS))
-def test_any_bounded_shuffle_gives_the_same_frames(delay, frames, skew):
+@given(delays, st.integers(2, 12), st.integers(-4 * MS, 4 * MS), st.integers(0, 5 * MS - 1))
+def test_any_bounded_shuffle_gives_the_same_frames(delay, frames, skew, before):
     """Within a stream and between streams: no sample is lost, doubled, or in another frame."""
     config = replace(CONFIG, reorder_ms=100.0)
-    ordered = recording(frames, 10**12, skew)
+    ordered = recording(frames, 10**12, skew, before)
     shuffled = [m for _, m in sorted(zip(delay, ordered, strict=False), key=lambda p: p[1].stamp_ns + p[0])]
     assert len(shuffled) == len(ordered)
     expected, counted = run(ordered)
@@ -82,12 +98,16 @@ def test_any_bounded_shuffle_gives_the_same_frames(delay, frames, skew):
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.fixed_dictionaries({s: st.integers(0, 95 * MS) for s in STEREO_IMU}), st.integers(2, 12))
-@example({"cam0": 0, "cam1": 0, "imu": 95 * MS}, 5)
-@example({"cam0": 95 * MS, "cam1": 0, "imu": 0}, 5)
-def test_streams_out_of_step_give_the_same_frames_without_reordering(lag, frames):
+@given(
+    st.fixed_dictionaries({s: st.integers(0, 95 * MS) for s in STEREO_IMU}),
+    st.integers(2, 12),
+    st.integers(0, 5 * MS - 1),
+)
+@example({"cam0": 0, "cam1": 0, "imu": 95 * MS}, 5, 0)
+@example({"cam0": 95 * MS, "cam1": 0, "imu": 0}, 5, 1)
+def test_streams_out_of_step_give_the_same_frames_without_reordering(lag, frames, before):
     """The default serves a live camera: each stream in order, but not in step with the others."""
-    ordered = recording(frames, 10**12)
+    ordered = recording(frames, 10**12, before=before)
     lagged = sorted(ordered, key=lambda m: m.stamp_ns + lag[m.stream])
     assert plain(run(lagged)[0]) == plain(run(ordered)[0])
 
@@ -105,20 +125,22 @@ def test_every_measurement_is_used_or_counted(data):
     stamps = [s for b in bundles for s in b.imu.stamps_ns.tolist()]
     assert stamps == sorted(set(stamps))
     for before, b in itertools.pairwise(bundles):
-        assert ((b.imu.stamps_ns > before.stamp_ns) & (b.imu.stamps_ns <= b.stamp_ns)).all()
+        assert (b.imu.stamps_ns > before.stamp_ns).all()
+        assert (b.imu.stamps_ns[:-1] < b.stamp_ns).all()
 
 
-def test_a_frame_goes_out_as_soon_as_it_is_whole():
+@pytest.mark.parametrize("before", [0, 1, 4 * MS])
+def test_a_frame_goes_out_as_soon_as_it_is_whole(before):
     """No frame waits for the next one: after its last measurement has come, it is out."""
     counters, fed, out = SequencerCounters(), [], []
 
     def feed():
-        for m in recording(5):
+        for m in recording(5, before=before):
             fed.append(m.stamp_ns)
             yield m
 
     out = [(b.stamp_ns, fed[-1]) for b in sequence(feed(), STEREO_IMU, RATE, CONFIG, counters)]
-    assert all(now == stamp for stamp, now in out[:-1])
+    assert all(now == stamp + before for stamp, now in out[:-1])
 
 
 @pytest.mark.parametrize("shift", [20 * MS, -20 * MS, 300 * MS])

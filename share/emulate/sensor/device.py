@@ -143,9 +143,12 @@ class Device:
 
     def _stream(self, rate_hz: float, stream: int) -> Stream:
         """A free-running stream begins somewhere in its first period; a triggered one at the origin."""
-        if self.profile.device.clock.triggered:
-            return Stream(rate_hz, self._origin_ns)
-        return Stream(rate_hz, self._origin_ns + clocks.phase_ns((*self._seed, _PHASE, stream), rate_hz))
+        begin_ns = self._origin_ns
+        if stream == _CAMERA:
+            begin_ns += round(self.effects.camera_phase_ms * 1e6)
+        if not self.profile.device.clock.triggered:
+            begin_ns += clocks.phase_ns((*self._seed, _PHASE, stream), rate_hz)
+        return Stream(rate_hz, begin_ns)
 
     @property
     def _reference_ms(self) -> float:

@@ -38,6 +38,7 @@ class Effects:
     jitter_ms: float = 0.0  # sigma of a picture's stamp
     imu_jitter_ms: float = 0.0  # sigma of an IMU sample's stamp
     time_offset_ms: float = 0.0
+    camera_phase_ms: float = 0.0  # pictures are taken, and stamped, so much later
     clock_offset_ms: float = 0.0
     clock_drift_ppm: float = 0.0
     wrap: bool = False  # stamps wrap as the device's counter does, where it does
@@ -67,6 +68,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "jitter_ms": (0, 20),
     "imu_jitter_ms": (0, 20),
     "time_offset_ms": (-1000, 1000),
+    "camera_phase_ms": (0, 1000),
     "clock_offset_ms": (-1e12, 1e12),
     "clock_drift_ppm": (-1000, 1000),
 }

@@ -149,6 +149,18 @@ def test_time_offset_is_kalibrs_t_imu_is_t_cam_plus_shift():
         assert np.array_equal(pictures.true_ns, pictures.stamp_ns + round(shift * 1e6))
 
 
+@pytest.mark.parametrize("name", ["euroc", "d435i"])
+def test_pictures_are_taken_and_stamped_later_than_the_clock_says_by_their_phase(name):
+    """So that no IMU sample is of the moment of a picture."""
+    whole, later = (
+        Device(profile(name), parse(["none", *more]), (3,), START).pictures(START, START + S)
+        for more in ([], ["camera_phase_ms=1.7"])
+    )
+    common = len(later) - 1
+    assert np.array_equal(later.true_ns[:common], whole.true_ns[:common] + 1_700_000)
+    assert np.array_equal(later.stamp_ns[:common], whole.stamp_ns[:common] + 1_700_000)
+
+
 def test_frames_keep_number_time_and_stamp_whatever_span_is_asked_for():
     effects = parse(["drops=0.2", "drop_burst=2", "jitter_ms=1", "clock_drift_ppm=15", "clock_offset_ms=-3"])
     device = Device(profile("d435i"), effects, (4,), START)
