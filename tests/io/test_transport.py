@@ -26,6 +26,7 @@ from share.io.transport import (
     connect,
     parse_address,
 )
+from share.io.transport.guard import Guard
 from share.io.transport.memory import MemoryNetwork
 from share.io.transport.shaped import ShapedLink, network
 from share.wire.codec import MAX_FRAME_BYTES, encode
@@ -103,6 +104,30 @@ def test_who_sent_a_message_is_known_by_its_key(net: Net) -> None:
     eventually(lambda: agent.send([b"hello"]))
     arrival = eventually(lambda: edge.receive(100))
     assert arrival == Arrival(peer_id(1), [b"hello"], net.agent_key)
+
+
+def test_a_fault_of_the_guard_costs_neither_the_edge_nor_the_guard(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failing = [True]
+    check = Guard._check
+
+    def faulty(guard: Guard, now_s: float) -> int:
+        if failing[0]:
+            raise ZeroDivisionError
+        return check(guard, now_s)
+
+    monkeypatch.setattr(Guard, "_check", faulty)
+    with ExitStack() as stack:
+        net = Net("zmq", stack, tmp_path)
+        edge = net.edge()
+        agent = joined(net, edge)
+        assert eventually(lambda: "guard of connections failed" in " ".join(edge.refusals()))
+        failing[0] = False
+        assert agent.send([b"again"])
+        assert eventually(lambda: heard(edge)) == (peer_id(1), [b"again"])
+        edge.refusals()
+        assert not edge.refusals()
 
 
 def test_without_an_edge_nothing_is_sent_and_nothing_blocks(net: Net) -> None:

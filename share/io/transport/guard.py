@@ -111,7 +111,7 @@ class Guard:
         if time.monotonic() >= due_s and self._turn.acquire(blocking=False):
             try:
                 self._due_s = min(self._due_s, time.monotonic())
-                self._look()
+                self._try_to_look()
             finally:
                 self._turn.release()
 
@@ -162,10 +162,18 @@ class Guard:
         while not self._is_over:
             self._events_ready.poll(wait_ms)
             with self._turn:
-                self._look()
+                self._try_to_look()
                 left_s = max(0.0, self._due_s - time.monotonic())
                 wait_ms = math.ceil(1e3 * left_s) if self._open else None
         self._events.close(linger=0)
+
+    def _try_to_look(self) -> None:
+        """A fault of our own costs this look, and neither the guard nor who receives."""
+        try:
+            self._look()
+        except Exception as error:
+            self._due_s = time.monotonic() + _TICK_MS * 1e-3
+            self._lines.append(f"the guard of connections failed and goes on: {error!r}")
 
     def _look(self) -> None:
         self._is_over = self._is_over or not self._hear()
