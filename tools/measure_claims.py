@@ -127,7 +127,7 @@ def played(made: KeyframeSet, lie: Lie | None, config: Config, seed: int = 0) ->
     room.run((ends_ns - began_ns) * 1e-9 + 3.0)
     apart = [r for r in records if r["event"] in ("set apart", "disputed", "agrees again")]
     runs = mapper.runs
-    names = [runs[name] for name in honest]
+    judged = [runs[name] for name in (made.agents if lie == Lie() else honest)]
     report = room.edge.report(room.mapper.report())
     if report["failed_jobs"]:
         raise ShareError(f"{report['failed_jobs']} jobs of the mapper failed")
@@ -135,8 +135,8 @@ def played(made: KeyframeSet, lie: Lie | None, config: Config, seed: int = 0) ->
         _final(made, mapper, {runs[name]: name for name in honest}),
         _causal(made, room, honest, began_ns),
         _together(room, honest),
-        mapper.doubt(names),
-        mapper.wronged(names),
+        mapper.doubt(judged),
+        mapper.wronged(judged),
         report["agents"][liar]["consistency"]["state"] if lie is not None else "",
         [f"{r['agent']} {r['event']}: {r['reason']}" for r in apart],
     )

@@ -129,7 +129,7 @@ def test_correction_covariance_is_not_too_small() -> None:
     nees = []
     for seed in range(25):
         a, b = Walker("a", 2 * seed, 30), Walker("b", 2 * seed + 1, 30, phase=0.3)
-        atlas = atlas_of(a, b)
+        atlas = atlas_of(a, b, config=replace(CONFIG, enter_m=1.0))  # told however unsure it is
         for x in near_loops(a, b, np.random.default_rng(seed), every=2):
             atlas.propose(x)
         applied = settle(atlas)[-1]

@@ -31,7 +31,9 @@ def tool():
 def room(seed: int):
     """As a `KeyframeSet`: two headsets and a robot walk round, 0.2 m and 250 ms from keyframe to keyframe."""
     place, agents = walls(seed), {}
-    for n, (name, kind) in enumerate((("ann", AgentKind.AR), ("bob", AgentKind.AR), ("eve", AgentKind.ROBOT))):
+    for n, (name, kind) in enumerate(
+        (("ann", AgentKind.AR), ("bob", AgentKind.AR), ("eve", AgentKind.ROBOT))
+    ):
         person = Person(name, place, 1.5 * n, 1000 * seed + 11 * (n + 1), kind)
         keyframes = []
         for k in range(STEPS):
