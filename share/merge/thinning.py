@@ -18,6 +18,8 @@ from share.merge.chart import Chart
 from share.merge.join import Key, Loop
 from share.types import F64
 
+_ROWS = 256
+
 
 @dataclass(frozen=True, eq=False)
 class Link:
@@ -50,7 +52,7 @@ def redundant(poses: F64, may_go: Collection[int], count: int, apart_m: float, a
     np.fill_diagonal(gap, np.inf)
     free = np.zeros(len(poses), bool)
     free[list(may_go)] = True
-    nearest = np.partition(gap, 1, axis=1)[:, :2] if len(poses) > 2 else gap
+    nearest = np.concatenate([_two_least(gap[rows]) for rows in _blocks(len(poses))]) if len(gap) > 2 else gap
     out: list[int] = []
     for _ in range(min(count, int(free.sum()))):
         rank = np.where(free, nearest[:, 0] + 1e-3 * nearest[:, 1], np.inf)
@@ -59,7 +61,7 @@ def redundant(poses: F64, may_go: Collection[int], count: int, apart_m: float, a
         free[gone] = False
         stale = np.flatnonzero(gap[gone] <= nearest[:, 1])
         gap[gone], gap[:, gone] = np.inf, np.inf
-        nearest[stale] = np.partition(gap[stale], 1, axis=1)[:, :2]
+        nearest[stale] = _two_least(gap[stale])
     return out
 
 
@@ -90,9 +92,21 @@ def take_out(chart: Chart, number: int, most_loops: int) -> TakenOut:
 
 
 def _unlike(poses: F64, apart_m: float, apart_rad: float) -> F64:
-    shift, angle = se3.apart(poses, poses)
-    gap: F64 = shift / apart_m + angle / apart_rad
+    gap: F64 = np.empty((len(poses), len(poses)))
+    for rows in _blocks(len(poses)):
+        shift, angle = se3.apart(poses[rows], poses)
+        gap[rows] = shift / apart_m + angle / apart_rad
     return gap
+
+
+def _blocks(count: int) -> list[slice]:
+    """Of rows: what is made on the way for all of thousands at once would take five times the result."""
+    return [slice(k, k + _ROWS) for k in range(0, count, _ROWS)]
+
+
+def _two_least(gap: F64) -> F64:
+    """Of each row, (N, 2)."""
+    return np.partition(gap, 1, axis=1)[:, :2].copy()
 
 
 def _link(chart: Chart, before: int | None, after: int) -> Link:
