@@ -514,6 +514,11 @@ def test_names_that_no_file_could_have(name, room, share, tmp_path):
     assert os.listdir(tmp_path) == []
 
 
+def _not_late(said: str) -> list[str]:
+    """But for what a busy machine adds."""
+    return [line for line in said.splitlines() if " late: this machine is too slow" not in line]
+
+
 def test_an_edge_that_never_answers(room, share, tmp_path):
     """Tracking is what `share track` makes of it, to the last digit; everything is written."""
     config = tmp_path / "quick.yaml"
@@ -521,7 +526,7 @@ def test_an_edge_that_never_answers(room, share, tmp_path):
     done = share(*as_agent(room / "ar1", tmp_path / "out"), "--config", config, *FEW)
     assert done.code == 1
     assert "20 of 20 frames tracked" in done.out
-    assert done.err.splitlines() == [
+    assert _not_late(done.err) == [
         "share agent: no edge answers yet; tracking goes on alone",
         f"share: no edge ever answered at {NOBODY}; is `share edge` running there?",
     ]
@@ -608,7 +613,7 @@ def test_an_agent_whose_disk_is_full_tracks_on(room, tmp_path):
         assert end(server).code == 0
     assert done.code == 1
     odom, in_map = (tmp_path / "out" / f"{name}.tum.partial" for name in ("odom", "map"))
-    assert done.err.splitlines() == [
+    assert _not_late(done.err) == [
         "share agent: connected to the edge",
         *(
             f"share agent: {file}: cannot be written: File too large; the run goes on without it"
@@ -616,7 +621,7 @@ def test_an_agent_whose_disk_is_full_tracks_on(room, tmp_path):
         ),
         f"share: {odom}: is not complete: File too large",
     ]
-    assert sorted(os.listdir(tmp_path / "out")) == [in_map.name, odom.name]
+    assert sorted(os.listdir(tmp_path / "out")) == ["latency.csv.partial", in_map.name, odom.name]
     lines = odom.read_text().splitlines()
     assert len(lines) > 5
     assert {len(line.split()) for line in lines} == {8}

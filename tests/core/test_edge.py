@@ -80,7 +80,7 @@ def test_the_report_counts_what_happened(joined):
     report = joined.edge.report()
     ann = report["agents"]["ann"]
     assert ann["keyframes"] == 24
-    assert ann["state"] == "OK"
+    assert ann["poses"] > 0
     assert report["loops"]["accepted"] == sum(a["loops"]["accepted"] for a in report["agents"].values()) > 0
     assert report["place_ms"]["n"] == 48
     assert report["failed_jobs"] == 0

@@ -142,7 +142,8 @@ def test_an_edge_that_sends_too_much_is_left(said: bytes) -> None:
         assert agent.growth < GROWTH_BYTES
         assert between_s > 0.9
         at_end = agent.end()
-    assert len(at_end["said"]) == 1 and "sends what no edge does" in at_end["said"][0]
+    said_once = {line.partition(" (")[0] for line in at_end["said"]}  # the reason depends on who is sooner
+    assert said_once == {"the edge there sends what no edge does"}
 
 
 def test_it_is_tried_ever_more_rarely() -> None:
