@@ -28,6 +28,7 @@ MAX_KEYPOINTS = 2000  # per keyframe
 MAX_NAME = 64  # characters, of an agent's name
 MAX_MAP_ID = MAX_NAME + 32  # characters: a run's key has at most 17 more than its name, a segment's number 11
 MAX_M = 1e5  # m, of a position or a landmark
+MAX_ODOM_M = 1e4  # m, of odometry from its origin: poses in maps, which are made of several, stay below MAX_M
 MAX_UV = 1e3  # of normalised image coordinates: 89.9 degrees off the axis
 MAX_ID = 2**31 - 1  # of keyframes, frames and revisions: 13 years at 5 Hz
 MAX_SIGMA = 1e6  # of anything, in its unit
@@ -104,15 +105,15 @@ def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
     )
 
 
-def checked_pose(name: str, value: ArrayLike) -> F64:
+def checked_pose(name: str, value: ArrayLike, most_m: float = MAX_M) -> F64:
     """`value` as a read-only rigid transform (4, 4). Raises ValueError if it is not one (1e-3), or if its
-    translation exceeds MAX_M."""
+    translation exceeds `most_m`."""
     T = checked(name, value, (4, 4), np.float64)
     rows = T.tolist()
     if not _is_rigid(*rows):
         raise ValueError(f"{name}: is not a rigid transform")
-    if not max(abs(row[3]) for row in rows) <= MAX_M:
-        raise ValueError(f"{name}: is more than {MAX_M:g} m away")
+    if not max(abs(row[3]) for row in rows) <= most_m:
+        raise ValueError(f"{name}: is more than {most_m:g} m away")
     return T
 
 
@@ -357,9 +358,9 @@ class Keyframe:
             raise ValueError(f"follows: {self.follows} must lie in -1 .. {self.id - 1}")
         _set(
             self,
-            T_ref_body=checked_pose("T_ref_body", self.T_ref_body),
+            T_ref_body=checked_pose("T_ref_body", self.T_ref_body, MAX_ODOM_M),
             cov=checked_cov("cov", self.cov),
-            T_odom_body=checked_pose("T_odom_body", self.T_odom_body),
+            T_odom_body=checked_pose("T_odom_body", self.T_odom_body, MAX_ODOM_M),
             up=checked_up("up", self.up),
             up_sigma=checked_sigma("up_sigma", self.up_sigma),
         )

@@ -14,6 +14,7 @@ import numpy as np
 from share.types import F64, checked_pose
 
 MOST_TIMESHIFT_S = 1.0
+BASELINE_M = (0.005, 2.0)  # of two cameras that see one room
 MOST_PIXELS = 10**8  # of an image: beyond any camera's
 _FOCAL_PX = (1.0, 1e5)  # shorter or longer, and what is divided or multiplied by it is noise
 _MOST_PX = 1e6  # the principal point, which may lie outside the image, from its corner
@@ -190,6 +191,11 @@ class Rig:
             T = getattr(self, name)
             if T is not None:
                 object.__setattr__(self, name, checked_pose(name, T))
+        if self.T_cam1_cam0 is not None and not BASELINE_M[0] <= self.baseline <= BASELINE_M[1]:
+            raise ValueError(
+                f"T_cam1_cam0: the cameras are {self.baseline:g} m apart, not {BASELINE_M[0]:g} to "
+                f"{BASELINE_M[1]:g}; translations are in metres"
+            )
         if not abs(self.timeshift_s) <= MOST_TIMESHIFT_S:
             raise ValueError(f"timeshift_s: {self.timeshift_s} is not within {MOST_TIMESHIFT_S:g} s")
 

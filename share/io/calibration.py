@@ -7,8 +7,9 @@ in docs/data.md.
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -82,7 +83,8 @@ def kalibr(chain: Section, imu: Section | None) -> Calibration:
     )
     if "cam1" in cams:
         T_cam1_cam0 = _kalibr_T_cam1_cam0(cam0, cams["cam1"])
-        rig = replace(rig, cam1=_camera(cams["cam1"]), T_cam1_cam0=T_cam1_cam0)
+        with said_of(cams["cam1"].where):
+            rig = replace(rig, cam1=_camera(cams["cam1"]), T_cam1_cam0=T_cam1_cam0)
     scale = _DEPTH_SCALE
     if "depth" in cams:
         depth = cams["depth"]
@@ -109,6 +111,15 @@ def _serial(section: Section) -> str:
     return found
 
 
+@contextlib.contextmanager
+def said_of(where: str) -> Iterator[None]:
+    """What a rig cannot be is a ConfigError, with where it was found."""
+    try:
+        yield
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from None
+
+
 def read_camera_yaml(path: Path) -> Calibration:
     """camera.yaml of a TUM RGB-D folder: one colour camera and its depth, registered or not."""
     top = read_yaml(path)
@@ -131,7 +142,8 @@ def read_euroc(cam0: Path, cam1: Path | None, imu0: Path | None) -> Calibration:
     if cam1:
         other = read_yaml(cam1)
         T_cam1_cam0 = se3.inverse(other.pose("T_BS")) @ T_b_cam0
-        rig = replace(rig, cam1=_camera(other), T_cam1_cam0=T_cam1_cam0)
+        with said_of(other.where):
+            rig = replace(rig, cam1=_camera(other), T_cam1_cam0=T_cam1_cam0)
     if imu0:
         imu = read_yaml(imu0)
         T_imu_cam0 = se3.inverse(imu.pose("T_BS")) @ T_b_cam0

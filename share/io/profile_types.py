@@ -261,7 +261,10 @@ class Profile:
         base = Rig(cam0=left, T_body_cam0=self.device.T_imu_cam0, imu=noise)
         if not depth:
             T_cam1_cam0 = inverse(self.device.T_imu_cam1) @ self.device.T_imu_cam0
-            return replace(base, cam1=right, T_cam1_cam0=T_cam1_cam0)
+            try:
+                return replace(base, cam1=right, T_cam1_cam0=T_cam1_cam0)
+            except ValueError as error:
+                raise ConfigError(f"profile '{self.name}': {error}") from None
         if self.device.depth is None:
             raise ConfigError(f"profile '{self.name}': its device measures no depth; use stereo, or d435i")
         return replace(base, depth=replace(left, distortion=()), T_depth_cam0=np.eye(4))

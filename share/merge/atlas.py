@@ -348,9 +348,10 @@ class Atlas:
         dropped = chart.drop([n for n in odd if n in chart.ties.loops]) if odd else ()
         tied = self._judge.settle()
         waiting = self._take_surety(job, solution)
-        corrections = self._corrections(job)
+        corrections, failed = self._corrections(job)
         counts = f"{len(solution.numbers)} poses, {len(solution.loop_ids)} loops solved"
         reason = f"map {job.map_id}: {counts}, corrects {', '.join(corrections) or 'nobody'}"
+        reason += "".join(f"; {agent}: {why}" for agent, why in failed.items())
         if dropped:
             reason += f"; dropped loops at odds with it: {', '.join(map(str, dropped))}"
         return Applied(corrections, reason + that_waited(tied), tied, dropped, waiting)
@@ -381,14 +382,20 @@ class Atlas:
         waiting = self._surety.take(job.stretches[0], job.stretches, found)
         return {trails.stretches[s].agent: spread for s, spread in waiting.items()}
 
-    def _corrections(self, job: SolveJob) -> dict[str, Correction]:
-        """For whom the map knows surely enough; those after the newest that was solved hang on it rigidly."""
-        trails, answers, out = self._chart.trails, dict(job.answers), {}
+    def _corrections(self, job: SolveJob) -> tuple[dict[str, Correction], dict[str, str]]:
+        """For whom the map knows surely enough; those after the newest that was solved hang on it rigidly.
+        And of whom a correction would be none, with the reason: that costs nobody else."""
+        trails, answers = self._chart.trails, dict(job.answers)
+        out: dict[str, Correction] = {}
+        failed: dict[str, str] = {}
         for stretch, last in zip(job.stretches, job.last, strict=True):
             agent, cov = trails.stretches[stretch].agent, self._surety.told(stretch, job.stretches[0])
             if cov is None or trails.current(agent) != stretch or last not in trails.nodes:
                 continue  # he waits, or that odometry has ended: nothing is left to correct
             placement, name = self._chart.placement(last), self._chart.name(stretch)
             about, answer = trails.nodes[last].key.id, answers.get(agent, -1)
-            out[agent] = Correction(placement, cov, name, 0, about, answer)
-        return out
+            try:
+                out[agent] = Correction(placement, cov, name, 0, about, answer)
+            except ValueError as error:
+                failed[agent] = f"no correction, {error}"
+        return out, failed

@@ -21,6 +21,7 @@ _SIDE = 2 * HALF + 1
 _AXIS = np.arange(-HALF, HALF + 1, dtype=np.float32)
 OFFSETS: F32 = np.stack(np.meshgrid(_AXIS, _AXIS), axis=-1).reshape(-1, 2)  # (S, 2) px, x and y
 _FLAT = 1e-3  # gray levels: a patch with less contrast is nothing
+_MOST_ROWS = 30_000  # of what cv2.remap gives at a time (SHRT_MAX)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +121,9 @@ def slanted(patches: Patches, error: F32, along: F64) -> tuple[F64, F64]:
 
 def sample(image: U8, x: F32, y: F32) -> F32:
     """Bilinear gray levels at (N, S) places."""
+    if len(x) > _MOST_ROWS:
+        parts = [slice(k, k + _MOST_ROWS) for k in range(0, len(x), _MOST_ROWS)]
+        return np.concatenate([sample(image, x[part], y[part]) for part in parts])
     out: F32 = cv2.remap(
         image,
         np.ascontiguousarray(x),

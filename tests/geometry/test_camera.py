@@ -76,3 +76,12 @@ def test_rig_says_what_it_is():
     stereo = Rig(PLAIN, np.eye(4), cam1=PLAIN, T_cam1_cam0=T)
     assert (stereo.kind, stereo.baseline) == ("stereo", pytest.approx(0.05))
     assert Rig(PLAIN, np.eye(4), depth=PLAIN, T_depth_cam0=np.eye(4)).kind == "rgbd"
+
+
+@pytest.mark.parametrize("metres", [0.0, 0.004, 2.1, 49.999])
+def test_a_baseline_that_is_not_in_metres_is_refused(metres: float) -> None:
+    camera = Camera(640, 480, 385.0, 385.0, 320.0, 240.0)
+    T = np.eye(4)
+    T[0, 3] = -metres
+    with pytest.raises(ValueError, match="T_cam1_cam0: the cameras are .* m apart.*in metres"):
+        Rig(camera, np.eye(4), camera, T)

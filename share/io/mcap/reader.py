@@ -20,7 +20,7 @@ from share.core.whose import of_another
 from share.errors import ConfigError, DataError
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
-from share.io.calibration import Calibration
+from share.io.calibration import Calibration, said_of
 from share.io.losses import Losses
 from share.io.mcap import images as ros_images
 from share.io.mcap import rig as ros_rig
@@ -245,7 +245,8 @@ def _rig_of_messages(file: McapFile, topics: dict[str, str]) -> Rig | None:
     T = {s: tree.find(info.header.frame_id, infos[CAM0].header.frame_id) for s, info in infos.items()}
     if any(pose is None for pose in T.values()):
         raise ConfigError(f"{where}: /tf_static does not say where the cameras sit; give --calib")
-    return Rig(cams[CAM0], np.eye(4), cams.get(CAM1), T.get(CAM1), cams.get(DEPTH), T.get(DEPTH))
+    with said_of(where):
+        return Rig(cams[CAM0], np.eye(4), cams.get(CAM1), T.get(CAM1), cams.get(DEPTH), T.get(DEPTH))
 
 
 def _camera_info(file: McapFile, topic: str) -> Any | None:

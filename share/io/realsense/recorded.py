@@ -126,7 +126,10 @@ def recorded_rig(file: Db3) -> Rig:
     if ACCEL in file.streams and GYRO in file.streams:
         stated = profile(_LIKE).rig()
         rig |= {"imu": stated.imu, "T_body_cam0": stated.T_body_cam0}
-    return Rig(**rig)
+    try:
+        return Rig(**rig)
+    except ValueError as error:
+        raise DataError(f"{file.path}: {error}") from None
 
 
 def _camera(file: Db3, stream: str) -> Camera:
