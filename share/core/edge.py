@@ -174,7 +174,7 @@ class Edge:
             self._record(now_ns, "bad message", peer, reason)
 
     def _heard(self, peer: Peer, now_ns: int) -> None:
-        peer.heard_ns = now_ns
+        peer.heard_ns, peer.was_heard = now_ns, True
         if peer.gone:
             peer.gone = False
             self._effects.append(Present(peer.key, True))

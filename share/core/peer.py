@@ -97,6 +97,7 @@ class Peer:
     gone: bool = False
     newest: Finding | None = None  # the newest correction; who has been away may not have got it
     greeted: bool = True  # in this life of the edge
+    was_heard: bool = True  # likewise
     unsafe: int = 0
 
     @property
@@ -136,7 +137,7 @@ class Peer:
         return {
             "kind": str(self.hello.kind),
             "run": self.key,
-            **self.status.report(now_ns, self.heard_ns),
+            **self.status.report(now_ns, self.heard_ns if self.was_heard else None),
             "gone": self.gone,
             **{name: self.counts[name] for name in _COUNTS},
             "refused_messages": self.refusals.n,

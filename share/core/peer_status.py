@@ -10,6 +10,7 @@ from share.wire.messages import Status
 
 SILENT_S = 0.7  # an agent says something twice a second; after this what it said is not shown as its state
 SILENT = "SILENT"
+_UNHEARD = "not heard since the map was taken up again"
 
 
 class PeerStatus:
@@ -38,8 +39,11 @@ class PeerStatus:
         """It said bye: its silence is no news."""
         self._has_left = True
 
-    def report(self, now_ns: int, heard_ns: int) -> dict[str, Any]:
-        """Plain data. state: SILENT where nothing was heard for SILENT_S. pose_age_ms: None if never told."""
+    def report(self, now_ns: int, heard_ns: int | None) -> dict[str, Any]:
+        """Plain data. state: SILENT where nothing was heard for SILENT_S. pose_age_ms: None if never told.
+        heard_ns: when the agent was last heard; None: not in this life of the edge."""
+        if heard_ns is None:
+            return {"state": SILENT, "reason": _UNHEARD, "pose_age_ms": None, "heard_s": None}
         silent_ns = max(0, now_ns - heard_ns)
         since_ms = max(0, now_ns - self._at_ns) / 1e6
         silent = silent_ns > seconds(SILENT_S) and not self._has_left

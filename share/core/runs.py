@@ -47,7 +47,7 @@ class Runs(Mapping[bytes, Peer]):
         """One of an earlier life: it is not here, but may go on where it was."""
         asked = run.next_keyframe
         peer = Peer(run.hello, run.key, 0, InOrder(asked), asked, run.foot, gone=True, greeted=False)
-        peer.newest = run.finding
+        peer.newest, peer.was_heard = run.finding, False
         self.add(peer_id(run.hello.run_id), peer)
 
     def forget_idle(self) -> tuple[Peer, bool] | None:

@@ -63,6 +63,8 @@ _REPORT_S = 0.1  # so that what is shown of agents is true within a second
 _UNWELL_S = 10.0  # how long a death is trouble
 REFUSALS_SAID = 64  # strangers at the door; more are only counted
 _AT_ONCE = 64  # messages, before anything else is looked after
+_MUTE_S = 5.0  # of the mapper, which says something every second
+_SOLVING_S = 15.0  # of one solution
 _STUCK_S = 1.0  # without a report: what is shown is no longer true
 _DRAIN_S = 0.5  # that the loop waits for the keeper of a life that is over
 
@@ -170,14 +172,25 @@ class EdgeRun:
         self._report_at = now + _REPORT_S
         self._heap.tidy(now)
         disks = [writer.trouble for writer in (self._keeper, self._scribe) if writer is not None]
+        standing = [*disks, self._standstill(now)]
         self._trouble = {text: until for text, until in self._trouble.items() if now < until}
         self._report = {
             **self._machine.report(self._mapped),
             "refused_handshakes": self._refused.total(),
-            "trouble": [*self._trouble, *(text for text in disks if text is not None)],
+            "trouble": [*self._trouble, *(text for text in standing if text is not None)],
             "uptime_s": round((time.monotonic_ns() - self._began_ns) * 1e-9, 3),
             **({} if self._solved_at is None else {"last_solve_s": round(now - self._solved_at, 3)}),
         }
+
+    def _standstill(self, now: float) -> str | None:
+        """Which process does not go on though it is alive, if one does not."""
+        if self._mapping is None or self._mapped_at is None:
+            return None
+        if (mute_s := now - self._mapped_at) > _MUTE_S:
+            return f"the mapper has not answered for {mute_s:.0f} s: no corrections meanwhile"
+        if (solving_s := self._solving_s + mute_s) > _SOLVING_S:
+            return f"the solver has been at one solution for {solving_s:.0f} s: no corrections meanwhile"
+        return None
 
     def _begin(self, after_s: float = 0.0) -> None:
         """A new life: agents notice by its number, and send again what it lacks.
@@ -186,6 +199,8 @@ class EdgeRun:
         """
         self._mapped: dict[str, Any] = {}
         self._solved_at: float | None = None
+        self._mapped_at: float | None = None  # when the mapper last said something
+        self._solving_s = 0.0  # at that time
         self._mapping: Companion | None = None
         self._keeper: Keeper | None = None
         self._trackers = Trackers(self._settings, self._answered)
@@ -250,6 +265,7 @@ class EdgeRun:
                     if _solved(mapped.report) > _solved(self._mapped):
                         self._solved_at = time.monotonic()
                     self._mapped = mapped.report
+                    self._mapped_at, self._solving_s = time.monotonic(), mapped.solving_s
                 case _Said() as said:
                     self._say(said.event, said.text)
                 case Restored():

@@ -35,9 +35,11 @@ class Restore:
 
 @dataclass(frozen=True)
 class Mapped:
-    """The mapper's report, now and then, and at the end."""
+    """The mapper's report, every second, and at the end. solving_s: for how long the solver has been at what
+    it does now."""
 
     report: dict[str, Any]
+    solving_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,7 @@ class _Mapping:
         self._solver = self._new_solver(0.0)
         self._is_restoring = False
         self._solving: Solve | None = None
+        self._solving_since = 0.0
         self._findings: list[Finding] = []
         self._report_at = self._poses_at = 0.0
         self._is_moved = False
@@ -146,7 +149,7 @@ class _Mapping:
     def _give_solver(self) -> None:
         step = self._guarded("solve", self._mapper.next_solve, None)
         if step is not None:
-            self._solving = step
+            self._solving, self._solving_since = step, time.monotonic()
             self._solver.send(step)
 
     def _solved(self, result: object, ms: float) -> None:
@@ -182,7 +185,8 @@ class _Mapping:
             self._findings = []
         if time.monotonic() >= self._report_at:
             self._report_at = time.monotonic() + _REPORT_S
-            self._answer(Mapped(self._mapper.report()))
+            solving_s = 0.0 if self._solving is None else time.monotonic() - self._solving_since
+            self._answer(Mapped(self._mapper.report(), solving_s))
             self._heap.tidy(time.monotonic())
 
 

@@ -8,6 +8,7 @@ from model_edge import MS, S
 from share.config import Config
 from share.core.edge import Edge
 from share.core.edge_events import Received, Tick
+from share.core.peer import Known
 from share.core.peer_status import PeerStatus
 from share.types import TrackState
 from share.wire import messages as wire
@@ -45,6 +46,18 @@ def test_a_pose_ends_the_reason_for_having_none() -> None:
 def test_before_it_has_said_anything_no_age_is_shown() -> None:
     report = PeerStatus().report(9 * S, 9 * S)
     assert (report["state"], report["pose_age_ms"]) == ("INITIALISING", None)
+
+
+def test_who_was_not_heard_in_this_life_has_no_age() -> None:
+    """The clock of the machine began long before the edge."""
+    known = Known("ann-000b", hello_of("ann", 1), None, 0)
+    edge = Edge(Config(), session=5, known=[known])
+    edge.handle(Tick(), 6600 * S)
+    seen = shown(edge)
+    assert (seen["state"], seen["heard_s"], seen["gone"]) == ("SILENT", None, True)
+    assert "not heard since" in str(seen["reason"])
+    edge.handle(Received(wire.peer_id(1), encode(hello_of("ann", 1))), 6601 * S)
+    assert shown(edge)["heard_s"] == 0.0
 
 
 def edge_with(status: wire.Status, at_ns: int) -> Edge:

@@ -7,9 +7,10 @@ import pytest
 
 from share.core.whose import as_read, of_another, unused
 from share.geometry.camera import Camera, ImuNoise, Rig
+from share.geometry.se3 import compose
 
 LENS = Camera(640, 480, 385.0, 385.0, 320.0, 240.0)
-STEREO = Rig(LENS, np.eye(4), cam1=LENS, T_cam1_cam0=np.eye(4))
+STEREO = Rig(LENS, np.eye(4), cam1=LENS, T_cam1_cam0=compose(np.eye(3), np.array([-0.05, 0, 0])))
 ALL = replace(STEREO, depth=LENS, T_depth_cam0=np.eye(4))
 RGBD = replace(ALL, cam1=None, T_cam1_cam0=None)
 

@@ -283,6 +283,6 @@ def test_a_camera_that_sits_elsewhere_is_told_and_found(walk, tracked):
 
 def test_what_it_cannot_track_is_refused():
     camera = Camera(640, 480, 385.0, 385.0, 319.5, 239.5)
-    stereo = Rig(camera, np.eye(4), cam1=camera, T_cam1_cam0=np.eye(4))
+    stereo = Rig(camera, np.eye(4), cam1=camera, T_cam1_cam0=se3.compose(np.eye(3), np.array([-0.05, 0, 0])))
     with pytest.raises(ValueError, match="IMU"):
         InertialTracker(stereo, InertialConfig(), TrackerConfig())

@@ -83,5 +83,5 @@ def test_a_baseline_that_is_not_in_metres_is_refused(metres: float) -> None:
     camera = Camera(640, 480, 385.0, 385.0, 320.0, 240.0)
     T = np.eye(4)
     T[0, 3] = -metres
-    with pytest.raises(ValueError, match="T_cam1_cam0: the cameras are .* m apart.*in metres"):
+    with pytest.raises(ValueError, match=r"T_cam1_cam0: the cameras are .* m apart.*in metres"):
         Rig(camera, np.eye(4), camera, T)

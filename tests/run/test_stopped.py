@@ -8,9 +8,11 @@ import os
 import random
 import signal
 import time
+import urllib.error
+import urllib.request
 
 import pytest
-from children import start_agent, start_edge
+from children import Child, start_agent, start_edge
 from crowd import crowd
 from test_edge_killed import FOUND_S, check_map, family, start, until
 
@@ -80,4 +82,26 @@ def test_agents_are_killed_again_and_again(tmp_path, plain_session):
     assert report["protocol"]["open"] == 0
     assert "Traceback" not in edge.said
     assert edge.process.poll() is None
+    assert edge.interrupt() == 0
+
+
+def test_a_mapper_that_stands_still_is_said(tmp_path):
+    """It is alive, and nothing else would tell: no keyframe waits in the front."""
+    edge = Child(tmp_path / "edge.log", "edge", "--bind", "tcp://127.0.0.1:0", "--http", "0")
+    address = edge.wait_for(r"status at (\S+)/")[1]
+
+    def trouble() -> list[str]:
+        try:
+            with urllib.request.urlopen(f"{address}/health", timeout=5) as answer:
+                return json.loads(answer.read())["trouble"]
+        except urllib.error.HTTPError as error:  # 503: unwell
+            return json.loads(error.read())["trouble"]
+
+    time.sleep(3.0)
+    assert trouble() == []
+    pid = family(edge.process.pid)["mapper"]
+    os.kill(pid, signal.SIGSTOP)
+    until("it is said", lambda: any("the mapper has not answered for" in text for text in trouble()))
+    os.kill(pid, signal.SIGCONT)
+    until("it is over", lambda: trouble() == [])
     assert edge.interrupt() == 0

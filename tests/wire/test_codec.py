@@ -23,7 +23,8 @@ from share.wire import messages as m
 POSE = np.eye(4)
 V = codec.VERSION
 CAMERA = Camera(752, 480, 458.0, 457.0, 367.0, 248.0, (-0.28, 0.07, 2e-4, 1.8e-5))
-STEREO = Rig(CAMERA, POSE, CAMERA, POSE, imu=ImuNoise(1.7e-4, 2e-3, 2e-5, 3e-3, 200.0), timeshift_s=0.01)
+BESIDE = np.block([[np.eye(3), np.array([[-0.05], [0], [0]])], [0, 0, 0, 1]])
+STEREO = Rig(CAMERA, POSE, CAMERA, BESIDE, imu=ImuNoise(1.7e-4, 2e-3, 2e-5, 3e-3, 200.0), timeshift_s=0.01)
 EVERY_CLASS = {*m.Up.__args__, *m.Down.__args__}
 
 

@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from share.geometry import se3
-from share.geometry.camera import MOST_TIMESHIFT_S, Camera, ImuNoise, Rig
+from share.geometry.camera import BASELINE_M, MOST_TIMESHIFT_S, Camera, ImuNoise, Rig
 from share.types import (
     MAX_ID,
     MAX_M,
+    MAX_ODOM_M,
     MAX_STAMP_NS,
     AgentKind,
     Correction,
@@ -35,9 +36,9 @@ ups = st.sampled_from([(0, 0, 0), (0, 0, 1), (0.6, 0, -0.8)]).map(lambda up: np.
 
 
 @st.composite
-def poses(draw: st.DrawFn) -> np.ndarray:
+def poses(draw: st.DrawFn, most_m: float = MAX_M) -> np.ndarray:
     rotation = draw(hnp.arrays(np.float64, 3, elements=st.floats(-3, 3)))
-    position = draw(hnp.arrays(np.float64, 3, elements=near))
+    position = draw(hnp.arrays(np.float64, 3, elements=st.floats(-most_m, most_m)))
     return se3.compose(se3.so3_exp(rotation), position)
 
 
@@ -57,7 +58,7 @@ def keyframes(draw: st.DrawFn) -> Keyframe:
     id_ = draw(ids)
     reference = draw(st.integers(-1, id_ - 1))
     follows = draw(st.integers(reference, id_ - 1))
-    motion = draw(poses()), draw(covs), draw(poses())
+    motion = draw(poses(MAX_ODOM_M)), draw(covs), draw(poses(MAX_ODOM_M))
     return Keyframe(
         id_, reference, draw(stamps), *motion, draw(ups), draw(st.floats(0, 10)), draw(views()), follows
     )
@@ -95,7 +96,9 @@ def tracked(draw: st.DrawFn) -> m.Tracked:
 
 @st.composite
 def rigs(draw: st.DrawFn) -> Rig:
-    cam1, depth = (draw(st.none() | st.tuples(cameras, poses())) or (None, None) for _ in range(2))
+    beside = poses(BASELINE_M[1] / 2).filter(lambda T: np.linalg.norm(T[:3, 3]) > BASELINE_M[0])
+    cam1 = draw(st.none() | st.tuples(cameras, beside)) or (None, None)
+    depth = draw(st.none() | st.tuples(cameras, poses())) or (None, None)
     shift_s = draw(st.floats(-MOST_TIMESHIFT_S, MOST_TIMESHIFT_S))
     return Rig(draw(cameras), draw(poses()), *cam1, *depth, draw(st.none() | imus), shift_s)
 
