@@ -7,7 +7,8 @@ from typing import Any
 from share.core.edge_events import Record
 from share.core.throttle import Throttle
 
-_HZ, _BURST = 1.0, 20.0  # records of one kind that one agent can cause
+_HZ, _BURST = 1.0, 20.0  # records of one kind that one agent can cause,
+_LASTING_HZ, _LASTING_BURST = 1 / 60, 200.0  # and those if it goes on causing them
 
 
 class Records:
@@ -15,7 +16,7 @@ class Records:
 
     def __init__(self, began_ns: int | None) -> None:
         self._began_ns = began_ns
-        self._throttle = Throttle(_HZ, _BURST)
+        self._throttle, self._lasting = Throttle(_HZ, _BURST), Throttle(_LASTING_HZ, _LASTING_BURST)
 
     def begin(self, now_ns: int) -> None:
         """An event has come."""
@@ -32,6 +33,9 @@ class Records:
     def seldom(self, now_ns: int, what: str, agent: str | None, reason: str, **fields: Any) -> Record | None:
         """None where so many of this kind and agent have just been written; the next one counts them."""
         held_back = self._throttle.admit((what, agent), now_ns)
+        if held_back is None:
+            return None
+        held_back = self._lasting.admit((what, agent), now_ns, held_back)
         if held_back is None:
             return None
         more = f" (and {held_back} more since the last line)" if held_back else ""
