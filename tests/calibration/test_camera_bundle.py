@@ -97,6 +97,7 @@ def test_with_corners_of_one_weight_it_is_opencvs_solution(
     assert np.abs(difference / solution.sigmas).max() < 0.01
 
 
+@pytest.mark.slow
 def test_its_sigmas_are_honest() -> None:
     nees = []
     for seed in range(12):

@@ -65,6 +65,7 @@ def test_what_five_minutes_do_not_tell_is_said(share, table, tmp_path):
     assert report == json.loads((tmp_path / "imu-report.json").read_text())
 
 
+@pytest.mark.slow
 def test_inflated_noise_is_written_and_said(share, table, tmp_path):
     share("calibrate", "imu", table, "--out", tmp_path / "one")
     share("calibrate", "imu", table, "--out", tmp_path / "two", "--inflate", "2")

@@ -82,6 +82,7 @@ def test_csv_and_tum_are_read_alike(room):
     assert np.array_equal(tum.stamps_ns, csv.stamps_ns) and np.allclose(tum.T, csv.T, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "order"), [("mocap.tum", [0, 1, 2, 3, 7, 4, 5, 6]), ("mocap.csv", [0, 1, 2, 3, 5, 6, 7, 4])]
 )

@@ -123,6 +123,7 @@ def test_the_session_is_as_others_are(room, made):
         np.testing.assert_allclose(source.rig.T_body_cam0, was.rig.T_body_cam0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_it_is_played_and_scored_as_with_the_real_truth(share, room, made, tmp_path):
     """The errors that are told differ from those of the same poses against the real truth by what the truths
     differ. bob comes 3 s later: it lasts until he is through."""

@@ -233,6 +233,7 @@ def test_a_room_that_is_damaged(content, emulate, tmp_path):
 # ------------------------------------------------------------------ machines that cannot
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up(small, tmp_path):
     """No file may grow beyond 500 kB: chunks keep within, the recording does not."""
 

@@ -193,6 +193,7 @@ def test_a_command_that_is_ended_leaves_nothing_that_looks_whole(tmp_path):
     assert only_unfinished(tmp_path)
 
 
+@pytest.mark.slow
 def test_after_ctrl_c_the_same_command_goes_on_where_it_was(tmp_path):
     from share.emulate.demo import recipe
     from share.emulate.session import cached_session

@@ -56,6 +56,7 @@ def rows_of(out: Path) -> dict[tuple[str, str], dict[str, str]]:
     return {(row["recording"], row["tracker"]): row for row in rows}
 
 
+@pytest.mark.slow
 def test_all_are_scored_alike_and_kept(compare, plain_session, tmp_path):
     out = tmp_path / "compared"
     arguments = (plain_session, "--peer", f"basalt={idler(tmp_path)}", "--out", out)

@@ -12,6 +12,7 @@ from share.metrics.local_error import LocalError
 from share.train.label_file import read_labels
 
 
+@pytest.mark.slow
 def test_labels_of_a_session(share, plain_session, tmp_path):
     out = tmp_path / "labels"
     arguments = ("train", "labels", plain_session, "--runs", 2, "--workers", 1, "--out", out)

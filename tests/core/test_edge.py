@@ -264,6 +264,7 @@ def test_under_load_keyframes_are_kept_but_not_looked_up():
     assert 80 - skipped - report["place_ms"]["n"] <= slow.config.edge.max_waiting + 2
 
 
+@pytest.mark.slow
 def test_maps_that_came_all_at_once_are_joined_at_leisure():
     """As after an outage: most is passed over when it comes, and looked up later."""
     both, mapper = town(), Mapper(Config())

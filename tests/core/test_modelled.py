@@ -44,6 +44,7 @@ def late_ms(room: World) -> tuple[float, float]:
     return everyone, told["ann"]["corrected_ms"]["mean"]
 
 
+@pytest.mark.slow
 def test_agents_are_joined_corrected_and_as_late_as_with_a_real_mapper() -> None:
     model = played()
     report = model.edge.report(model.mapper.report())

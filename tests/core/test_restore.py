@@ -126,6 +126,7 @@ def test_a_headset_keeps_its_place_and_a_map_its_founder(
     assert list(second.mapper.report()["maps"]) == [founder]
 
 
+@pytest.mark.slow
 def test_maps_that_meet_only_in_a_second_life_are_joined_as_in_the_first(tmp_path: Path) -> None:
     """The robot's to the headset's, though it is older."""
     config = Config()

@@ -133,6 +133,7 @@ def test_provenance_tells_how_to_make_it_again(whole, recipe):
 # ------------------------------------------------------------------ same recipe, same bytes
 
 
+@pytest.mark.slow
 def test_one_worker_makes_the_same_bytes(whole, recipe, tmp_path):
     alone = make_session(recipe, tmp_path / "other name", workers=1)
     assert files(alone) == files(whole)
@@ -160,6 +161,7 @@ def test_the_digest_follows_files_that_the_user_edits(small, tmp_path):
 # ------------------------------------------------------------------ breaks
 
 
+@pytest.mark.slow
 def test_what_a_kill_leaves_is_used_and_the_result_is_the_same(whole, recipe, small, tmp_path):
     out, grows = tmp_path / "session", tmp_path / ".session.partial"
     words = ["--scene", "plain", "--seconds", "3", "--seed", "5", "--workers", "1", "--profile", str(small)]
@@ -250,6 +252,7 @@ def test_depth_does_not_fit_an_asl_folder(recipe, tmp_path):
     assert os.listdir(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_faults_of_clocks_and_cables(small, tmp_path):
     """Drops, jitter, a camera that is stamped late, and two clocks that differ from the session's."""
     effects = ("drops=0.2", "jitter_ms=4", "time_offset_ms=30", "clock_offset_ms=1500", "blur=off")
@@ -290,6 +293,7 @@ def test_a_counter_that_wraps_keeps_its_order(small, tmp_path):
     assert unwrapped[0] - start < 10**8
 
 
+@pytest.mark.slow
 def test_where_the_truth_has_a_gap_there_is_no_picture(small, tmp_path):
     stamps = START_NS + np.arange(0, 4 * 10**9, 10**7)
     gap = (stamps[150], stamps[230])

@@ -56,6 +56,7 @@ def slow(seed):
     return pytest.param(seed, marks=marks + [pytest.mark.xfail(reason="5.7 mm", strict=True)] * (seed == 5))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *map(slow, range(1, 6))])
 def test_it_finds_where_its_camera_sits_and_when_it_looks(seed):
     left = run(seed, wrong(seed, 1.0)).extrinsics[-1]

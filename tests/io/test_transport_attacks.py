@@ -346,6 +346,7 @@ def test_a_flood_of_connections_that_say_nothing(front: Front, number: int) -> N
     assert took_s < 3.0 and len(said["said"]) < 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "beginning",
     [b"", b"\xff", greeting()[:40], greeting(), greeting() + ready(b"12345678")[:9]],

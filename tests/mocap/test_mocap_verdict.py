@@ -48,6 +48,7 @@ def found_in(mocap: Mocap, options: FitOptions = NEAR) -> Aligned:
     return align(record_imu(Motion(3), SECONDS), NOISE, mocap, options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("span", [(11.5, 40.0), (0.0, 4.5), (6.0, 10.0)])
 def test_markers_swapped_for_seconds_pull_nowhere_and_leave_no_truth(span) -> None:
     found = found_in(swapped(record_mocap(Motion(3), SECONDS), *span))
@@ -96,6 +97,7 @@ class Level(Motion):
         return T
 
 
+@pytest.mark.slow
 def test_a_mirrored_axis_along_which_little_goes_is_refused_too() -> None:
     """The path comes together all the same, and would be centimetres off."""
     coarse = replace(NEAR, sigma_position=0.01)
@@ -113,6 +115,7 @@ def test_the_scale_of_each_axis_is_found_within_its_sigma() -> None:
     np.testing.assert_array_less(np.abs(fit.too_long - (0.03, -0.02, 0.0)), 4 * fit.too_long_sigma)
 
 
+@pytest.mark.slow
 def test_noise_that_was_not_said_is_asked_for() -> None:
     mocap = record_mocap(Motion(3), SECONDS, sigma=(0.008, np.radians(0.2)))
     with pytest.raises(MisfitError, match=r"1[34]\.[0-9] mm rms are left, 3\.[0-9]+ times .* \(--sigma-mm\)"):

@@ -88,6 +88,7 @@ def test_stereo_keyframes_query_and_verification(euroc: Seen, kitchen: Seen) -> 
     assert np.median(errors, axis=0)[0] < 0.03
 
 
+@pytest.mark.slow
 def test_stereo_keyframes_every_pair(euroc: Seen) -> None:
     n = len(euroc.sights)
     found = accepted(euroc, ((q, c) for q in range(n) for c in range(q)))

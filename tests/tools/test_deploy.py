@@ -174,6 +174,7 @@ def test_a_release_that_does_not_run_is_taken_back_though_nobody_looks_on(device
     assert [line for line in device.asked() if "restart" in line] == ["systemctl restart share-agent@ann"] * 2
 
 
+@pytest.mark.slow
 def test_a_service_that_fails_where_only_the_program_was_is_said_to_be_gone(device):
     program = device.program("1.0", "broken")
     assert device.deploy("program", dist=program).code == 0
@@ -183,6 +184,7 @@ def test_a_service_that_fails_where_only_the_program_was_is_said_to_be_gone(devi
     assert "systemctl disable --now share-agent@ann" in device.asked()
 
 
+@pytest.mark.slow
 def test_a_second_service_that_fails_leaves_the_first_one_running(device):
     program = device.program("1.0")
     assert device.deploy("edge", dist=program).code == 0
@@ -195,6 +197,7 @@ def test_a_second_service_that_fails_leaves_the_first_one_running(device):
     assert [line for line in asked if "restart" in line][-1] == "systemctl restart share-edge"
 
 
+@pytest.mark.slow
 def test_back_by_hand_and_forth_again(device):
     device.agent(device.program("1.0"))
     device.agent(device.program("1.1"))
@@ -204,6 +207,7 @@ def test_back_by_hand_and_forth_again(device):
         assert f"{version}-" in done.out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "profile"), [("ar", "d435i-n100-headset"), ("robot", "d435i-turtlebot4"), (None, "laptop-edge")]
 )
@@ -241,6 +245,7 @@ def test_back_without_a_release_before_is_one_line(device):
     assert (done.code, done.err) == (1, "deploy: there is no previous release to go back to\n")
 
 
+@pytest.mark.slow
 def test_only_the_newest_releases_stay(device):
     for version in ("1.0", "1.1", "1.2", "1.3"):
         assert device.agent(device.program(version), "--keep", 2).code == 0

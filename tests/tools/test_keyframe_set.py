@@ -51,6 +51,7 @@ def made(tool, recipe, every, cache):
     return tool("keyframe_set").keyframe_set(recipe, every, cache)
 
 
+@pytest.mark.slow
 def test_views_and_truth_are_the_recordings(made, recipe, tmp_path):
     session = make_session(recipe, tmp_path / "session", workers=1)
     for name, kind in NAMES.items():

@@ -22,6 +22,7 @@ def recorded(tmp_path):
     return tmp_path / "head.tum"
 
 
+@pytest.mark.slow
 def test_a_recording_two_people_and_a_robot_in_a_warehouse(warehouse, recorded):
     specs = ["walk:", f"rec=tum:{recorded}", "bob=walk:speed=0.7", "robot:"]
     found = plan(specs, warehouse, 10.0, 4)

@@ -91,6 +91,7 @@ def test_a_room_without_a_way_says_so(monkeypatch):
         crowd(tight, members, [], np.zeros((0, 3)), 6.0, (1,))
 
 
+@pytest.mark.slow
 def test_an_experiment_of_the_paper_has_the_papers_lengths():
     members = paper.members(2)
     paths = crowd(Ground(floor()), members, [], np.array([[1.0, 1.0, 1.0]]), paper.SECONDS, (1,))

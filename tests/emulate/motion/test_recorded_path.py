@@ -122,6 +122,7 @@ def test_an_asl_folder_gives_the_same(euroc: Recording, shared_data: Path, tmp_p
     assert same.noise == n
 
 
+@pytest.mark.slow
 def test_tumvis_own_folder_is_read_as_raw_mocap(shared_data: Path, tmp_path: Path) -> None:
     plain, root = shared_data / "motion/tumvi/room1", tmp_path / "dataset-room1"
     for name, file in (("imu0", "imu0.csv"), ("mocap0", "groundtruth.csv"), ("cam0", "cam_timestamps.txt")):

@@ -53,6 +53,7 @@ def blurred(k: int, count: int, speed: float = 0.04):
     ]
 
 
+@pytest.mark.slow
 def test_blur_converges(boxes):
     """To the mean of many supersampled moments; 15 px of blur."""
     reference = np.mean([boxes.radiance(D435I, [m]) for m in blurred(0, 64)], axis=0)

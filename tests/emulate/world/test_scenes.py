@@ -119,6 +119,7 @@ def test_one_can_walk_round_in_every_small_room(name: str) -> None:
         assert connected > 0.97, seed
 
 
+@pytest.mark.slow
 def test_a_large_warehouse_holds_more_things_not_larger_ones() -> None:
     small, large = rooms("warehouse")[1], layout("warehouse", 1, (18, 12, 6))
     racks = [[p for p in room.pieces if p.name.startswith("rack")] for room in (small, large)]
