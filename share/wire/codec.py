@@ -7,6 +7,7 @@ Nothing is allocated for a declared size before the bytes that fill it are seen 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -345,9 +346,16 @@ def size(frames: Sequence[Bytes]) -> int:
     return sum([memoryview(frame).nbytes for frame in frames])
 
 
+# msgspec quotes a value as it came, so that it could go on as if it were our own words.
+_QUOTED = re.compile("'(.*)'", re.DOTALL)
+_MOST_QUOTED = 40  # characters
+
+
 def _wire_error(where: str, error: Exception) -> WireError:
-    """One short printable line: parts of `error` may be the peer's own text."""
-    line = "".join(c if c.isprintable() else "?" for c in f"{where}: {error}")
+    """One short printable line: what of `error` is the peer's own text is cut, and quoted so that its end is
+    seen."""
+    told = _QUOTED.sub(lambda found: repr(found[1][:_MOST_QUOTED]), str(error))
+    line = "".join(c if c.isprintable() else "?" for c in f"{where}: {told}")
     return WireError(line[:200])
 
 
