@@ -197,7 +197,8 @@ def test_infinite_points_and_disagreeing_lengths_are_refused() -> None:
     [
         ("OK; agent 'hope': lost", """PoseUpdate: Invalid enum value "OK; agent 'hope': lost" - at `$[1]`"""),
         ("OK' - at `$[1]`; agent", """PoseUpdate: Invalid enum value "OK' - at `$[1]`; agent" - at `$[1]`"""),
-        ("x" * 100, f"PoseUpdate: Invalid enum value '{'x' * 40}' - at `$[1]`"),
+        ("x'" * 60, f"""PoseUpdate: Invalid enum value "{"x'" * 19}x…" - at `$[1]`"""),
+        ("x" * 100, f"PoseUpdate: Invalid enum value '{'x' * 39}…' - at `$[1]`"),
         ("\u2028x\n", r"PoseUpdate: Invalid enum value '\u2028x\n' - at `$[1]`"),
     ],
 )
