@@ -8,7 +8,6 @@ import pytest
 from hellos import hello_of
 
 from share.io.session import is_agent_name
-from share.names import checked_name
 
 
 @pytest.mark.parametrize(
@@ -40,7 +39,7 @@ def test_honest_names(name: str) -> None:
 )
 def test_names_that_are_none(name: str) -> None:
     with pytest.raises(ValueError, match=r"^name: .*; use 1 to 64 letters, digits") as refused:
-        checked_name(name)
+        hello_of(name, 1)
     assert str(refused.value).isprintable()
     assert len(str(refused.value)) < 140
     assert not is_agent_name(name)
