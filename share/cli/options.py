@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from unicodedata import normalize
 
 import click
 
@@ -88,12 +89,13 @@ def load_config(path: str | None) -> Config:
 
 
 def agent_name(value: str) -> str:
-    """A name that can be a file's. Raises UsageError."""
+    """A name that can be a file's, as Unicode composes it (NFC). Raises UsageError."""
     from share.io.session import AGENT_NAME, is_agent_name
 
-    if not is_agent_name(value):
-        raise UsageError(f"--name '{value}': use {AGENT_NAME}")
-    return value
+    name = normalize("NFC", value)
+    if not is_agent_name(name):
+        raise UsageError(f"--name {value[:80]!r}: use {AGENT_NAME}")
+    return name
 
 
 def by_name(option: str, words: tuple[str, ...]) -> dict[str, str]:

@@ -3,12 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from math import ceil
 
 from share.config import EdgeConfig
 from share.core.edge_events import Received
 from share.core.peer import Peer
-from share.core.rate import seconds
+from share.core.rate import TokenBucket, seconds
 from share.wire.messages import Hello, public_tag
+
+# New runs that are taken in: each stays in the report, and in the map once it has a keyframe. Of one name as
+# many as somebody starts who tries things out; of all names, two full rooms at once.
+_NAME_BURST, _NAME_HZ = 8.0, 0.1
+_EDGE_BURST, _EDGE_HZ = 128.0, 2.0
+
+
+class Newcomers:
+    """How often new runs may come, of each name and of the whole edge."""
+
+    def __init__(self) -> None:
+        self._all = _bucket(_EDGE_BURST, _EDGE_HZ)
+        self._of_name: dict[str, TokenBucket] = {}
+
+    def objection(self, name: str, now_ns: int) -> str | None:
+        """Why no new run of this name may come now, and when one may; None if one may."""
+        of_name = self._of_name.get(name)
+        if of_name is not None and (wait_s := of_name.wait_s(now_ns)):
+            return f"too many new runs of '{name}': try again in {ceil(wait_s)} s"
+        if wait_s := self._all.wait_s(now_ns):
+            return f"too many new runs of all agents: try again in {ceil(wait_s)} s"
+        return None
+
+    def came(self, name: str, now_ns: int) -> None:
+        """A new run of this name, to which there was no objection."""
+        self._of_name = {who: kept for who, kept in self._of_name.items() if not kept.is_full(now_ns)}
+        for bucket in (self._all, self._of_name.setdefault(name, _bucket(_NAME_BURST, _NAME_HZ))):
+            bucket.take(now_ns)
+
+
+def _bucket(burst: float, hz: float) -> TokenBucket:
+    bucket = TokenBucket(burst)
+    bucket.hz = hz
+    return bucket
 
 
 class Admission:
@@ -16,6 +51,7 @@ class Admission:
 
     def __init__(self, config: EdgeConfig, tracks: bool) -> None:
         self._config, self._tracks = config, tracks
+        self._newcomers = Newcomers()
 
     def objection(
         self, event: Received, hello: Hello, peers: Mapping[bytes, Peer], now_ns: int
@@ -30,9 +66,15 @@ class Admission:
         if (known := peers.get(event.peer)) is not None:
             same = known.hello.name == hello.name
             return None if same else f"this run's number is in use by '{known.hello.name}'; start again"
-        return self._no_room(hello, [peer for peer in peers.values() if not peer.gone], now_ns)
+        return self.no_room(hello, peers, now_ns) or self._newcomers.objection(hello.name, now_ns)
 
-    def _no_room(self, hello: Hello, present: Collection[Peer], now_ns: int) -> str | None:
+    def came(self, hello: Hello, now_ns: int) -> None:
+        """This new run was taken in."""
+        self._newcomers.came(hello.name, now_ns)
+
+    def no_room(self, hello: Hello, peers: Mapping[bytes, Peer], now_ns: int) -> str | None:
+        """Why a run that is not present cannot be, beside those that are; None if it can."""
+        present = [peer for peer in peers.values() if not peer.gone]
         for peer in present:
             if peer.hello.name == hello.name and now_ns - peer.heard_ns < seconds(self._config.name_hold_s):
                 return f"the name '{hello.name}' is in use by another agent; choose another with --name"

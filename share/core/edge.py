@@ -124,8 +124,8 @@ class Edge:
         if peer is not None and not event.speaks_for(peer.hello.name):
             self._complain(None, f"a key that does not speak for '{peer.hello.name}' used its run", now_ns)
             return
-        if peer is not None:
-            self._heard(peer, now_ns)
+        if peer is not None and not self._heard(event.peer, peer, message, now_ns):
+            return
         match message:
             case wire.Hello():
                 self._greet(event, message, now_ns)
@@ -173,12 +173,33 @@ class Edge:
         if counts["bad_messages"] == 1:
             self._record(now_ns, "bad message", peer, reason)
 
-    def _heard(self, peer: Peer, now_ns: int) -> None:
-        peer.heard_ns, peer.was_heard = now_ns, True
+    def _heard(self, peer_id: bytes, peer: Peer, message: wire.Message, now_ns: int) -> bool:
+        """Whether it is present now. Who was gone comes back only where its name and a place are free."""
         if peer.gone:
-            peer.gone = False
-            self._effects.append(Present(peer.key, True))
-            self._record_seldom(now_ns, "back", peer, "is heard again")
+            if isinstance(message, wire.Bye):  # said again, or late
+                return False
+            if (reason := self._no_room(peer, now_ns)) is not None:
+                self._refuse(peer_id, reason, now_ns)
+                return False
+            self._come_back(peer, now_ns)
+        peer.heard_ns, peer.was_heard = now_ns, True
+        return True
+
+    def _no_room(self, peer: Peer, now_ns: int) -> str | None:
+        """Why a run that is gone cannot come back; None if it can."""
+        return self._admission.no_room(peer.hello, self._runs, now_ns)
+
+    def _come_back(self, peer: Peer, now_ns: int) -> None:
+        self._supersede(peer.hello.name, now_ns)
+        peer.gone = False
+        self._effects.append(Present(peer.key, True))
+        self._record_seldom(now_ns, "back", peer, "is heard again")
+
+    def _supersede(self, name: str, now_ns: int) -> None:
+        """A run of this name comes: one that is present has been silent for so long that it lost the name."""
+        for other in self._runs.values():
+            if not other.gone and other.hello.name == name:
+                self._gone(other, "silent", "another run has its name now", now_ns)
 
     def _notice_silence(self, now_ns: int) -> None:
         for peer in self._runs.values():
@@ -201,6 +222,8 @@ class Edge:
         if peer_id not in self._runs:
             if (idle := self._runs.forget_idle()) is not None:
                 self._forget(*idle)
+            self._admission.came(hello, now_ns)
+            self._supersede(hello.name, now_ns)
             self._enter(peer_id, Peer(hello, new_key(hello, self._runs.by_key), now_ns))
             self._schedule.begin(hello.name)
             joined = f"{hello.kind} '{hello.name}'"
@@ -224,7 +247,6 @@ class Edge:
 
     def _enter(self, peer_id: bytes, peer: Peer) -> None:
         self._runs.add(peer_id, peer)
-        self._keep(KeepRun(peer.key, peer.hello))
         self._effects.append(Join(peer.key, peer.hello))
 
     def _forget(self, peer: Peer, was_latest: bool) -> None:
@@ -256,6 +278,7 @@ class Edge:
             return []
 
     def _apply(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> None:
+        begins = peer.foot is None
         try:
             keyframe, complaint = peer.place(keyframe)
         except ValueError as error:
@@ -264,7 +287,8 @@ class Edge:
         if complaint:
             self._record_seldom(now_ns, "odometry doubted", peer, complaint)
         assert peer.foot is not None
-        self._keep(KeepKeyframe(peer.key, keyframe))
+        run = (KeepRun(peer.key, peer.hello),) if begins else ()  # no run without a keyframe is kept
+        self._keep(*run, KeepKeyframe(peer.key, keyframe))
         self._effects.append(Add(peer.key, keyframe))
 
     def _keep(self, *changes: Change) -> None:

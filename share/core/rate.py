@@ -55,6 +55,16 @@ class TokenBucket:
         self._tokens -= 1
         return True
 
+    def wait_s(self, now_ns: int) -> float:
+        """How long until one may pass, s; 0: now."""
+        self._refill(now_ns)
+        return 0.0 if self.hz is None else max(0.0, (1 - 1e-9 - self._tokens) / self.hz)
+
+    def is_full(self, now_ns: int) -> bool:
+        """Whether it is as if nothing had ever passed."""
+        self._refill(now_ns)
+        return self.hz is None or self._tokens >= self._burst
+
     def _refill(self, now_ns: int) -> None:
         passed_ns = 0 if self._seen_ns is None else max(0, now_ns - self._seen_ns)
         self._seen_ns = now_ns

@@ -123,13 +123,12 @@ class TrackingEdge(Edge):
         if afar.is_ready:
             super()._welcome(peer_id, peer, now_ns)
 
-    def _heard(self, peer: Peer, now_ns: int) -> None:
-        was_gone = peer.gone
-        super()._heard(peer, now_ns)
-        if was_gone and (reason := self._full(peer.key, peer.hello.rig)) is not None:
-            self._send(self._runs.by_key[peer.key], wire.Refused(reason))
-        elif was_gone:
-            self._do(self._afar[peer.key].begin())
+    def _no_room(self, peer: Peer, now_ns: int) -> str | None:
+        return super()._no_room(peer, now_ns) or self._full(peer.key, peer.hello.rig)
+
+    def _come_back(self, peer: Peer, now_ns: int) -> None:
+        super()._come_back(peer, now_ns)
+        self._do(self._afar[peer.key].begin())
 
     def _gone(self, peer: Peer, what: str, reason: str, now_ns: int) -> None:
         super()._gone(peer, what, reason, now_ns)

@@ -16,6 +16,7 @@ from share.errors import ConfigError, UsageError
 from share.io.calibration import Calibration, kalibr, read_calibration
 from share.io.inside import inside
 from share.io.section import Section, read_yaml
+from share.names import checked_name
 from share.types import AgentKind
 
 SESSION = "session.yaml"
@@ -57,7 +58,11 @@ class Session:
 
 def is_agent_name(text: str) -> bool:
     """Whether it can be an agent's, and so a file's."""
-    return re.fullmatch(r"[\w.-]{1,64}", text) is not None and not text.startswith(".")
+    try:
+        checked_name(text)
+    except ValueError:
+        return False
+    return re.fullmatch(r"[\w.-]+", text) is not None and not text.startswith(".")
 
 
 def is_session(folder: Path) -> bool:

@@ -7,6 +7,7 @@ Nothing is allocated for a declared size before the bytes that fill it are seen 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -132,7 +133,7 @@ class _Array:
 
     def decode(self, dtype: str, shape: tuple[int, ...], frame: Bytes) -> NDArray[Any] | None:
         if dtype not in _DTYPES:
-            raise ValueError(f"{self.path}: unknown dtype '{dtype[:8]}'")
+            raise ValueError(f"{self.path}: unknown dtype {dtype[:8]!r}")
         if dtype != self.dtype or not self._admits(shape):
             raise ValueError(f"{self.path}: {dtype} of shape {shape[:4]}, expected {self.dtype} {self.shape}")
         size = prod(shape) * _DTYPES[dtype].itemsize
@@ -345,9 +346,21 @@ def size(frames: Sequence[Bytes]) -> int:
     return sum([memoryview(frame).nbytes for frame in frames])
 
 
+# A peer's own text in an error, as repr quotes it: of any length, its end would be cut off with the line's.
+_QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""")
+_MOST_QUOTED = 40  # characters
+
+
+def _cut(found: re.Match[str]) -> str:
+    text = found[0]
+    return text if len(text) <= _MOST_QUOTED + 2 else f"{text[:_MOST_QUOTED]}…{text[0]}"
+
+
 def _wire_error(where: str, error: Exception) -> WireError:
-    """One short printable line: parts of `error` may be the peer's own text."""
-    line = "".join(c if c.isprintable() else "?" for c in f"{where}: {error}")
+    """One short printable line: what of `error` is the peer's own text is cut, and quoted so that its end is
+    seen."""
+    told = _QUOTED.sub(_cut, str(error))
+    line = "".join(c if c.isprintable() else "?" for c in f"{where}: {told}")
     return WireError(line[:200])
 
 

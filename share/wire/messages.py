@@ -10,9 +10,9 @@ import hashlib
 from dataclasses import dataclass
 
 from share.geometry.camera import Camera, Rig
+from share.names import checked_name
 from share.types import (
     F64,
-    MAX_NAME,
     AgentKind,
     Correction,
     Frame,
@@ -71,8 +71,7 @@ class Hello:
     streams: bool = False
 
     def __post_init__(self) -> None:
-        if not (0 < len(self.name) <= MAX_NAME and self.name.isprintable() and "/" not in self.name):
-            raise ValueError(f"name: 1 to {MAX_NAME} printable characters without '/'")
+        object.__setattr__(self, "name", checked_name(self.name))
         for camera in (self.rig.cam0, self.rig.cam1, self.rig.depth):
             if camera is not None:
                 _check_camera(camera)

@@ -507,7 +507,7 @@ def test_addresses_that_cannot_be_used(room, share, tmp_path, monkeypatch):
             assert said in complaint(done, 2)
 
 
-@pytest.mark.parametrize("name", ["", "a/b", "../x", ".hidden", "a b", "x" * 65])
+@pytest.mark.parametrize("name", ["", "a/b", "../x", ".hidden", "a b", "x" * 65, "hope\u3164"])
 def test_names_that_no_file_could_have(name, room, share, tmp_path):
     done = share(*as_agent(room / "ar1", tmp_path / "out", name=name))
     assert f"--name '{name}': use 1 to 64 letters" in complaint(done, 2)

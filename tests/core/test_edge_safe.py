@@ -44,11 +44,10 @@ def of(effects: list[ed.Effect], kind: type) -> list:
 
 def test_nothing_is_acknowledged_before_it_is_kept() -> None:
     edge = Edge(Config(), 7, keeps=True)
-    (joined,) = of(tell(edge, HELLO), ed.Keep)
-    assert isinstance(joined.changes[0], KeepRun)
+    tell(edge, HELLO)
     effects = tell(edge, keyframe(0, -1))
     (keep,) = of(effects, ed.Keep)
-    assert isinstance(keep.changes[0], KeepKeyframe)
+    assert [type(change) for change in keep.changes] == [KeepRun, KeepKeyframe]
     assert of(effects, ed.Add)  # the map need not wait for the disk
     assert not acks(effects)
     again = acks(tell(edge, keyframe(0, -1)))

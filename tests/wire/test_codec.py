@@ -193,6 +193,24 @@ def test_infinite_points_and_disagreeing_lengths_are_refused() -> None:
             codec.decode([*frames[:index], frame, *frames[index + 1 :]])
 
 
+@pytest.mark.parametrize(
+    ("state", "said"),
+    [
+        ("OK; agent 'hope': lost", """PoseUpdate: Invalid enum value "OK; agent 'hope': lost" - at `$[1]`"""),
+        ("OK' - at `$[1]`; agent", """PoseUpdate: Invalid enum value "OK' - at `$[1]`; agent" - at `$[1]`"""),
+        ("x'" * 60, f"""PoseUpdate: Invalid enum value "{"x'" * 19}x…" - at `$[1]`"""),
+        ("x" * 100, f"PoseUpdate: Invalid enum value '{'x' * 39}…' - at `$[1]`"),
+        ("\u2028x\n", r"PoseUpdate: Invalid enum value '\u2028x\n' - at `$[1]`"),
+    ],
+)
+def test_what_a_peer_said_is_quoted_and_cut(state: str, said: str) -> None:
+    """So that it cannot go on as if it were the edge's own words."""
+    frames = [header(V, 2, [0, state, -1], [("<f8", (4, 4))]), np.eye(4).tobytes()]
+    with pytest.raises(WireError) as refused:
+        codec.decode(frames)
+    assert str(refused.value) == said
+
+
 # ---------------------------------------------------------------- anything at all
 
 

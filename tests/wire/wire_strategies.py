@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+from unicodedata import normalize
+
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from share.geometry import se3
 from share.geometry.camera import BASELINE_M, MOST_TIMESHIFT_S, Camera, ImuNoise, Rig
+from share.names import checked_name
 from share.types import (
     MAX_ID,
     MAX_M,
@@ -24,13 +28,23 @@ from share.types import (
 )
 from share.wire import messages as m
 
+
+def is_name(text: str) -> bool:
+    try:
+        return checked_name(text) == text
+    except ValueError:
+        return False
+
+
 int64 = st.integers(-(2**63), 2**63 - 1)
 stamps = st.integers(-MAX_STAMP_NS, MAX_STAMP_NS)
 ids = st.integers(0, MAX_ID)
 ids_or_none = st.integers(-1, MAX_ID)
 near = st.floats(-MAX_M, MAX_M)
 finite = st.floats(-1e6, 1e6)
-names = st.text(st.characters(categories=["L", "N"]), min_size=1, max_size=64)
+words = st.text(st.characters(categories=["L", "N"]), min_size=1, max_size=64)
+names = st.text(st.characters(categories=["Lu", "Ll", "Lo", "Nd"]), min_size=1, max_size=64)
+names = names.map(partial(normalize, "NFC")).filter(is_name)
 covs = hnp.arrays(np.float64, (6, 6), elements=st.floats(-1e4, 1e4)).map(lambda A: A @ A.T)
 ups = st.sampled_from([(0, 0, 0), (0, 0, 1), (0.6, 0, -0.8)]).map(lambda up: np.array(up, float))
 
@@ -119,7 +133,7 @@ messages = st.one_of(
     st.builds(m.Welcome, int64, ids),
     st.builds(m.Refused, st.text(st.characters(codec="utf-8"), max_size=m.MAX_TEXT)),
     st.builds(m.Ack, ids, st.lists(ids, max_size=m.MAX_HELD).map(tuple)),
-    st.builds(Correction, poses(), covs, names, ids, ids, ids_or_none),
+    st.builds(Correction, poses(), covs, words, ids, ids, ids_or_none),
     st.builds(m.Rate, st.floats(0, m.MAX_RATE_HZ)),
     st.builds(m.Pong, int64, stamps, stamps, stamps, int64),
     frames(),

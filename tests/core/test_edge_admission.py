@@ -1,0 +1,191 @@
+"""How many runs of agents come in, and which that were gone come back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hellos import hello_of
+
+from share.config import Config
+from share.core import edge_events as ed
+from share.core.admission import Newcomers
+from share.core.edge import Edge
+from share.core.edge_events import Keep
+from share.core.keeping import KeepKeyframe, KeepRun
+from share.core.peer import Foot, Known
+from share.core.tracking_edge import Room, TrackingEdge
+from share.types import AgentKind, Keyframe, View
+from share.wire import messages as m
+from share.wire.codec import decode, encode
+
+S = 1_000_000_000
+EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
+
+
+def keyframe(id: int) -> Keyframe:
+    cov = 1e-6 * np.eye(6)
+    return Keyframe(id, id - 1, 200 * id, np.eye(4), cov, np.eye(4), np.zeros(3), 0.0, EMPTY)
+
+
+def tell(edge: Edge, run_id: int, message: m.Message, now_s: float = 0) -> list[ed.Effect]:
+    frames = [bytes(frame) for frame in encode(message)]
+    return edge.handle(ed.Received(m.peer_id(run_id), frames), round(now_s * S))
+
+
+def come(edge: Edge, name: str, run_id: int, now_s: float = 0) -> list[ed.Effect]:
+    return tell(edge, run_id, hello_of(name, run_id), now_s)
+
+
+def refusal(effects: list[ed.Effect]) -> str | None:
+    messages = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.Send)]
+    return next((message.reason for message in messages if isinstance(message, m.Refused)), None)
+
+
+def of(effects: list[ed.Effect], kind: type) -> list:
+    return [effect for effect in effects if isinstance(effect, kind)]
+
+
+def present(edge: Edge) -> int:
+    return sum(not agent["gone"] for agent in edge.report({})["agents"].values())
+
+
+# ---------------------------------------------------------------- how often
+
+
+def test_runs_of_one_keyframe_do_not_fill_the_edge() -> None:
+    """130 a second of one name for 20 s, which say bye: 8 and one each 10 s are taken in."""
+    edge = Edge(Config(), 7)
+    for k in range(2600):
+        come(edge, "eve", k, k / 130)
+        tell(edge, k, keyframe(0), k / 130)
+        tell(edge, k, m.Bye(), k / 130)
+    assert len(edge.report({})["agents"]) == 9
+    assert refusal(come(edge, "ann", -1, 20)) is None  # others come as before
+
+
+def test_who_comes_too_often_is_told_why_and_when_to_try_again() -> None:
+    edge = Edge(Config(), 7)
+    for k in range(8):
+        assert refusal(come(edge, "eve", k, 1)) is None
+        tell(edge, k, m.Bye(), 1)
+    assert refusal(come(edge, "eve", 8, 2.5)) == "too many new runs of 'eve': try again in 9 s"
+    assert refusal(come(edge, "eve", 8, 10.9)) is not None  # nor has it lost anything by asking too early
+    assert refusal(come(edge, "eve", 8, 11.1)) is None
+
+
+def test_new_runs_of_all_names_are_bounded_too() -> None:
+    edge = Edge(Config(), 7)
+    for k in range(128):
+        assert refusal(come(edge, f"eve{k}", k)) is None
+        tell(edge, k, m.Bye())
+    assert refusal(come(edge, "ann", -1)) == "too many new runs of all agents: try again in 1 s"
+    assert refusal(come(edge, "ann", -1, 0.6)) is None
+
+
+def test_names_that_came_long_ago_take_no_memory() -> None:
+    newcomers = Newcomers()
+    for k in range(2000):
+        newcomers.came(f"eve{k}", k * S // 2)
+    assert len(newcomers._of_name) <= 2 * 10 + 1
+
+
+def test_who_is_known_comes_again_as_often_as_it_likes() -> None:
+    known = [Known(f"bob-{k:04x}", hello_of("bob", 100 + k), Foot(4, 0), 5) for k in range(12)]
+    edge = Edge(Config(), 7, keeps=True, known=known)
+    for _ in range(200):  # a hello that is repeated, and a reconnect
+        assert refusal(come(edge, "ann", 1)) is None
+    for k in range(12):  # of the map's file
+        assert refusal(come(edge, "bob", 100 + k)) is None
+        tell(edge, 100 + k, m.Bye())
+    for k in range(8):
+        assert refusal(come(edge, "bob", 200 + k)) is None
+        tell(edge, 200 + k, m.Bye())
+    tell(edge, 1, m.Bye())
+    assert refusal(come(edge, "ann", 1)) is None
+
+
+def test_a_refusal_for_another_reason_costs_no_new_run() -> None:
+    edge = Edge(Config(), 7)
+    come(edge, "ann", 1)
+    for _ in range(20):
+        assert "in use" in str(refusal(come(edge, "ann", 2)))
+    tell(edge, 1, m.Bye())
+    assert refusal(come(edge, "ann", 2)) is None
+
+
+def test_a_run_without_a_keyframe_is_not_kept() -> None:
+    edge = Edge(Config(), 7, keeps=True)
+    assert not of(come(edge, "ann", 1), Keep)
+    (keep,) = of(tell(edge, 1, keyframe(0)), Keep)
+    assert [type(change) for change in keep.changes] == [KeepRun, KeepKeyframe]
+    (keep,) = of(tell(edge, 1, keyframe(1)), Keep)
+    assert [type(change) for change in keep.changes] == [KeepKeyframe]
+
+
+# ---------------------------------------------------------------- who comes back
+
+
+@pytest.mark.parametrize(
+    "message",
+    [m.Evaluation(0, 1000.0, 0.0), keyframe(0), m.Ping(1, 1), hello_of("hope", 1)],
+    ids=lambda message: type(message).__name__,
+)
+def test_an_old_run_does_not_come_back_beside_the_present_one(message: m.Message) -> None:
+    edge = Edge(Config(), 7)
+    come(edge, "hope", 1)
+    tell(edge, 1, m.Bye())
+    come(edge, "hope", 2)
+    effects = tell(edge, 1, message, 1)
+    assert "in use" in str(refusal(effects))
+    assert not of(effects, ed.Present) + of(effects, ed.Add)
+    assert len(of(effects, ed.Send)) == 1
+    assert present(edge) == 1
+    assert sum(agent["evaluations"] for agent in edge.report({})["agents"].values()) == 0
+    tell(edge, 2, m.Bye(), 2)
+    assert refusal(tell(edge, 1, m.Ping(1, 1), 2)) is None
+    assert present(edge) == 1
+
+
+def test_who_said_bye_comes_back_only_to_a_free_place() -> None:
+    """As many as may be, of names of their own, after others who said bye."""
+    config = Config()
+    edge = Edge(replace(config, edge=replace(config.edge, max_agents=4)), 7)
+    for k in range(8):
+        assert refusal(come(edge, f"eve{k}", k)) is None
+        tell(edge, k, m.Bye())
+    said = [refusal(tell(edge, k, m.Ping(1, 1))) for k in range(8)]
+    assert said[:4] == [None] * 4
+    assert all("4 agents already" in str(reason) for reason in said[4:])
+    assert present(edge) == 4
+
+
+def test_who_was_silent_for_too_long_has_lost_its_name() -> None:
+    """Also where the edge has not had time to notice."""
+    edge = Edge(Config(), 7)
+    come(edge, "ann", 1)
+    effects = come(edge, "ann", 2, 3.5)
+    assert [(e.key, e.here) for e in of(effects, ed.Present)] == [(f"ann-{m.public_tag(1)[:4]}", False)]
+    assert "in use" in str(refusal(tell(edge, 1, m.Evaluation(0, 1.0, 1.0), 3.6)))
+    assert present(edge) == 1
+
+
+def test_bye_is_heard_once() -> None:
+    edge = Edge(Config(), 7)
+    come(edge, "ann", 1)
+    tell(edge, 1, m.Bye())
+    assert tell(edge, 1, m.Bye()) == []
+
+
+def test_no_tracker_begins_for_who_cannot_come_back() -> None:
+    edge = TrackingEdge(Config(), 7, room=Room(1, "it is small"))
+    for k, name in enumerate(("ann", "bob")):
+        hello = replace(hello_of(name, k, AgentKind.AR), streams=True)
+        assert of(tell(edge, k, hello), ed.BeginTracking)
+        tell(edge, k, m.Bye())
+    assert of(tell(edge, 0, m.Ping(1, 1)), ed.BeginTracking)
+    effects = tell(edge, 1, m.Ping(1, 1))
+    assert "can track 1 streamed agent" in str(refusal(effects))
+    assert not of(effects, ed.BeginTracking)
+    assert present(edge) == 1
