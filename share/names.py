@@ -26,10 +26,12 @@ def checked_name(name: str) -> str:
     name = normalize("NFC", name)
     if not 0 < len(name) <= MAX_NAME:
         raise ValueError(f"name: {len(name)} characters; use {ALLOWED}")
-    before = " "  # kind of the character before: letter, mark, digit, space or other
+    before = " "  # kinds of the character before, and of the marks on it: letter, mark, digit, space or other
     for character in name:
         kind = _kind(character)
-        if kind is None or (kind == " " and before == " ") or (kind == "M" and before != "L"):
+        if kind == "M" and before in ("L", "LM"):  # two marks, as Indic and Thai names have them
+            kind = before + "M"
+        if kind in (None, "M") or (kind == " " and before == " "):
             raise ValueError(f"name: not with U+{ord(character):04X} there; use {ALLOWED}")
         before = kind
     if before == " ":
