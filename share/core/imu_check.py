@@ -85,13 +85,12 @@ def _stands_out(stamps: I64, values: F64, out: NDArray[np.bool_], first: int, pa
     if len(around) < _AROUND or stamps[past - 1] - stamps[first] > _RUN_NS:
         return False
     after = list(range(past, min(past + _AROUND, len(stamps))))
-    steps = np.diff(stamps[[*around[::-1], *range(first, past), *after]])
-    if steps.max() > _APART_NS:
-        return False
     times, more = _BETWEEN if after else _AT_THE_END
-    near = values[[*around, *after]]
+    near, run = values[[*around, *after]], values[first:past]
     low, high = near.min(axis=0), near.max(axis=0)
-    run = values[first:past]
-    excess = np.maximum(run - high, low - run)
+    excess = np.maximum(run - high, low - run) - times * (high - low)
+    if not (excess > more).any(axis=1).all():
+        return False
+    steps = np.diff(stamps[[*around[::-1], *range(first, past), *after]])
     wider = max(1.0, float(np.median(steps)) / _USUAL_NS)
-    return bool((excess > times * (high - low) + wider * more).any(axis=1).all())
+    return bool(steps.max() <= _APART_NS and (excess > wider * more).any(axis=1).all())
