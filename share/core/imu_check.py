@@ -10,11 +10,16 @@ from numpy.typing import NDArray
 from share.types import F64, I64
 
 _AROUND = 2  # neighbours either side
+_RUN = 3  # a glitch lasts at most so many samples
+_RUN_NS = 12_000_000  # and at most so long: 10 ms and the jitter of stamps
+_FAR = _RUN + _AROUND  # a neighbour is no further off: a run may lie between
+_KEPT = _RUN - 1 + _FAR  # of the frame before: a run that goes on, and its neighbours
 _APART_NS = 25_000_000  # samples further apart than this say nothing of each other
 _USUAL_NS = 5_000_000  # bounds are of samples so far apart, 200 Hz, and grow with the distance
-# A sample that stands out from all of its neighbours by more than so many times what these differ, and this
-# much more (rad/s, m/s^2). Of 195,000 samples of seven drones and hand-held recordings (EuRoC, TUM-VI) none
-# exceeds 0.12 and 2.3 with neighbours on both sides, 0.8 and 13 with those before it alone.
+# Left out is a run each sample of which stands out from all of its neighbours by more than so many times what
+# these differ, and this much more (rad/s, m/s^2). Of 195,000 samples of seven drones and hand-held recordings
+# (EuRoC, TUM-VI), one, two or three in a row, none exceeds 0.13 and 4.0 with neighbours on both sides, 0.8
+# and 13 with those before it alone.
 _BETWEEN = (4.0, np.repeat([1.0, 20.0], 3))
 _AT_THE_END = (8.0, np.repeat([3.0, 50.0], 3))
 
@@ -30,47 +35,62 @@ class ImuRange:
 
 class ImuCheck:
     """Fed with the samples of each frame in turn. Counts what is left out: `out_of_range` (NaN too) and
-    `spikes`, single samples far from those around them; a step, a shock or a vibration has neighbours that
-    differ too. The last of a frame is held against those before it, so that nothing waits for the next."""
+    `spikes`, samples in runs of at most three that are far from those on both sides; a step, a shock or a
+    vibration has neighbours that differ too. A run that ends with its frame is held against those before it,
+    so that nothing waits for the next. One that goes on in the next frame is judged there as a whole: what of
+    it was handed out stays so, the rest is left out."""
 
     def __init__(self, limits: ImuRange) -> None:
         self._most = np.repeat([limits.gyro, limits.accel], 3)
-        self._stamps, self._values = np.zeros(0, np.int64), np.zeros((0, 6))  # the newest in range
+        # the newest in range, and which of them are left out
+        self._stamps, self._values, self._out = np.zeros(0, np.int64), np.zeros((0, 6)), np.zeros(0, np.bool_)
         self.out_of_range = self.spikes = 0
 
     def believed(self, stamps: I64, values: F64) -> NDArray[np.bool_]:
         """Of samples (N,) ns, (N, 6) gyro and accel: which (N,) are measurements."""
         good = np.asarray((np.abs(values) <= self._most).all(axis=1), np.bool_)  # NaN is not
         self.out_of_range += len(good) - int(good.sum())
-        before = len(self._stamps)
         at, all_ = np.concatenate([self._stamps, stamps[good]]), np.concatenate([self._values, values[good]])
-        spikes = _spikes(at, all_)[before:]
-        self._stamps, self._values = at[-_AROUND:], all_[-_AROUND:]
+        out = _left_out(at, all_, self._out)
+        spikes = out[len(self._out) :]
+        self._stamps, self._values, self._out = at[-_KEPT:], all_[-_KEPT:], out[-_KEPT:]
         if spikes.any():
             self.spikes += int(spikes.sum())
             good[np.flatnonzero(good)[spikes]] = False
         return good
 
 
-def _spikes(stamps: I64, values: F64) -> NDArray[np.bool_]:
-    """Which (N,) stand out."""
-    count = len(stamps)
-    out = np.zeros(count, np.bool_)
-    # cheap first: whoever does not leap from the one before it does not stand out
-    leaps = np.zeros(count, np.bool_)
-    leaps[1:] = (np.abs(np.diff(values, axis=0)) > _BETWEEN[1]).any(axis=1)
-    for k in np.flatnonzero(leaps).tolist():
-        first, last = max(0, k - _AROUND), min(count - 1, k + _AROUND)
-        steps = np.diff(stamps[first : last + 1])
-        if last - first >= _AROUND + (last > k) and steps.max() <= _APART_NS:
-            around = np.delete(values[first : last + 1], k - first, axis=0)
-            wider = max(1.0, float(np.median(steps)) / _USUAL_NS)
-            out[k] = _stands_out(values[k], around, wider, ends=bool(last == k))
+def _left_out(stamps: I64, values: F64, before: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which (N,) stand out; of the first, `before` says it and is not changed."""
+    count, new = len(stamps), len(before)
+    out = np.concatenate([before, np.zeros(count - new, np.bool_)])
+    # cheap first: a run that stands out begins with a leap, and another one ends it
+    leaps = np.zeros(count + 1, np.bool_)
+    leaps[1:count] = (np.abs(np.diff(values, axis=0)) > _BETWEEN[1]).any(axis=1)
+    leaps[count] = True  # may be one
+    for leap in np.flatnonzero(leaps[:count]).tolist():
+        first = leap
+        while first and out[first - 1]:  # it goes on with a run
+            first -= 1
+        for past in range(max(leap, new) + 1, min(first + _RUN, count) + 1):
+            if leaps[past] and _stands_out(stamps, values, out, first, past):
+                out[max(leap, new) : past] = True
+                break
     return out
 
 
-def _stands_out(value: F64, around: F64, wider: float, ends: bool) -> bool:
-    times, more = _AT_THE_END if ends else _BETWEEN
-    low, high = around.min(axis=0), around.max(axis=0)
-    excess = np.maximum(value - high, low - value)
-    return bool((excess > times * (high - low) + wider * more).any())
+def _stands_out(stamps: I64, values: F64, out: NDArray[np.bool_], first: int, past: int) -> bool:
+    """Whether each sample of the run [first, past) does."""
+    around = [k for k in range(first - 1, max(-1, first - 1 - _FAR), -1) if not out[k]][:_AROUND]
+    if len(around) < _AROUND or stamps[past - 1] - stamps[first] > _RUN_NS:
+        return False
+    after = list(range(past, min(past + _AROUND, len(stamps))))
+    times, more = _BETWEEN if after else _AT_THE_END
+    near, run = values[[*around, *after]], values[first:past]
+    low, high = near.min(axis=0), near.max(axis=0)
+    excess = np.maximum(run - high, low - run) - times * (high - low)
+    if not (excess > more).any(axis=1).all():
+        return False
+    steps = np.diff(stamps[[*around[::-1], *range(first, past), *after]])
+    wider = max(1.0, float(np.median(steps)) / _USUAL_NS)
+    return bool(steps.max() <= _APART_NS and (excess > wider * more).any(axis=1).all())

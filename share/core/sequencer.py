@@ -52,7 +52,7 @@ class SequencerCounters:
     imu_silent: int = 0  # frames that no IMU sample reaches although the rig has an IMU
     imu_dropped: int = 0  # samples longer than max_jump_s before their frame
     imu_out_of_range: int = 0  # dropped: beyond what the sensor can measure, or not finite
-    imu_spikes: int = 0  # dropped: single samples far from those around them
+    imu_spikes: int = 0  # dropped: up to three samples in a row far from those around them
     wraps: int = 0
     jumps: int = 0
     strays: int = 0

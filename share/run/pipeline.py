@@ -24,8 +24,8 @@ _REMEMBERED = 600  # frames that are left out one after the other, whose IMU sam
 _NO_MEASUREMENTS = {
     "imu_out_of_range": "the IMU gave samples beyond {0.gyro:.3g} rad/s or {0.accel:.3g} m/s^2, or no "
     "numbers; such are left out (sequencer.imu_out_of_range in the report)",
-    "imu_spikes": "the IMU gave single samples far from those before and after them; such are left out "
-    "(sequencer.imu_spikes in the report); look at its cable and supply",
+    "imu_spikes": "the IMU gave one to three samples in a row far from those before and after; such are left "
+    "out (sequencer.imu_spikes in the report); look at its cable and supply",
 }
 
 

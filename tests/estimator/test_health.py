@@ -38,6 +38,22 @@ def test_nothing_believed_for_a_second(straying: Straying) -> None:
     assert straying.certain
 
 
+def test_frames_in_which_nothing_is_left_to_be_seen_do_not_acquit(straying: Straying) -> None:
+    """All is refused and given up; the next frame has nothing to look for, and takes new features."""
+    for _ in range(30):
+        straying.add(True, due=MANY, found=MANY, seen=0, seconds=FRAME_S)
+        straying.add(True, due=0, found=0, seen=0, seconds=FRAME_S)
+    assert straying.suspected and not straying.certain
+    straying.add(True, due=MANY, found=MANY, seen=0, seconds=FRAME_S)
+    assert straying.certain
+
+
+def test_one_sight_acquits(straying: Straying) -> None:
+    for k in range(90):
+        straying.add(True, due=MANY, found=MANY, seen=MANY if k % 20 == 19 else 0, seconds=FRAME_S)
+    assert not straying.certain
+
+
 def test_a_gap_counts_for_no_more_than_a_frame_can(straying: Straying) -> None:
     for _ in range(4):
         straying.add(True, due=MANY, found=MANY, seen=0, seconds=10.0)

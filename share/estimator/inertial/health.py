@@ -53,8 +53,9 @@ class Straying:
         `due` should be in view, `found` look as they should, `seen` were believed as well."""
         if textured and due >= self._weak:
             self._frames = self._frames + 1 if found < self._blind else 0
-        refused = textured and due >= self._blind and seen < self._blind
-        self._refused_s = self._refused_s + min(seconds, _LONGEST_S) if refused else 0.0
+        if due >= self._blind:  # else all was refused in the frame before, and is gone
+            refused = textured and seen < self._blind
+            self._refused_s = self._refused_s + min(seconds, _LONGEST_S) if refused else 0.0
 
     @property
     def suspected(self) -> bool:
