@@ -276,7 +276,8 @@ class AgentRun:
     def _carry_out(self, effect: ev.AgentEffect) -> None:
         match effect:
             case ev.Send():
-                self._link.send(effect.frames)
+                if not self._link.send(effect.frames):
+                    self._handle(ev.NotTaken(effect))
             case ev.Localised():
                 self._localised(effect)
             case ev.FrameDone():
