@@ -249,7 +249,8 @@ def _keyframes(r: dict[str, Any], traffic: str) -> str:
     if not told["edge_sessions"]:
         return f"no edge answered: {made} keyframes were not sent"
     safe = told["keyframes"] - told["unacknowledged"]
-    return f"{made} keyframes: {told['sent']} sent, {safe} acknowledged, {r['corrections']} corrections, {traffic}"
+    sent = f"{told['sent']} sent, {safe} acknowledged"
+    return f"{made} keyframes: {sent}, {r['corrections']} corrections, {traffic}"
 
 
 def _unacknowledged(run: AgentRun, name: str, finish_s: float) -> str | None:

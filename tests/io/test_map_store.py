@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from map_changes import ANN, BOB, keyframe, loop, pose, run, small_map, solution, told
-
 from special_files import KINDS, special
 
 from share.core.keeping import DropLoop, KeepLink, KeepLoop, Retire
