@@ -247,10 +247,10 @@ def _keyframes(r: dict[str, Any], traffic: str) -> str:
     """What the link took of them, and what the edge has acknowledged."""
     told, made = r["protocol"], r["keyframes"]
     if not told["edge_sessions"]:
-        return f"no edge answered: {made} keyframes were not sent"
+        return f"no edge answered: {_of(made)} not sent"
     safe = told["keyframes"] - told["unacknowledged"]
     sent = f"{told['sent']} sent, {safe} acknowledged"
-    return f"{made} keyframes: {sent}, {r['corrections']} corrections, {traffic}"
+    return f"{_of(made)}: {sent}, {r['corrections']} corrections, {traffic}"
 
 
 def _unacknowledged(run: AgentRun, name: str, finish_s: float) -> str | None:
@@ -267,7 +267,11 @@ def _unacknowledged(run: AgentRun, name: str, finish_s: float) -> str | None:
         why = f"it has {told['held']} of them, but not in its map's file; can it write that? It says why not"
     else:
         why = f"it did not answer within agent.finish_s, {finish_s:g} s"
-    return f"the edge never acknowledged {count} keyframe{'s' * (count > 1)}: {why}"
+    return f"the edge never acknowledged {_of(count)}: {why}"
+
+
+def _of(keyframes: int) -> str:
+    return "1 keyframe" if keyframes == 1 else f"{keyframes} keyframes"
 
 
 def _clock(c: dict[str, Any]) -> str:

@@ -79,7 +79,8 @@ def test_what_is_no_file_is_not_written_where_a_file_belongs(tmp_path, kind):
         file = LineFile(path, said.append)
         file.write("line")
         file.close()
-    assert said == [f"{path}: cannot be written: it is a {kind}, not a file; remove it; the run goes on without it"]
+    why = f"it is a {kind}, not a file; remove it"
+    assert said == [f"{path}: cannot be written: {why}; the run goes on without it"]
     assert os.listdir(tmp_path) == [path.name]
     assert not path.is_file()
 
