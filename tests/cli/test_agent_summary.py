@@ -11,6 +11,9 @@ TOLD = {
     "held": 0,
 }  # fmt: skip
 
+KEYS = "not let in: the edge there wants keys"
+UNSAFE = "but not in its map's file; can it write that? It says why not"
+
 
 def report(**told):
     return {"keyframes": 60, "corrections": 3, "protocol": TOLD | told}
@@ -23,14 +26,10 @@ def report(**told):
         (
             {"held": 4},
             None,
-            "it has 4 of them, but not in its map's file; can it write that? It says why not",
+            f"it has 4 of them, {UNSAFE}",
         ),
         ({"connected": False}, None, "the edge is silent"),
-        (
-            {"connected": False},
-            "not let in: the edge there wants keys",
-            "not let in: the edge there wants keys",
-        ),
+        ({"connected": False}, KEYS, KEYS),
         ({"connected": False, "refusal": "too many"}, None, "the edge refuses 'ann': too many"),
     ],
 )

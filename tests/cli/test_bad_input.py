@@ -632,8 +632,8 @@ def test_what_an_edge_never_acknowledged_is_said(room, share, tmp_path):
     assert f"\n{made} keyframes: {sent} sent, 1 acknowledged, 0 corrections, " in done.out
     assert done.err.splitlines() == [
         "share agent: connected to the edge",
-        f"share agent: the edge never acknowledged {left} keyframes: it has {left} of them, but not in its map's "
-        "file; can it write that? It says why not",
+        f"share agent: the edge never acknowledged {left} keyframes: it has {left} of them, but not in its "
+        "map's file; can it write that? It says why not",
     ]
 
 
