@@ -117,6 +117,8 @@ def agent(
     line.end()
     options.say_losses(opened)
     click.echo(json.dumps(run.report) if as_json else _summary(run))
+    if (missing := _unacknowledged(run, hello.name, settings.agent.finish_s)) is not None:
+        line.say(missing)
     if not run.report["protocol"]["edge_sessions"]:
         if (refusal := run.report["protocol"]["refusal"]) is not None:
             raise ShareError(f"the edge at {address} refuses '{hello.name}': {refusal}")
@@ -225,12 +227,11 @@ def _summary(run: AgentRun) -> str:
     r = run.report
     p95 = r["track_ms"]["p95"]
     traffic = f"{r['bytes_up'] / 1e6:.2f} MB up, {r['bytes_down'] / 1e6:.3f} MB down"
-    keyframes = f"{r['sent']} of {r['keyframes']} keyframes sent, {r['corrections']} corrections"
     lines = [f"{r['tracked']} of {r['frames']} frames tracked, lost for {r['lost_s']:.1f} s"]
     if "untracked" in r:
         lines += [f"{r['untracked']} more frames had no answer of the edge, {traffic}"]
     else:
-        lines += [f"{keyframes}, {traffic}"]
+        lines += [_keyframes(r, traffic)]
     if r["drop_late"]:
         lines.append(f"{r['drop_late']} more frames came too late and were left out")
     if r["frames_late"]:
@@ -240,6 +241,37 @@ def _summary(run: AgentRun) -> str:
     if r["clock"]["uncertainty_ms"] is not None:
         lines.append(f"clock of the edge: {_clock(r['clock'])}")
     return "\n".join([*lines, *live.summary(r)])
+
+
+def _keyframes(r: dict[str, Any], traffic: str) -> str:
+    """What the link took of them, and what the edge has acknowledged."""
+    told, made = r["protocol"], r["keyframes"]
+    if not told["edge_sessions"]:
+        return f"no edge answered: {_of(made)} not sent"
+    safe = told["keyframes"] - told["unacknowledged"]
+    sent = f"{told['sent']} sent, {safe} acknowledged"
+    return f"{_of(made)}: {sent}, {r['corrections']} corrections, {traffic}"
+
+
+def _unacknowledged(run: AgentRun, name: str, finish_s: float) -> str | None:
+    """How many keyframes an edge that was there has not acknowledged, and why as far as the agent knows."""
+    told = run.report["protocol"]
+    count = told["unacknowledged"]
+    if not count or not told["edge_sessions"]:
+        return None
+    if told["refusal"] is not None:
+        why = f"the edge refuses '{name}': {told['refusal']}"
+    elif not told["connected"]:
+        why = run.trouble or "the edge is silent"
+    elif told["held"]:
+        why = f"it has {told['held']} of them, but not in its map's file; can it write that? It says why not"
+    else:
+        why = f"it did not answer within agent.finish_s, {finish_s:g} s"
+    return f"the edge never acknowledged {_of(count)}: {why}"
+
+
+def _of(keyframes: int) -> str:
+    return "1 keyframe" if keyframes == 1 else f"{keyframes} keyframes"
 
 
 def _clock(c: dict[str, Any]) -> str:

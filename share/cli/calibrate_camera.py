@@ -72,7 +72,7 @@ def camera(
     if pictures.said is not None:
         to_kalibr(pictures.said.rig, pictures.said)  # what is kept of it must be sound: said before the work
     options.say_another(source, pictures.said, pictures.serial)
-    writable_dir(out)
+    writable_dir(out, CAMCHAIN, REPORT, PICTURE)
     outcome = _calibrated(source, pictures, target, every, most, workers)
     text = json.dumps(known(camera_report.to_json(outcome)), indent=1)
     files = places(out, outcome.verdict.passed, CAMCHAIN, REPORT, PICTURE)

@@ -80,7 +80,7 @@ def camera_imu(
     pictures = open_rig_pictures(source, camera)
     noise = stated_noise(source, imu, "--imu")
     options.say_another(source, pictures.pictures.said, pictures.pictures.serial)
-    writable_dir(out)
+    writable_dir(out, CAMCHAIN, IMU_CHAIN, report.REPORT, report.PICTURE)
     outcome = _calibrated(source, pictures, noise, target_name, every, within, workers)
     text = json.dumps(known(report.to_json(outcome)), indent=1)
     verdict = "passed" if outcome.verdict.passed else "FAILED"

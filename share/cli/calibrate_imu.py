@@ -48,7 +48,7 @@ def imu(source: str, profile_name: str | None, inflate: float, out: Path, as_jso
     from share.io.profile import profile
 
     stated = profile(profile_name) if profile_name else None
-    writable_dir(out)
+    writable_dir(out, "kalibr_imu_chain.yaml", "imu-report.json", "imu-report.png")
     with Stages() as stages:
         table = read_imu(source, lambda done, total: stages("reading", done, total))
         stages("Allan deviation", 0, 1)

@@ -93,7 +93,7 @@ def mocap(
         chosen = replace(chosen, within_s=0.0, offset_sigma=1e-5, drift_sigma=1e-8)
     noise, bodies = stated_noise(source, calib, "--calib"), read_bodies(truth, rotations)
     _, seen = pick_body(str(truth), bodies, body, Path(source).stem, "--body BODY")
-    writable_dir(out)
+    writable_dir(out, "mocap.yaml", "mocap-report.json")
     with Stages() as stages:
         table = read_imu(source, lambda done, total: stages("reading", done, total))
         stages("fitting", 0, 1)

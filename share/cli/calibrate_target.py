@@ -42,7 +42,7 @@ def target(
 
     from share.calibration.sheet import USUAL, sheet
     from share.io.earlier import says_target
-    from share.io.files import atomic_write, check_writable
+    from share.io.files import atomic_write, check_replaceable, check_writable
     from share.io.target import to_plain
     from share.io.target_sheet import pdf, words
 
@@ -54,8 +54,8 @@ def target(
     except ValueError as error:
         raise UsageError(str(error)) from None
     known_as = out.with_suffix(".yaml")
-    for path in (out, known_as):
-        check_writable(path)
+    check_writable(out)
+    check_replaceable(known_as)
     there = known_as.exists()
     if there and not says_target(known_as, made.target):
         raise UsageError(

@@ -69,7 +69,7 @@ def compare(
     ]
     for text in lacking:
         click.echo(f"left out: {text}", err=True)
-    writable_dir(out)
+    writable_dir(out, "table.md", "table.csv", "report.html")
     jobs = [job for job in jobs if job not in unfit]
     found, failed = _run(jobs, recordings, out)
     if found:

@@ -77,14 +77,14 @@ def convert(
     Example:  share dataset convert rec/kitchen --out kitchen.mcap --frames 0:250
     """
     from share.io.convert import to_euroc, to_mcap
-    from share.io.files import check_writable
+    from share.io.files import check_replaceable
     from share.io.source import open_source
 
     target = Path(out)
     if kind == "euroc" and jpeg is not None:
         raise UsageError("--jpeg: goes with --format mcap only")
     if kind == "mcap":
-        _check_mcap(check_writable(target), source)
+        _check_mcap(check_replaceable(target), source)
     opened = open_source(source, calib, frames)
     options.say_notes(opened)
     with progress(opened.images_count, "converting") as bar:

@@ -181,7 +181,7 @@ def ablation(
     opened = [read_session(folder) for folder in sessions]
     config = settings(config_file, told, opened)
     planned = plan(opened, policies, range(seeds), Terms("", **told), out / "runs", config)
-    writable_dir(out)
+    writable_dir(out, "agents.csv", "runs.csv", "report.md", "report.html")
     came = played(planned, side_by_side(workers), lambda one: one.out.name)
     trials, failed = list(came.values()), [one.out.name for one in planned if one.out not in came]
     if trials:

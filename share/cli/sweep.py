@@ -74,7 +74,7 @@ def sweep(
     opened = [read_session(folder) for folder in sessions]
     config = settings(config_file, told, opened)
     runs = planned(opened, axes, points, range(seeds), Terms(policy, **told), out / "runs", config)
-    writable_dir(out)
+    writable_dir(out, "sweep.csv", "sweep.md")
     at = {one.out: point for one, point in runs}
     players = Cluster(scheduler) if scheduler else side_by_side(workers)
     trials = played([one for one, _ in runs], players, lambda one: ", ".join(at[one.out]))

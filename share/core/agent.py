@@ -77,6 +77,8 @@ class Agent:
 
     def handle(self, event: ev.AgentEvent, now_ns: int) -> list[ev.AgentEffect]:
         """What to do about `event` at `now_ns` (host monotonic clock, never falling)."""
+        if isinstance(event, ev.NotTaken):
+            self._not_taken(event.sent)
         if self._ended:
             return []
         self._effects, self._now_ns = [], now_ns
@@ -91,9 +93,6 @@ class Agent:
             case ev.FrameArrived() if self._streaming:
                 self._status.image_came(event.arrived_ns)
                 self._streaming.arrived(event, self._connected)
-            case ev.NotTaken() if self._streaming:
-                self._streaming.not_taken(event.sent.index)
-                self._counts["bytes_up"] -= size(event.sent.frames)
             case ev.Received():
                 self._received(event, now_ns)
             case ev.Finished():
@@ -126,6 +125,8 @@ class Agent:
             **(self._streaming.report() if self._streaming else {}),
             "keyframes": self._chain.next_id,
             "open": self._ledger.open,
+            "unacknowledged": self._ledger.unacknowledged,
+            "held": self._ledger.held,
             "rate_hz": self._bucket.hz,
             "connected": self._connected,
             "edge_sessions": len(self._lives),
@@ -306,7 +307,7 @@ class Agent:
             if (ping := self._pings.due(now_ns)) is not None:
                 self._send(ping)
             for entry in self._ledger.due(now_ns):
-                self._send(entry.keyframe)
+                self._send_frames(encode(entry.keyframe), entry.keyframe.id)
             self._send_frame(now_ns)
         elif self._hello_timer.due(now_ns):
             self._send_hello(now_ns)
@@ -357,9 +358,17 @@ class Agent:
     def _send(self, message: m.Up) -> None:
         self._send_frames(encode(message))
 
-    def _send_frames(self, frames: Any) -> None:
+    def _send_frames(self, frames: Any, keyframe: int | None = None) -> None:
         self._counts["bytes_up"] += size(frames)
-        self._effects.append(ev.Send(frames))
+        self._effects.append(ev.Send(frames, keyframe))
+
+    def _not_taken(self, sent: ev.Send | ev.SendFrame) -> None:
+        self._counts["bytes_up"] -= size(sent.frames)
+        if isinstance(sent, ev.SendFrame):
+            if self._streaming is not None:
+                self._streaming.not_taken(sent.index)
+        elif sent.keyframe is not None:
+            self._ledger.not_taken(sent.keyframe)
 
     @property
     def _alone(self) -> str:

@@ -57,9 +57,9 @@ class FrameArrived:
 
 @dataclass(frozen=True, eq=False)
 class NotTaken:
-    """The link could not take this frame."""
+    """The link could not take this message or frame: nothing of it is sent."""
 
-    sent: SendFrame
+    sent: Send | SendFrame
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,14 +95,16 @@ AgentEvent = Connected | FrameTracked | KeyframeMade | FrameArrived | NotTaken |
 
 @dataclass(frozen=True, eq=False)
 class Send:
-    """Hand these frames to the link; whether they left is not reported back."""
+    """Hand these frames to the link; if it does not take them, `NotTaken` is the answer. keyframe: the id, if
+    they are one."""
 
     frames: Sequence[Bytes]
+    keyframe: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class SendFrame:
-    """The same for a frame to be tracked; if the link does not take it, `NotTaken` is the answer."""
+    """The same for a frame to be tracked."""
 
     index: int
     frames: Sequence[Bytes]

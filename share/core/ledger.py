@@ -20,6 +20,7 @@ class Entry:
     frame: int
     arrived_ns: int
     attempts: int = 0  # in this life of the edge
+    sendings: int = 0  # that the link took, in any life
     due_ns: int | None = None  # None: now
     sent_ns: int = 0
     replayed: bool = False  # an earlier life of the edge had acknowledged it
@@ -53,6 +54,16 @@ class Ledger:
         return len(self._open)
 
     @property
+    def unacknowledged(self) -> int:
+        """How many keyframes are not known to be safe at the edge, those included that were dropped."""
+        return len(self._open) + self.counts["drop_oldest"]
+
+    @property
+    def held(self) -> int:
+        """How many of them the edge has, but has not made safe."""
+        return sum(keyframe in self._open for keyframe in self._held)
+
+    @property
     def last_acknowledged(self) -> Entry | None:
         return next(reversed(self._acknowledged.values()), None)
 
@@ -80,11 +91,11 @@ class Ledger:
             self._drop()
 
     def due(self, now_ns: int) -> list[Entry]:
-        """What to send now, in order; taken as sent."""
+        """What to send now, in order; taken as sent, unless `not_taken` says otherwise."""
         window = list(self._open.values())[: self._link.window]
         chosen = [entry for entry in window if self._is_due(entry, now_ns)]
         for entry in chosen:
-            self.counts["sent" if entry.attempts == 0 else "resent"] += 1
+            self._count(entry, 1)
             backoff = self._link.resend_s * 2.0 ** min(entry.attempts, 30)
             entry.due_ns = now_ns + seconds(min(backoff, self._link.resend_max_s))
             entry.attempts += 1
@@ -92,6 +103,17 @@ class Ledger:
             self._sent_to = max(self._sent_to, entry.keyframe.id)
         self._ever_sent_to = max(self._ever_sent_to, self._sent_to)
         return chosen
+
+    def not_taken(self, keyframe: int) -> None:
+        """The link had no room for one that was due, or nobody to take it to. It is due again in its time."""
+        if (entry := self.find(keyframe)) is not None and entry.sendings:
+            self._count(entry, -1)
+
+    def _count(self, entry: Entry, change: int) -> None:
+        """One sending more or less. sent: keyframes; resent: what was sent of them once more."""
+        first = max(entry.sendings, entry.sendings + change) == 1
+        self.counts["sent" if first else "resent"] += change
+        entry.sendings += change
 
     def acknowledge(self, ack: Ack) -> bool:
         """Takes note of what has arrived; gaps below what is held are due again after `gap_s`.

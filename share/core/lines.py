@@ -9,6 +9,22 @@ from share.core.rate import TokenBucket
 _BURST, _HZ = 20.0, 0.2  # lines at once, and then one each 5 s
 _REMEMBERED = 16  # complaints
 _LONGEST = 300
+_GONE_NS = 60_000_000_000
+
+
+class Lasting:
+    """Of a trouble that comes and goes: whether it is to be said."""
+
+    def __init__(self) -> None:
+        self._there: dict[str, int] = {}  # when it was last there
+
+    def begins(self, text: str, now_ns: int) -> bool:
+        """It is there: True the first time, and where it had been gone for a minute."""
+        since_ns = self._there.pop(text, None)
+        self._there[text] = now_ns
+        if len(self._there) > _REMEMBERED:
+            del self._there[next(iter(self._there))]
+        return since_ns is None or now_ns - since_ns > _GONE_NS
 
 
 class Lines:

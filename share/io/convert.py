@@ -11,7 +11,7 @@ from share.core.measurement import CAM0, CAM1, IMU, LazyImage, Measurement
 from share.errors import DataError, MisfitError, UsageError
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise
-from share.io.files import atomic_write, check_writable, new_folder
+from share.io.files import atomic_write, check_replaceable, new_folder
 from share.io.images import EncodedImage, encode_png, image_format
 from share.io.mcap import rig as ros_rig
 from share.io.mcap.recorder import Recorder
@@ -48,7 +48,7 @@ def to_mcap(source: Source, out: Path, jpeg: int | None, progress: Progress) -> 
 
 def write_recording(source: Source, out: Path, jpeg: int | None, progress: Progress) -> None:
     """`to_mcap` without the truth."""
-    check_writable(out)
+    check_replaceable(out)
     try:
         with Recorder(out, source.rig, jpeg, serial=source.serial) as recorder:
             for measurement in _counted(source, progress):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import shutil
 import tempfile
@@ -17,13 +18,12 @@ def atomic_write(path: Path, data: bytes | str) -> None:
     """Write beside `path`, make it durable, then take its name: `path` is old or new, never between.
 
     A link of that name is replaced, not followed: who can put one into our folder has no say over what else
-    we write. A device or pipe is simply written to. Raises UsageError if the folder cannot be written to,
-    ShareError if the disk is full or fails.
+    we write. A device, and a pipe that `check_writable` has opened, are simply written to. Raises UsageError
+    for another pipe and if the folder cannot be written to, ShareError if the disk is full or fails.
     """
     content = data.encode() if isinstance(data, str) else data
     if is_special(path):
-        with writing(path):
-            path.write_bytes(content)
+        _write_special(path, content)
         return
     path = path.resolve() if _of_system(path) else path
     try:
@@ -68,12 +68,71 @@ def sync_folder(folder: Path) -> None:
 
 
 def check_writable(path: Path) -> Path:
-    """`path`, if a file of that name can be made (its folder may have to be made). Else UsageError."""
+    """`path`, which a person named, if a file of that name can be made (its folder may have to be made).
+
+    It may be a device, or a pipe that somebody reads. Else UsageError.
+    """
     if path.is_dir():
         raise UsageError(f"{path}: is a folder; give the name of a file")
     if not is_special(path):
         writable_dir(path.parent)
+    elif not path.is_char_device():
+        _open_pipe(path)
     return path
+
+
+def check_replaceable(path: Path) -> Path:
+    """`path`, if it is a file or nothing, and so can be replaced by one. Else UsageError."""
+    if is_special(path):
+        raise _in_the_way(path)
+    return check_writable(path)
+
+
+_pipes: dict[tuple[int, int], int] = {}  # open for writing, by device and inode
+
+
+def _open_pipe(path: Path) -> None:
+    """It stays open from here on: a reader takes the close of its last writer for the end. Raises UsageError
+    where nobody reads it, for which open(2) would wait."""
+    if not path.is_fifo():
+        raise UsageError(f"{path}: is {_what(path)}; give the name of a file")
+    if (which := _which(path)) in _pipes:
+        return
+    try:
+        handle = os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        why = "that nobody reads" if error.errno == errno.ENXIO else f"and cannot be opened: {error.strerror}"
+        raise UsageError(f"{path}: is a pipe {why}; give the name of a file") from None
+    os.set_blocking(handle, True)  # its reader may be slow
+    _pipes[which] = handle
+
+
+def _write_special(path: Path, content: bytes) -> None:
+    with writing(path):
+        if path.is_char_device():
+            handle = os.open(path, os.O_WRONLY | os.O_CLOEXEC | os.O_NOCTTY)
+        elif (known := _pipes.get(_which(path))) is not None:
+            handle = os.dup(known)
+        else:
+            raise _in_the_way(path)
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+
+
+def _which(path: Path) -> tuple[int, int]:
+    found = path.stat()
+    return found.st_dev, found.st_ino
+
+
+def _in_the_way(path: Path) -> UsageError:
+    return UsageError(
+        f"{path}: is {_what(path)}, where a file is to be written; remove it, or give another --out"
+    )
+
+
+def _what(path: Path) -> str:
+    """A name for what is no file."""
+    return "a pipe" if path.is_fifo() else "a socket" if path.is_socket() else "a device"
 
 
 def is_special(path: Path) -> bool:
@@ -91,9 +150,11 @@ def _of_system(path: Path) -> bool:
 
 def fresh(path: Path) -> IO[bytes]:
     """A new, empty file in the place of what had that name: neither a link there nor another name of the same
-    file is written through. A device or pipe is opened as it is. Raises OSError."""
-    if is_special(path):
+    file is written through. A device is opened as it is. Raises OSError, also for a pipe."""
+    if path.is_char_device() and is_special(path):
         return path.open("wb")
+    if is_special(path):
+        raise OSError(errno.EINVAL, f"it is {_what(path)}, not a file; remove it", str(path))
     with contextlib.suppress(FileNotFoundError):
         path.unlink()
     return os.fdopen(os.open(path, _FRESH, 0o666), "wb")
@@ -119,16 +180,23 @@ def claim(folder: Path) -> int:
     return handle
 
 
-def writable_dir(path: Path) -> Path:
-    """`path`, made if need be and tried with a file of its own. Else UsageError."""
+def writable_dir(path: Path, *names: str) -> Path:
+    """`path`, made if need be and tried with a file of its own. Else UsageError.
+
+    names: of what will be written there, and so is a file or nothing.
+    """
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
-            return path
+            pass
     except (FileExistsError, NotADirectoryError):
         raise UsageError(f"{path}: is not a folder, or lies below a file; give another --out") from None
     except OSError as error:
         raise UsageError(f"{path}: cannot be written to: {error.strerror}; give another --out") from None
+    for name in names:
+        if is_special(path / name):
+            raise _in_the_way(path / name)
+    return path
 
 
 def _umask() -> int:
@@ -144,7 +212,7 @@ def new_file(out: Path) -> Iterator[IO[bytes]]:
 
     Raises UsageError if `out` is there or cannot be made; ShareError if the disk is full or fails.
     """
-    if check_writable(out).exists():
+    if check_replaceable(out).exists():
         raise UsageError(f"{out}: exists and is not overwritten; give a new name")
     handle, name = tempfile.mkstemp(prefix=f".{out.name}.", dir=out.parent)
     try:

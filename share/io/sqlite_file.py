@@ -29,6 +29,11 @@ def log_of(path: Path) -> Path:
     return path.with_name(path.name + "-wal")
 
 
+def index_of(path: Path) -> Path:
+    """What SQLite looks up in that log, shared between processes."""
+    return path.with_name(path.name + "-shm")
+
+
 def read_only(path: Path) -> str:
     """Its URI. Without a log nobody writes, and no file beside it is needed."""
     mode = "mode=ro" if log_of(path).exists() else "immutable=1"

@@ -27,6 +27,7 @@ from typing import Any
 from share import __version__, config
 from share.core import events as ev
 from share.core.agent import Agent
+from share.core.lines import Lasting
 from share.core.sequencer import SequencerCounters
 from share.errors import DataError, ShareError
 from share.estimator.result import TrackResult
@@ -115,6 +116,7 @@ class AgentRun:
         self._received = 0  # messages in it
         self._over_ns: int | None = None  # when the last frame was done
         self.report: dict[str, Any] = {}
+        self._troubles = Lasting()
         self.trouble: str | None = None  # why the edge does not let this agent in
 
     def _prepare(self) -> None:
@@ -257,10 +259,9 @@ class AgentRun:
         return self._over_ns is not None and time.monotonic_ns() - self._over_ns > patience_s * 1e9
 
     def _say_trouble(self) -> None:
-        if (trouble := self._link.trouble()) != self.trouble:
-            self.trouble = trouble
-            if trouble is not None:
-                self._say(trouble)
+        self.trouble = self._link.trouble()
+        if self.trouble is not None and self._troubles.begins(self.trouble, time.monotonic_ns()):
+            self._say(self.trouble)
 
     def _handle(self, event: ev.AgentEvent) -> None:
         """One guarded step: what fails costs this event, and never the run."""
@@ -276,7 +277,8 @@ class AgentRun:
     def _carry_out(self, effect: ev.AgentEffect) -> None:
         match effect:
             case ev.Send():
-                self._link.send(effect.frames)
+                if not self._link.send(effect.frames):
+                    self._handle(ev.NotTaken(effect))
             case ev.Localised():
                 self._localised(effect)
             case ev.FrameDone():

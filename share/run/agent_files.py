@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from share.io.files import atomic_write, check_writable, claim
+from share.io.files import atomic_write, check_replaceable, claim
 from share.io.line_file import LineFile
 from share.io.spool import Spool
 from share.io.trajectory import format_pose
@@ -26,7 +26,7 @@ _NAMES = ("odom.tum", "map.tum", "latency.csv", "report.json")
 
 def _claim(out: Path) -> int:
     for name in _NAMES:
-        check_writable(out / name)
+        check_replaceable(out / name)
     return claim(out)
 
 

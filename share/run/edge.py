@@ -46,7 +46,7 @@ from share.core.edge_events import (
 )
 from share.core.tracking_edge import TrackingEdge
 from share.errors import StoreError
-from share.io.files import atomic_write, check_writable, claim
+from share.io.files import atomic_write, check_replaceable, claim
 from share.io.line_file import LineFile
 from share.io.map_store import MapStore
 from share.io.transport import EdgeLink
@@ -105,8 +105,8 @@ class EdgeRun:
         self._events: LineFile | None = None
         self._scribe: Scribe | None = None
         if out is not None:
-            check_writable(out / "edge.json")
-            check_writable(out / "events.jsonl")
+            check_replaceable(out / "edge.json")
+            check_replaceable(out / "events.jsonl")
             self._claim = claim(out)
             self._events = LineFile(out / "events.jsonl", self._complain)
             self._scribe = Scribe(out, self._complain)

@@ -83,7 +83,7 @@ def play(
     links.check(session.agents)
     folders = {name: out / name for name in session.agents}
     logs = {name: out / f"{name}.log" for name in (*folders, "edge")}
-    writable_dir(out)
+    writable_dir(out, *(log.name for log in logs.values()))
     with ExitStack() as stack:
         bind = ("--bind", "tcp://127.0.0.1:0", "--out", str(out / "edge"), *terms.of_edge())
         edge = stack.enter_context(child(logs["edge"], "edge", *bind))

@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +20,11 @@ from pathlib import Path
 import pytest
 from recordings import make_euroc, make_tum
 from shell import Done
+
+from share.io.transport import bind
+from share.types import Keyframe
+from share.wire import messages as m
+from share.wire.codec import decode, encode
 
 SHARE = [sys.executable, "-m", "share"]
 NOBODY = "tcp://127.0.0.1:1"  # a port that nothing listens on
@@ -389,6 +395,50 @@ def test_out_may_be_a_device_and_stays_one(room, share):
     assert complaint(done, 1) == "share: /dev/full: cannot be written: No space left on device\n"
 
 
+@contextmanager
+def within(seconds: float) -> Iterator[None]:
+    """What takes longer ends with an error, for it would take for ever."""
+
+    def late(number: int, frame: object) -> None:
+        raise AssertionError(f"not done within {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_out_where_a_pipe_lies(room, share, tmp_path):
+    """It would be opened, and that waits for somebody who reads it."""
+    names = ("T.tum", "events.jsonl", "edge.json", "odom.tum", "report.json")
+    for name in names:
+        (tmp_path / name).mkdir()
+        os.mkfifo(tmp_path / name / name)
+    pipe, source = tmp_path / "T.tum" / "T.tum", room / "ar1"
+    with untouched(tmp_path), within(20):
+        for arguments, said in (
+            (["track", source, "--out", pipe], "T.tum: is a pipe that nobody reads"),
+            (["track", source, "--report", pipe], "T.tum: is a pipe that nobody reads"),
+            *((as_agent(source, tmp_path / name), f"{name}: is a pipe, where") for name in names[3:]),
+            *(([*EDGE, tmp_path / name], f"{name}: is a pipe, where") for name in names[1:3]),
+            (["dataset", "convert", source, "--format", "mcap", "--out", pipe], "T.tum: is a pipe, where"),
+        ):
+            assert said in complaint(share(*arguments), 2)
+
+
+def test_poses_into_a_command_that_reads_them(room):
+    command = 'exec "$@" --out >(wc -l)'
+    arguments = [*SHARE, "track", room / "ar1", "--frames", ":5"]
+    done = subprocess.run(
+        ["bash", "-c", command, "-", *map(str, arguments)], capture_output=True, text=True, timeout=60
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "5" in done.stdout.split("\n")
+
+
 # ------------------------------------------------------------------ tracking
 
 
@@ -525,7 +575,13 @@ def test_an_edge_that_never_answers(room, share, tmp_path):
     config.write_text("link: {silent_s: 0.4}\nagent: {finish_s: 0.2}")
     done = share(*as_agent(room / "ar1", tmp_path / "out"), "--config", config, *FEW)
     assert done.code == 1
-    assert "20 of 20 frames tracked" in done.out
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert done.out.startswith(
+        "20 of 20 frames tracked, lost for 0.0 s\n"
+        f"no edge answered: {report['keyframes']} keyframe not sent\n"
+    )
+    assert report["keyframes"] == 1
+    assert (report["bytes_up"], report["protocol"]["sent"]) == (0, 0)  # no link took anything
     assert _not_late(done.err) == [
         "share agent: no edge answers yet; tracking goes on alone",
         f"share: no edge ever answered at {NOBODY}; is `share edge` running there?",
@@ -534,6 +590,56 @@ def test_an_edge_that_never_answers(room, share, tmp_path):
     assert (tmp_path / "out" / "map.tum").read_bytes() == b""
     assert share("track", room / "ar1", "--out", tmp_path / "T.tum", *FEW).code == 0
     assert (tmp_path / "out" / "odom.tum").read_bytes() == (tmp_path / "T.tum").read_bytes()
+
+
+class Careless(threading.Thread):
+    """An edge that makes only the first keyframe safe, and holds the others."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.link, self.is_over = bind("tcp://127.0.0.1:0"), False
+        self._held = set()
+
+    def run(self) -> None:
+        while not self.is_over:
+            if (arrival := self.link.receive(50)) is not None:
+                for answer in self._answers(decode(arrival.frames)):
+                    self.link.send(arrival.peer, encode(answer))
+        self.link.close()
+
+    def _answers(self, message: object) -> Iterator[m.Down]:
+        match message:
+            case m.Hello():
+                yield m.Welcome(7, 0)
+            case m.Ping():
+                yield m.Pong(message.sequence, message.sent_ns, 1, 1, 7)
+            case Keyframe():
+                self._held |= {message.id} - {0}
+                yield m.Ack(1, tuple(sorted(self._held)))
+
+
+def test_what_an_edge_never_acknowledged_is_said(room, share, tmp_path):
+    (config := tmp_path / "quick.yaml").write_text(
+        "agent: {finish_s: 0.4}\ninertial: {keyframe_m: 0.01, keyframe_rad: 0.01}\n"
+    )
+    edge = Careless()
+    edge.start()
+    try:
+        done = share(*as_agent(room / "ar1", tmp_path / "out", edge.link.endpoint), "--config", config)
+    finally:
+        edge.is_over = True
+        edge.join()
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    made, sent = report["keyframes"], report["protocol"]["sent"]
+    left = made - 1
+    assert 3 < sent == made == report["protocol"]["keyframes"]
+    assert done.code == 0
+    assert f"\n{made} keyframes: {sent} sent, 1 acknowledged, 0 corrections, " in done.out
+    assert done.err.splitlines() == [
+        "share agent: connected to the edge",
+        f"share agent: the edge never acknowledged {left} keyframes: it has {left} of them, but not in its "
+        "map's file; can it write that? It says why not",
+    ]
 
 
 def test_an_agent_leaves_a_damaged_image_out(damaged, share, tmp_path):

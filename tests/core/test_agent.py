@@ -16,7 +16,7 @@ from share.errors import UsageError
 from share.geometry import se3
 from share.types import Correction, Keyframe, TrackState, View
 from share.wire import messages as m
-from share.wire.codec import VERSION, decode, encode
+from share.wire.codec import VERSION, decode, encode, size
 
 T = TypeVar("T")
 SESSION = 77
@@ -478,3 +478,27 @@ def test_an_agent_tells_how_unsurely_the_map_placed_it(placement: bool) -> None:
     # of one motion, after that of odometry in the map
     cov = se3.compose_cov(pose(3), COV, COV) if placement else COV
     assert told.error_cm == pytest.approx(100 * np.sqrt(np.trace(cov[3:, 3:])))
+
+
+def test_what_no_link_takes_is_not_sent() -> None:
+    """Neither its bytes nor its keyframe count, however often it is tried in vain."""
+    agent, now, tried = welcomed(), 0, 0
+    bytes_up = agent.report()["bytes_up"]
+    effects = handle(agent, tracked(0, candidate=True), now)
+    while tried < 3:
+        for effect in only(ev.Send, effects):
+            tried += effect.keyframe == 0
+            assert not only(ev.Send, handle(agent, ev.NotTaken(effect), now))
+        now += 100 * MS
+        effects = tell(agent, m.Ack(0), now)  # it is there, but its queue is full
+    told = agent.report()
+    assert (told["sent"], told["resent"], told["bytes_up"]) == (0, 0, bytes_up)
+    assert (told["keyframes"], told["unacknowledged"]) == (1, 1)
+    while not (keyframes := [s for s in only(ev.Send, effects) if s.keyframe == 0]):
+        now += 100 * MS
+        effects = tell(agent, m.Ack(0), now)
+    told = agent.report()
+    assert (told["sent"], told["resent"]) == (1, 0)
+    assert told["bytes_up"] >= bytes_up + size(keyframes[0].frames)
+    tell(agent, m.Ack(1), now)
+    assert agent.report()["unacknowledged"] == 0

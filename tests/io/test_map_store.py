@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from map_changes import ANN, BOB, keyframe, loop, pose, run, small_map, solution, told
+from special_files import KINDS, special
 
 from share.core.keeping import DropLoop, KeepLink, KeepLoop, Retire
 from share.errors import StoreError, UsageError
@@ -317,3 +318,56 @@ def test_keyframes_of_an_earlier_wire_version_that_have_not_changed_are_read(pat
     monkeypatch.undo()
     with pytest.raises(StoreError, match=r"are of wire version 99, this SHARE reads \d+: use the SHARE that"):
         again(path)
+
+
+@pytest.mark.parametrize("end", ["-wal", "-shm"])
+@pytest.mark.parametrize("kind", [*KINDS, "link"])
+@pytest.mark.parametrize("made", [True, False])
+def test_what_lies_beside_a_map_is_a_file(path, end, kind, made):
+    """SQLite would open a pipe, and wait or write there."""
+    if made:
+        with MapStore.open(path) as store:
+            store.write(small_map())
+    beside = path.with_name(path.name + end)
+    if kind == "link":
+        beside.symlink_to(path.parent / "elsewhere")
+    else:
+        special(beside, kind)
+    with pytest.raises(UsageError, match=f"sqlite{end}: (is a link|cannot be the (log|index) of)"):
+        MapStore.open(path)
+    assert not (path.parent / "elsewhere").exists()
+    beside.rmdir() if kind == "folder" else beside.unlink()
+    assert again(path) is not None
+
+
+LIMITED = """
+import resource, sys
+from pathlib import Path
+from map_changes import small_map
+from share.errors import StoreError
+from share.io.map_store import MapStore
+path, limit = Path(sys.argv[1]), int(sys.argv[2])
+store = MapStore.open(path) if limit > 50_000 else None
+resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+try:
+    store = store or MapStore.open(path)
+    for _ in range(2000):
+        store.write(small_map())
+except StoreError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("limit", [1_000, 10_000, 40_000, 100_000, 300_000])
+def test_a_map_that_may_not_grow_says_by_which_limit(path, limit):
+    """SQLite says "disk I/O error". Wherever it meets the limit: file, log or index."""
+    here = Path(__file__).parents[1]
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, path, str(limit)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(here), os.environ.get("PYTHONPATH", "")])},
+        capture_output=True,
+        text=True,
+    )
+    assert done.stderr == ""
+    assert "may not grow beyond the file size limit of this process" in done.stdout, done.stdout
+    assert done.stdout.endswith("; raise it (ulimit -f) and start again\n")

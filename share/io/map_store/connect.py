@@ -10,9 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from share.errors import StoreError, UsageError
+from share.io.map_store.complaint import size_limit
 from share.io.map_store.schema import PAGE_BYTES, first_page
 from share.io.regular_file import is_hollow, open_regular, read_bytes
-from share.io.sqlite_file import distrust, log_of, read_only
+from share.io.sqlite_file import distrust, index_of, log_of, read_only
 
 BUSY_S = 5.0  # how long a commit waits for a reader of another process
 WAL_PAGES = 512  # after as many (4 MiB) the log is moved into the file
@@ -80,7 +81,8 @@ def complaints(path: Path, doing: str) -> Iterator[None]:
     except BROKEN as error:
         if is_damage(error):
             raise DamageError(f"{path}: the map is damaged: {error}") from None
-        raise StoreError(f"{path}: the map cannot be {doing}: {error}") from None
+        why = size_limit(error, path) or error
+        raise StoreError(f"{path}: the map cannot be {doing}: {why}") from None
 
 
 def is_damage(error: Exception) -> bool:
@@ -92,9 +94,9 @@ def check_is_map(path: Path) -> bool:
 
     A writer killed before its first commit leaves nothing or a bare first page; what follows is in the log.
     """
+    for beside in (log_of(path), index_of(path)):
+        _check_beside(beside)
     try:
-        if log_of(path).is_symlink():
-            raise UsageError(f"{log_of(path)}: is a link; the log of a map lies beside it")
         with open_regular(path) as file:
             head = file.read(PAGE_BYTES)
         if is_hollow(path):
@@ -108,6 +110,19 @@ def check_is_map(path: Path) -> bool:
     if head and not is_bare(path):
         raise UsageError(f"{path}: is not a map of SHARE, and was left as it is; give another file")
     return log_of(path).exists() and bool(log_of(path).stat().st_size)
+
+
+def _check_beside(file: Path) -> None:
+    """Raises UsageError unless it is a file of SQLite's, or not there."""
+    what = "the log of a map" if file.suffix.endswith("-wal") else "the index of a map's log"
+    if file.is_symlink():
+        raise UsageError(f"{file}: is a link; {what} lies beside it")
+    try:
+        open_regular(file).close()
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise UsageError(f"{file}: cannot be {what}: {error.strerror}; remove it") from None
 
 
 def is_bare(path: Path) -> bool:

@@ -5,17 +5,16 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 from share.core.keeping import Change, Kept
 from share.errors import StoreError, UsageError
 from share.io.map_store import changes, lock, reading, schema
+from share.io.map_store.complaint import why_not_written
 from share.io.map_store.opening import examine, look, make
 from share.io.map_store.salvage import set_aside
 from share.io.map_store.scan import whole_rows
-from share.io.map_store.schema import PAGE_BYTES
 from share.io.sqlite_file import log_of
 
 
@@ -87,7 +86,7 @@ class MapStore:
             with contextlib.suppress(sqlite3.Error):  # a full disk has rolled back by itself
                 db.execute("ROLLBACK")
             if isinstance(error, sqlite3.Error):
-                why = _why(error, self.path)
+                why = why_not_written(error, self.path)
                 raise StoreError(f"{self.path}: the map cannot be written: {why}") from None
             raise
         self._check_in_place()
@@ -163,17 +162,3 @@ def _which(path: Path) -> dict[Path, tuple[int, int]]:
             found = file.stat()
             out[file] = found.st_dev, found.st_ino
     return out
-
-
-def _why(error: sqlite3.Error, path: Path) -> str:
-    """As a person knows it. SQLite says the same of a quota and of a broken disk: the system is asked."""
-    if getattr(error, "sqlite_errorcode", 0) == sqlite3.SQLITE_FULL:
-        return "No space left on device"
-    try:
-        with tempfile.TemporaryFile(dir=path.parent) as file:
-            file.write(bytes(PAGE_BYTES))
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as system:
-        return system.strerror or str(system)
-    return str(error)

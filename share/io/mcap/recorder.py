@@ -18,7 +18,7 @@ import numpy as np
 from share.core.measurement import DEPTH, IMU, Measurement
 from share.errors import DataError, UsageError
 from share.geometry.camera import Rig
-from share.io.files import check_writable, fresh, sync_folder, writing
+from share.io.files import check_replaceable, fresh, sync_folder, writing
 from share.io.images import EncodedImage, encode_jpeg
 from share.io.mcap import images as ros_images
 from share.io.mcap import rig as ros_rig
@@ -66,7 +66,7 @@ class Recorder:
     ) -> None:
         from mcap.writer import Writer
 
-        self.path, self.part = check_writable(path), part_of(path)
+        self.path, self.part = check_replaceable(path), part_of(path)
         self._rig, self._jpeg, self._durable = rig, jpeg, durable
         try:
             self._file = self.part.open("xb") if durable else fresh(self.part)
