@@ -38,7 +38,9 @@ def test_where_pictures_are_missing_it_is_said_how_to_do_without(tmp_path: Path)
     written(tmp_path / "mono" / "cam0", "1.png", "2.png")
     with pytest.raises(DataError, match=r"of the same name in cam0 and cam1; give --camera cam0$"):
         open_pictures(str(tmp_path / "mono"), ("cam0", "cam1"))
-    chain = {"cam0": CAMERA, "cam1": CAMERA | {"T_cn_cnm1": np.eye(4).tolist()}}
+    beside = np.eye(4)
+    beside[0, 3] = -0.05
+    chain = {"cam0": CAMERA, "cam1": CAMERA | {"T_cn_cnm1": beside.tolist()}}
     (tmp_path / "stereo.yaml").write_text(yaml.safe_dump(chain))
     with pytest.raises(
         DataError, match=r"in cam0 and cam1; for one camera, give --camera a camchain without"

@@ -21,7 +21,7 @@ from typing import Any
 import pytest
 from raw_zmtp import command, frame, greeting, message, metadata, parts
 
-GROWTH_BYTES = 60_000_000  # within 20 ms and what a busy machine adds; without a guard 1 GB and more
+GROWTH_BYTES = 120_000_000  # 5 to 70 MB, by how busy the machine is; without a guard 700 MB and more
 PING = command(b"PING", b"\0\0abc")
 
 
