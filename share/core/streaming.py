@@ -19,7 +19,7 @@ class Streaming:
         self._patience_ns = seconds(config.patience_s)
         self._window = Window(config.window)
         self._counts: Counter[str] = Counter()
-        self._broken = False  # another life of the edge tracks from now on
+        self._broken = False  # what comes is of another odometry, though no frame has said so yet
 
     @property
     def is_idle(self) -> bool:
@@ -56,6 +56,7 @@ class Streaming:
         sent = self._window.answered(answer.index)
         if sent is None:
             self._counts["late"] += 1
+            self._broken = self._broken or answer.new_stretch  # so is what comes after it
             return None
         self._counts["answered"] += 1
         broken = self._broken and answer.state.has_pose

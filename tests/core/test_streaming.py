@@ -14,6 +14,7 @@ from share.core import edge_events as ed
 from share.core import events as ev
 from share.core.agent import Agent
 from share.core.edge import Edge
+from share.core.streaming import Streaming
 from share.core.tracking_edge import Room, TrackingEdge
 from share.errors import UsageError
 from share.geometry import se3
@@ -337,3 +338,16 @@ def test_large_images_need_more_room():
     why = f"{why}: 4 cores, 1.0 GB free; wait until one leaves"
     assert begun == 2 and refused == [m.Refused(why)] * 10
     assert [type(e) for e in greeted(edge, 50)[1]].count(ed.BeginTracking) == 1  # a small one has room
+
+
+def test_a_stretch_that_begins_with_a_frame_nobody_waits_for_any_more_begins_with_the_next() -> None:
+    """A tracker that died and came back answers first what it was given meanwhile: too late."""
+    streaming = Streaming(CONFIG.stream)
+    for k in range(2):
+        streaming.arrived(ev.FrameArrived(frame(k), 0), connected=True)
+        streaming.next(2000 * MS * k)  # by then nobody waits for the first
+    late = m.Tracked(0, 0, TrackState.OK, pose(0), new_stretch=True)
+    assert streaming.tracked(late, 2000 * MS) is None
+    answer = streaming.tracked(m.Tracked(1, 33 * MS, TrackState.OK, pose(1)), 2001 * MS)
+    assert answer is not None
+    assert answer.new_stretch
