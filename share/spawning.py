@@ -37,7 +37,7 @@ class _First:
 
 
 @contextlib.contextmanager
-def _held() -> Iterator[None]:
+def held() -> Iterator[None]:
     """Signals are handled after the block: a child that is left half started writes a traceback. The mask is
     inherited by the child and holds back this thread alone; another thread may take a signal, which Python
     then handles in the main thread."""
@@ -68,7 +68,7 @@ class _Process(SpawnProcess):
     """It ignores SIGINT and SIGHUP from its first instruction: a terminal sends them to the whole group."""
 
     def start(self) -> None:
-        with _held():
+        with held():
             super().start()
 
     def __reduce__(self) -> Any:

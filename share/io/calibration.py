@@ -113,7 +113,7 @@ def _serial(section: Section) -> str:
 
 @contextlib.contextmanager
 def said_of(where: str) -> Iterator[None]:
-    """What a rig cannot be is a ConfigError, with where it was found."""
+    """What a camera or a rig cannot be is a ConfigError, with where it was found."""
     try:
         yield
     except ValueError as error:
@@ -170,10 +170,8 @@ def _make(
     cy: float,
     distortion: tuple[float, ...],
 ) -> Camera:
-    try:
+    with said_of(section.where):
         return Camera(width, height, fx, fy, cx, cy, distortion)
-    except ValueError as error:
-        raise ConfigError(f"{section.where}: {error}") from None
 
 
 def _resolution(section: Section, key: str) -> tuple[int, int]:

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import os
-import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from itertools import islice
 from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import TypeVar
 
 from share.errors import ShareError
-from share.spawning import SPAWN
+from share.spawning import SPAWN, held
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 _failed: ShareError | None = None  # of this process, at its start
-_ENDINGS = {signal.SIGINT, signal.SIGTERM}
 _AHEAD = 2  # jobs handed out per worker, so that none waits for work
 
 
@@ -45,7 +43,7 @@ class Pool:
         try:
             while True:
                 for job in islice(waiting, _AHEAD * self._workers - len(running)):
-                    with _undisturbed():
+                    with held():
                         running[self._pool.submit(_do, work, job)] = job
                 if not running:
                     return
@@ -65,16 +63,6 @@ class Pool:
         self._pool.shutdown(cancel_futures=True)
         self._ours.close()
         self._going_on.close()
-
-
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """SIGINT and SIGTERM wait: a process that gets only half of what it begins with complains at length."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDINGS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _begin(going_on: Connection, start: Callable[..., None], arguments: tuple[object, ...]) -> None:
