@@ -21,7 +21,7 @@ class Newcomers:
     """How often new runs may come, of each name and of the whole edge."""
 
     def __init__(self) -> None:
-        self._all = _bucket(_EDGE_BURST, _EDGE_HZ)
+        self._all = TokenBucket(_EDGE_BURST, _EDGE_HZ)
         self._of_name: dict[str, TokenBucket] = {}
 
     def objection(self, name: str, now_ns: int) -> str | None:
@@ -36,14 +36,8 @@ class Newcomers:
     def came(self, name: str, now_ns: int) -> None:
         """A new run of this name, to which there was no objection."""
         self._of_name = {who: kept for who, kept in self._of_name.items() if not kept.is_full(now_ns)}
-        for bucket in (self._all, self._of_name.setdefault(name, _bucket(_NAME_BURST, _NAME_HZ))):
+        for bucket in (self._all, self._of_name.setdefault(name, TokenBucket(_NAME_BURST, _NAME_HZ))):
             bucket.take(now_ns)
-
-
-def _bucket(burst: float, hz: float) -> TokenBucket:
-    bucket = TokenBucket(burst)
-    bucket.hz = hz
-    return bucket
 
 
 class Admission:

@@ -34,8 +34,8 @@ class TokenBucket:
     What is not preferred passes only where a token would be lost otherwise: when `burst` have been saved up.
     """
 
-    def __init__(self, burst: float) -> None:
-        self.hz: float | None = None
+    def __init__(self, burst: float, hz: float | None = None) -> None:
+        self.hz = hz
         self._burst = burst
         self._tokens = burst
         self._seen_ns: int | None = None

@@ -19,18 +19,13 @@ class Throttle:
         self._hz, self._burst = hz, burst
         self._buckets: dict[object, TokenBucket] = {}  # the one not asked for the longest first
         self._held: dict[object, int] = {}
-        self._new = TokenBucket(_NEW_BURST)
-        self._begun = False
+        self._new = TokenBucket(_NEW_BURST, _NEW_HZ)
 
     def admit(self, key: object, now_ns: int, before: int = 0) -> int | None:
         """None: held back. Else how many of this key were held back since the last that was let through.
         before: how many somebody else has held back before this one."""
         key = self._known(key, now_ns)
-        bucket = self._buckets.pop(key, None)
-        if bucket is None:
-            bucket = TokenBucket(self._burst)
-            bucket.limit(self._hz, now_ns)
-        self._buckets[key] = bucket
+        self._buckets[key] = bucket = self._buckets.pop(key, None) or TokenBucket(self._burst, self._hz)
         if not bucket.take(now_ns):
             self._held[key] = self._held.get(key, 0) + before + 1
             return None
@@ -40,9 +35,6 @@ class Throttle:
         """The key under which this one is counted."""
         if key in self._buckets or len(self._buckets) < _MAX_KEYS:
             return key
-        if not self._begun:
-            self._begun = True
-            self._new.limit(_NEW_HZ, now_ns)
         if not self._new.take(now_ns):
             return None
         oldest = next(iter(self._buckets))

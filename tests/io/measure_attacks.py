@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -122,32 +122,29 @@ def chunk(compression: str) -> Attack:
     return made
 
 
+def _altered(path: Path, statements: Iterable[str]) -> list[str]:
+    import sqlite3
+
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        for statement in statements:
+            connection.execute(statement)
+        connection.commit()
+    return ["dataset", "info", str(path)]
+
+
 def map_file(*statements: str) -> Attack:
     def made(folder: Path) -> list[str]:
-        import sqlite3
-
         path = folder / "map.sqlite"
         with MapStore.open(path) as store:
             store.write(small_map(12, points=10))
-        with contextlib.closing(sqlite3.connect(path)) as connection:
-            for statement in statements:
-                connection.execute(statement)
-            connection.commit()
-        return ["dataset", "info", str(path)]
+        return _altered(path, statements)
 
     return made
 
 
 def sdk(*statements: str) -> Attack:
     def made(folder: Path) -> list[str]:
-        import sqlite3
-
-        path = make_db3(folder / "a.db3")
-        with contextlib.closing(sqlite3.connect(path)) as connection:
-            for statement in statements:
-                connection.execute(statement)
-            connection.commit()
-        return ["dataset", "info", str(path)]
+        return _altered(make_db3(folder / "a.db3"), statements)
 
     return made
 
