@@ -71,6 +71,15 @@ class Account:
         return max(0, self.waiting) * self.weight
 
     @property
+    def is_tiny(self) -> bool:
+        """Whether what waits is of small parts."""
+        return self.weight > TINY
+
+    def exceeds(self, bounds: Bounds) -> bool:
+        """Whether more waits than may of one peer."""
+        return self.memory > bounds.peer / (TINY_SHARE if self.is_tiny else 1)
+
+    @property
     def marked(self) -> int:
         """What waited when it was marked and still does."""
         return self._mark[0] - self.handed - self._commands

@@ -6,7 +6,7 @@ The agent looks itself, whenever it receives (`share.io.transport.guard` does th
 from __future__ import annotations
 
 from share.io.transport import tcp
-from share.io.transport.account import TINY, TINY_SHARE, Account, Bounds
+from share.io.transport.account import Account, Bounds
 
 
 class EdgeWatch:
@@ -36,9 +36,8 @@ class EdgeWatch:
             self._connection = None
             return None
         self._account.sample(*read)
-        tiny = self._account.weight > TINY
-        if self._account.memory > self._bounds.peer / (TINY_SHARE if tiny else 1):
-            return self._break_off("many small messages" if tiny else "more than may wait")
+        if self._account.exceeds(self._bounds):
+            return self._break_off("many small messages" if self._account.is_tiny else "more than may wait")
         return None
 
     def empty(self) -> str | None:

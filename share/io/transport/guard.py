@@ -27,7 +27,7 @@ from threading import Lock, Thread
 import zmq
 
 from share.io.transport import tcp
-from share.io.transport.account import TINY, TINY_SHARE, Account, Bounds
+from share.io.transport.account import Account, Bounds
 from share.io.transport.connection import Connection
 from share.io.transport.keep_out import KeepOut
 
@@ -353,8 +353,7 @@ class Guard:
     def _bound(self, now_s: float) -> None:
         """Whatever it is that waits: who has too much of it goes, then who has the most for the longest."""
         for connection in self._present():
-            tiny = connection.account.weight > TINY
-            if connection.account.memory > self._bounds.peer / (TINY_SHARE if tiny else 1):
+            if connection.account.exceeds(self._bounds):
                 self._unload(connection, "more than may wait", now_s)
         unclaimed, share = self._unclaimed(), self._bounds.peer / 8  # which an agent may have in any case
         while present := self._present():
@@ -365,7 +364,7 @@ class Guard:
             self._unload(worst, "more than may wait of all together", now_s)
 
     def _unload(self, connection: Connection, reason: str, now_s: float) -> None:
-        if connection.account.weight > TINY:
+        if connection.account.is_tiny:
             self._offend(connection, "many small parts", now_s)
         else:
             self._shed(connection, reason)
