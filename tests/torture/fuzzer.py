@@ -3,18 +3,26 @@
     python fuzzer.py ADDRESS --corpus FILE --kind KIND --count N --rate R --seed S [--valid --cpu SHARE]
                      [--keys PUBLIC SECRET SERVER] [--peer HEX] [--ring FILE]
 
-Prints JSON at the end: sent, connections, closed, refused, CPU share. It exits 0 even if the edge has died;
-the last messages of each connection are then in the ring file. Nothing of `share` is imported.
+Prints JSON at the end: messages sent; with_run, those sent by a run that the edge had welcomed and had not
+refused since; connections, closed, unanswered dials; CPU share; how many messages of each kind came back. It
+exits 0 even if the edge has died; the last messages of each connection are then in the ring file. Nothing of
+`share` is imported.
+
+A run is kept over connections, and says its hello again now and then (a Bye ends it): the edge takes in only
+so many new ones, and messages without a run reach little of it.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import math
 import random
 import sys
 import time
-from collections import deque
+from collections import Counter, deque
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -25,6 +33,8 @@ from mutations import mutate
 from raw_wire import Message, RawPeer, pack, unpack
 
 CONNECTIONS, RING, BATCH_S = 4, 400, 0.02
+HELLO_EVERY_S = 0.5  # of a run
+RENEWED = 0.02  # the share of batches before which a connection that mutates hellos is another run's
 SMALL_POINTS = 12  # of keyframes: it is their fields that are mutated; few bytes, many messages
 
 
@@ -35,8 +45,18 @@ def own_name(identity: bytes, keys: object) -> str:
 
 class Speaker(Protocol):
     def send(self, messages: list[Message]) -> None: ...
-    def drain(self) -> int: ...
+    def come(self) -> list[Message]: ...
     def close(self) -> None: ...
+
+
+@dataclass
+class Run:
+    """One of the attacker's runs, and the connection that it has at the moment."""
+
+    identity: bytes
+    speaker: Speaker | None = None
+    welcome: bool = False
+    hello_at: float = -math.inf
 
 
 class CurvePeer:
@@ -62,14 +82,12 @@ class CurvePeer:
             except self._zmq.ZMQError as error:
                 raise OSError(str(error)) from None
 
-    def drain(self) -> int:
-        n = 0
-        try:
-            for _ in range(1000):
-                n += sum(map(len, self._socket.recv_multipart(self._zmq.NOBLOCK)))
-        except self._zmq.ZMQError:
-            pass
-        return n
+    def come(self) -> list[Message]:
+        out: list[Message] = []
+        with contextlib.suppress(self._zmq.ZMQError):
+            while len(out) < 1000:
+                out.append(self._socket.recv_multipart(self._zmq.NOBLOCK))
+        return out
 
     def close(self) -> None:
         self._socket.close(0)
@@ -83,11 +101,12 @@ class Attacker:
         self.args, self.draw = args, random.Random(args.seed)
         self.corpus = Corpus(args.corpus)
         self.small = _small(self.corpus.by_kind[args.kind], args.kind)
-        self.speakers: list[tuple[bytes, Speaker]] = []
+        self.runs = [Run(self._identity()) for _ in range(CONNECTIONS)]
         self.ring: deque[Recorded] = deque(maxlen=RING)
-        self.counts = {"sent": 0, "bytes_heard": 0, "connections": 0, "closed": 0, "refused": 0}
+        self.counts: Counter[str] = Counter(sent=0, with_run=0, connections=0, closed=0, unanswered=0)
+        self.heard: Counter[str] = Counter()
 
-    def run(self) -> None:
+    def run(self) -> dict[str, Any]:
         args, began, spent = self.args, time.monotonic(), time.process_time()
         last_alive = began
         while self.counts["sent"] < args.count and time.monotonic() - began < args.seconds:
@@ -97,8 +116,9 @@ class Attacker:
             if time.monotonic() - last_alive > 8:
                 break  # nobody is there any more
             self._pause(began, spent, due)
-        self.counts["seconds"] = round(time.monotonic() - began, 2)
-        self.counts["cpu"] = round((time.process_time() - spent) / max(1e-3, time.monotonic() - began), 3)
+        seconds = time.monotonic() - began
+        cpu = (time.process_time() - spent) / max(1e-3, seconds)
+        return {**self.counts, "heard": self.heard, "seconds": round(seconds, 2), "cpu": round(cpu, 3)}
 
     def _pause(self, began: float, spent: float, due: int) -> None:
         if self.counts["sent"] < due:
@@ -111,38 +131,52 @@ class Attacker:
 
     def _send(self, n: int) -> bool:
         """Whether somebody took them."""
-        speaker = self._speaker()
-        if speaker is None:
-            time.sleep(0.2)
-            return False
-        identity, peer = speaker
-        messages = [self._next(identity) for _ in range(n)]
-        self.ring += [Recorded(identity, True, parts) for parts in messages]
+        run = self.draw.choice(self.runs)
+        if self._mutates_hellos and self.draw.random() < RENEWED:
+            self._end(run)
+            run.identity = self._identity()
+        messages = [self._next(run.identity) for _ in range(n)]
         try:
-            peer.send(messages)
-            self.counts["bytes_heard"] += peer.drain()
+            speaker = self._speaker(run)
+            self.ring += [Recorded(run.identity, True, parts) for parts in messages]
+            speaker.send(messages)
+            self._hear(run, speaker.come())
         except OSError:
-            self.counts["closed"] += 1
-            self.speakers.remove(speaker)
-            peer.close()
+            self.counts["closed" if run.speaker else "unanswered"] += 1
+            time.sleep(0.0 if run.speaker else 0.2)
+            self._end(run)
             return False
         self.counts["sent"] += n
+        self.counts["with_run"] += n * run.welcome
         return True
 
-    def _speaker(self) -> tuple[bytes, Speaker] | None:
-        if len(self.speakers) < CONNECTIONS:
-            identity = self._identity()
-            try:
-                peer = self._dial(identity)
-                hello = self.corpus.hello(own_name(identity, self.args.keys), identity)
-                if self.args.kind != "hello" or self.args.valid:
-                    self.ring.append(Recorded(identity, True, hello))
-                    peer.send([hello])
-                self.speakers.append((identity, peer))
-                self.counts["connections"] += 1
-            except OSError:
-                self.counts["refused"] += 1
-        return self.draw.choice(self.speakers) if self.speakers else None
+    @property
+    def _mutates_hellos(self) -> bool:
+        return self.args.kind == "hello" and not self.args.valid
+
+    def _speaker(self, run: Run) -> Speaker:
+        """Its connection, made if it has none. Raises OSError."""
+        if run.speaker is None:
+            run.speaker, run.hello_at = self._dial(run.identity), -math.inf
+            self.counts["connections"] += 1
+        if time.monotonic() - run.hello_at > HELLO_EVERY_S and not self._mutates_hellos:
+            run.hello_at = time.monotonic()
+            hello = self.corpus.hello(own_name(run.identity, self.args.keys), run.identity)
+            self.ring.append(Recorded(run.identity, True, hello))
+            run.speaker.send([hello])
+        return run.speaker
+
+    def _hear(self, run: Run, messages: list[Message]) -> None:
+        for parts in messages:
+            kind = Recorded(run.identity, False, parts).kind
+            self.heard[kind] += 1
+            if kind in ("welcome", "refused"):
+                run.welcome = kind == "welcome"
+
+    def _end(self, run: Run) -> None:
+        if run.speaker is not None:
+            run.speaker.close()
+        run.speaker, run.welcome = None, False
 
     def _identity(self) -> bytes:
         if self.args.peer and self.draw.random() < 0.5:
@@ -207,11 +241,11 @@ def arguments(argv: list[str]) -> argparse.Namespace:
 def main() -> None:
     args = arguments(sys.argv[1:])
     attacker = Attacker(args)
-    attacker.run()
+    counts = attacker.run()
     if args.ring is not None:
-        about = {"attack": f"fuzz {args.kind}", "seed": args.seed, "sent": attacker.counts["sent"]}
+        about = {"attack": f"fuzz {args.kind}", "seed": args.seed, "sent": counts["sent"]}
         write(args.ring, attacker.ring, about)
-    print(json.dumps(attacker.counts))
+    print(json.dumps(counts))
 
 
 if __name__ == "__main__":

@@ -46,6 +46,8 @@ TEXTS += ["‮evil", "é" * 64, "\ud7ff" * 64, "<script>alert(1)</script>", "%s%
 DTYPES = ["<f8", "<f4", "<i8", "|u1", "|O", ">f8", "<U9999", "", "\x00"]
 DIMS = [0, 1, 3, 4, 32, 2000, 2001, 8192, 2**31, 2**63 - 1, 2**64 - 1, -1]
 LEFT_BE = 0.04  # the share that is a replay as it was
+MOST_PARTS = 9  # in a message: with more, its connection ends
+BEYOND = 0.0005  # the share that may have more
 
 
 def mutate(draw: random.Random, message: Message) -> Message:
@@ -54,7 +56,7 @@ def mutate(draw: random.Random, message: Message) -> Message:
         return list(message)
     for _ in range(draw.choice((1, 1, 1, 2, 3))):
         message = draw.choice(_ALL)(draw, message)
-    return message
+    return message if draw.random() < BEYOND else message[:MOST_PARTS]
 
 
 # ------------------------------------------------------------------ of bytes

@@ -159,15 +159,15 @@ def dial(address: str, timeout_s: float = 5.0) -> socket.socket:
     return socket.create_connection(host_port(address), timeout_s)
 
 
-def _first_frame(data: bytes) -> tuple[int, bytes, int] | None:
-    """Flags, body and length of the frame that `data` begins with, if all of it is there."""
-    if len(data) < 2:
+def _frame_at(data: bytes, at: int) -> tuple[int, bytes, int] | None:
+    """Flags and body of the frame that begins at `at`, and where it ends, if all of it is there."""
+    if len(data) < at + 2:
         return None
-    head = 9 if data[0] & LONG else 2
-    if len(data) < head:
+    begin = at + (9 if data[at] & LONG else 2)
+    if len(data) < begin:
         return None
-    size = struct.unpack(">Q", data[1:9])[0] if head == 9 else data[1]
-    return None if len(data) < head + size else (data[0], data[head : head + size], head + size)
+    end = begin + (struct.unpack_from(">Q", data, at + 1)[0] if data[at] & LONG else data[at + 1])
+    return None if len(data) < end else (data[at], data[begin:end], end)
 
 
 class RawPeer:
@@ -177,6 +177,7 @@ class RawPeer:
         self.socket = dial(address, timeout_s)
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._unread = b""
+        self._parts: Message = []
         self.socket.sendall(GREETING + ready(identity))
         self._read_exactly(64)
 
@@ -203,6 +204,31 @@ class RawPeer:
             self.socket.settimeout(5.0)
         return n
 
+    def come(self) -> list[Message]:
+        """Whole messages that have come, without waiting. Raises OSError once the other side has closed."""
+        self.socket.setblocking(False)
+        try:
+            while len(self._unread) < 1 << 22:
+                self._fill()
+        except BlockingIOError:
+            pass
+        finally:
+            self.socket.settimeout(5.0)
+        out: list[Message] = []
+        at = 0
+        while (found := _frame_at(self._unread, at)) is not None:
+            flags, body, at = found
+            if flags & COMMAND:
+                if body[:5] == b"\x04PING":
+                    self.socket.sendall(frame(b"\x04PONG" + body[7:], COMMAND))
+                continue
+            self._parts.append(body)
+            if not flags & MORE:
+                out.append(self._parts)
+                self._parts = []
+        self._unread = self._unread[at:]
+        return out
+
     def hear(self, timeout_s: float = 2.0) -> list[Message]:
         """Whole messages that have come, waiting for the first; pings of the link are answered."""
         self.socket.settimeout(timeout_s)
@@ -227,10 +253,10 @@ class RawPeer:
 
     def _frame(self) -> tuple[int, bytes]:
         """The next frame; what is not whole yet stays. Raises TimeoutError."""
-        while (found := _first_frame(self._unread)) is None:
+        while (found := _frame_at(self._unread, 0)) is None:
             self._fill()
-        flags, body, size = found
-        self._unread = self._unread[size:]
+        flags, body, end = found
+        self._unread = self._unread[end:]
         return flags, body
 
     def _fill(self) -> None:
