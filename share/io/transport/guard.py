@@ -5,8 +5,8 @@ what was handed over from whoever receives (`took`, `empty`). It cuts off who ha
 whose message has too many parts, who is no agent, and who says nothing.
 
 It looks in a thread of its own, and in that of whoever receives, which on a busy machine has its turn sooner.
-After somebody was cut off, newcomers are held until what still waits of it is thrown away: the kernel lets
-none of their data in, so that an attack that is repeated brings nothing, and honest ones are not turned away.
+Newcomers wait at its gate after somebody was cut off, so that an attack that is repeated brings nothing, and
+honest ones are not turned away.
 
 No whole message of a connection waits when `receive` has found nothing at all, and neither when as many
 messages of others were handed over as there can be connections: libzmq takes one of each in turn. What still
@@ -29,6 +29,7 @@ import zmq
 from share.io.transport import tcp
 from share.io.transport.account import Account, Bounds
 from share.io.transport.connection import Connection
+from share.io.transport.gate import Gate
 from share.io.transport.keep_out import KeepOut
 
 CONNECTIONS = 128  # at a time
@@ -39,9 +40,6 @@ _TICK_MS, _ALERT_MS = 20, 5
 _MANY = 64  # messages in less than _TICK_MS
 _ROUND = 2 * CONNECTIONS  # messages; those of connections that are closed by now wait beside the others
 GROWTH_BYTES = 12_000_000  # of memory, beyond the bytes that wait: small parts take much more than they have
-_PAUSE_S = 0.3  # without newcomers from where somebody offended of whom no more is known than that
-_AT_ONCE = 4  # that were held are let in: an attacker may have sent many
-_SETTLES_S = 0.05  # until all that libzmq has read of a connection that was cut off is there to be received
 _HOMES = 4096
 _EVENTS = (
     zmq.EVENT_LISTENING
@@ -73,19 +71,13 @@ class Guard:
         self._admitted: deque[tuple[str, str]] = deque(maxlen=CONNECTIONS)  # key and address
         self._lines: deque[str] = deque(maxlen=128)
         self._empty_s = 0.0
-        # Descriptors of those that were cut off: what still waits of them is thrown away, and nobody new is
-        # let in (who could have such a descriptor next) until nothing waits any more.
-        self._cut_off: frozenset[int] = frozenset()
-        self._cut_off_s = 0.0  # when the last was
+        self._gate = Gate()
         self._unlooked = 0  # messages since somebody looked
         self._turn = Lock()  # of who looks, and of what follows
         self._due_s, self._looked_s = 0.0, 0.0  # when to look again, and when last
         self._is_over = False
-        self._listener: tuple[int, int] | None = None  # descriptor and cookie
-        self._is_gated = False  # who is accepted is held from the start
         self._open: dict[int, Connection] = {}  # by descriptor
         self._ended: dict[int, float] = {}  # when a descriptor was last given back
-        self._paused: dict[str, float] = {}  # addresses of which nobody new is let in, until when
         self._to_fail = 0  # handshakes that were cut off
         self._orphaned = 0.0  # bytes of memory of connections that ended, since nothing waited
         self._homes: set[str] = set()  # addresses from which a key has sent a message
@@ -117,7 +109,7 @@ class Guard:
 
     def discards(self, descriptor: int) -> bool:
         """Whether what comes from that connection is to be thrown away."""
-        return descriptor in self._cut_off
+        return self._gate.discards(descriptor)
 
     def empty(self, asked_s: float) -> None:
         """There was no message when asked at `asked_s` (time.monotonic)."""
@@ -194,8 +186,7 @@ class Guard:
             if event == zmq.EVENT_MONITOR_STOPPED:
                 return False
             if event == zmq.EVENT_LISTENING:
-                number = tcp.cookie(value)
-                self._listener = None if number is None else (value, number)
+                self._gate.listen(value)
             elif event == zmq.EVENT_ACCEPTED:
                 self._accept(value)
             elif event == zmq.EVENT_DISCONNECTED:
@@ -216,33 +207,23 @@ class Guard:
         self._open[descriptor] = connection
         if self._kept_out.holds(connection.address, now_s):
             self._cut(connection)
-            self._cut_off |= {descriptor}
-        elif self._holds(connection.address, now_s):
-            connection.is_held = tcp.hold(descriptor, number)
+            self._gate.discard(descriptor)
         else:
-            tcp.release(descriptor, number)  # it may have come while the gate was closed
+            self._gate.admit(connection, self._is_full, now_s)
         self._make_room()
 
     def _is_sure(self, descriptor: int) -> bool:
         return self._ended.get(descriptor, -1.0) < self._empty_s
 
-    def _holds(self, address: str, now_s: float) -> bool:
-        """Whether newcomers from there have to wait."""
-        full = self._orphaned > self._bounds.total
-        return full or bool(self._cut_off) or now_s < self._paused.get(address, now_s)
+    @property
+    def _is_full(self) -> bool:
+        """Whether more waits to be thrown away than may wait at all."""
+        return self._orphaned > self._bounds.total
 
     def _let_in(self, now_s: float) -> None:
-        """Those who need not wait any longer; closes or opens the gate for those to come."""
-        held = [c for c in self._open.values() if c.is_held and not self._holds(c.address, now_s)]
-        for connection in held[:_AT_ONCE]:  # who came first
-            tcp.release(connection.descriptor, connection.cookie)
-            connection.is_held, connection.sure = False, self._is_sure(connection.descriptor)
+        for connection in self._gate.let_in(self._open.values(), self._is_full, now_s):
+            connection.sure = self._is_sure(connection.descriptor)
             connection.account.since_s = now_s
-        self._paused = {address: until_s for address, until_s in self._paused.items() if now_s < until_s}
-        gate = bool(self._paused) or self._holds("", now_s)
-        if gate != self._is_gated and self._listener is not None:
-            (tcp.hold if gate else tcp.release)(*self._listener)
-            self._is_gated = gate
 
     def _make_room(self) -> None:
         """Where there are too many, one that has said nothing goes, by chance among those of the address that
@@ -275,13 +256,12 @@ class Guard:
         if empty_s > self._marked_s or self._since_mark >= _ROUND:
             self._judge(empty_s, now_s)
         self._bound(now_s)
-        if empty_s > self._cut_off_s + _SETTLES_S:
-            self._cut_off = frozenset()
+        self._gate.empty(empty_s)
         much = sum(max(0, connection.account.waiting) for connection in self._present())
         if much > self._bounds.message:
             self._weigh(much, now_s)
         self._let_in(now_s)
-        if much <= self._bounds.message and not self._cut_off:
+        if much <= self._bounds.message and not self._gate.discards_any:
             self._resident, self._handed = tcp.resident_bytes(), 0
             return _TICK_MS
         self._poke()
@@ -385,8 +365,7 @@ class Guard:
 
     def _end(self, connection: Connection) -> None:
         self._cut(connection)
-        self._cut_off |= {connection.descriptor}
-        self._cut_off_s = time.monotonic()
+        self._gate.cut_off(connection.descriptor, time.monotonic())
 
     def _offend(self, connection: Connection, reason: str, now_s: float) -> None:
         """It sends what no agent does: it is kept out."""
@@ -397,8 +376,8 @@ class Guard:
         self._lines.append(f"{connection.name}: {reason}; cut off{' and kept out' if who else ''}")
         if who is not None:
             self._kept_out.offend(who, now_s)
-        elif connection.address in self._paused or len(self._paused) < _HOMES:
-            self._paused[connection.address] = now_s + _PAUSE_S
+        else:
+            self._gate.pause(connection.address, now_s)
 
     def _cut(self, connection: Connection) -> None:
         connection.is_cut = True
