@@ -1,7 +1,7 @@
 """Who has to wait before the edge's socket: the kernel lets none of their data in until they are released.
 
-After somebody was cut off, newcomers are held until what still waits of it is thrown away: one of them could have
-its descriptor next. And for a while those from an address whose offender is not known more closely.
+After somebody was cut off, newcomers are held until what still waits of it is thrown away: one of them could
+have its descriptor next. And for a while those from an address whose offender is not known more closely.
 """
 
 from __future__ import annotations
