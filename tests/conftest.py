@@ -5,7 +5,8 @@ from share import process
 process.prepare()
 
 import signal  # noqa: E402
-from collections.abc import Callable  # noqa: E402
+import time  # noqa: E402
+from collections.abc import Callable, Iterator  # noqa: E402
 from pathlib import Path  # noqa: E402
 
 import numpy as np  # noqa: E402
@@ -37,6 +38,14 @@ def share(capsys: pytest.CaptureFixture[str]) -> Callable[..., Done]:
         return Done(end.value.code, *capsys.readouterr())
 
     return run
+
+
+@pytest.fixture
+def soon() -> Iterator[None]:
+    """The test takes little CPU time: most that use this take milliseconds, what goes wrong takes minutes."""
+    began = time.process_time()
+    yield
+    assert time.process_time() - began < 20.0
 
 
 @pytest.fixture(scope="session")

@@ -65,6 +65,13 @@ def ended(arguments: list[str], after_s: float, number: int) -> tuple[int, str]:
     return process.returncode, said.decode()
 
 
+def printed(program: str) -> str:
+    """What a Python program prints that ends well and complains of nothing."""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
 def check(folder: Path, command: str, number: int, steps: Sequence[float]) -> None:
     make_euroc(folder / "walk", frames=40)
     for after_s in steps:
@@ -121,8 +128,7 @@ def test_an_import_is_not_interrupted(tmp_path):
         "try:\n    with unwinding():\n        import swallows\n        time.sleep(10)\n"
         "except KeyboardInterrupt:\n    print('interrupted')\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted\n", "")
+    assert printed(program) == "interrupted\n"
 
 
 def test_a_worker_is_not_left_half_started():
@@ -145,8 +151,7 @@ def test_a_worker_is_not_left_half_started():
         "try:\n    with unwinding():\n        worker.start()\n"
         "except KeyboardInterrupt:\n    worker.join()\n    print('interrupted')\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "worked\ninterrupted\n", "")
+    assert printed(program) == "worked\ninterrupted\n"
 
 
 @pytest.mark.parametrize("number", list(ENDED))
@@ -189,5 +194,4 @@ def test_what_waited_for_an_import_waits_for_a_worker_too():
         "        os.kill(os.getpid(), signal.SIGTERM)\n        worker.start()\n"
         "except SystemExit:\n    worker.join()\n    print('ended')\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "worked\nended\n", "")
+    assert printed(program) == "worked\nended\n"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sqlite3
-import time
 from pathlib import Path
 
 import numpy as np
@@ -21,14 +20,7 @@ from share.io.realsense import db3
 from share.io.source import open_source
 from share.run.pipeline import frames_of
 
-SOON_S = 10.0  # of CPU time, generous
-
-
-@pytest.fixture(autouse=True)
-def soon():
-    began = time.process_time()
-    yield
-    assert time.process_time() - began < SOON_S
+pytestmark = pytest.mark.usefixtures("soon")
 
 
 @pytest.fixture

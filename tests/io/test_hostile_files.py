@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import struct
-import time
 import zlib
 
 import cv2
@@ -34,14 +33,7 @@ from share.io.tables import longest_rising, read_table
 from share.run.pipeline import frames_of
 from share.strict import load_yaml
 
-SOON_S = 20.0  # of CPU time, generous: most take milliseconds
-
-
-@pytest.fixture(autouse=True)
-def soon():
-    began = time.process_time()
-    yield
-    assert time.process_time() - began < SOON_S
+pytestmark = pytest.mark.usefixtures("soon")
 
 
 # ------------------------------------------------------------------ YAML and JSON

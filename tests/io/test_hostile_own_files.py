@@ -6,7 +6,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import time
 import zipfile
 from pathlib import Path
 
@@ -37,14 +36,7 @@ from share.train.fitted import Fitted, read_fitted, write_fitted
 from share.train.label_file import Labels, read_labels, write_labels
 from share.train.score import read_scores
 
-SOON_S = 10.0  # of CPU time, generous
-
-
-@pytest.fixture(autouse=True)
-def soon():
-    began = time.process_time()
-    yield
-    assert time.process_time() - began < SOON_S
+pytestmark = pytest.mark.usefixtures("soon")
 
 
 # ------------------------------------------------------------------ arrays

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sqlite3
 import struct
-import time
 from pathlib import Path
 
 import numpy as np
@@ -29,14 +28,7 @@ from share.io.source import open_source
 from share.merge.join import Key
 from share.run.pipeline import frames_of
 
-SOON_S = 20.0  # of CPU time, generous: most take milliseconds
-
-
-@pytest.fixture(autouse=True)
-def soon():
-    began = time.process_time()
-    yield
-    assert time.process_time() - began < SOON_S
+pytestmark = pytest.mark.usefixtures("soon")
 
 
 # ------------------------------------------------------------------ MCAP

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import struct
-import time
 import zlib
 from pathlib import Path
 from typing import Any
@@ -22,14 +21,7 @@ from share.errors import DataError, ShareError
 
 pytest.importorskip("trimesh")
 
-SOON_S = 10.0  # of CPU time, generous: most take milliseconds
-
-
-@pytest.fixture(autouse=True)
-def soon():
-    began = time.process_time()
-    yield
-    assert time.process_time() - began < SOON_S
+pytestmark = pytest.mark.usefixtures("soon")
 
 
 def glb(folder: Path, made: Any, data: bytes = DATA, length: int | None = None) -> Path:
