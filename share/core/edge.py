@@ -19,6 +19,7 @@ from share.core.edge_events import (
     Add,
     Effect,
     Event,
+    Forget,
     Found,
     Join,
     Kept,
@@ -28,7 +29,7 @@ from share.core.edge_events import (
     Tick,
 )
 from share.core.finding import Finding
-from share.core.keeping import Change, KeepKeyframe, KeepRun
+from share.core.keeping import Change, ForgetRun, KeepKeyframe, KeepRun
 from share.core.peer import Known, Peer, Refusals, refused_lines
 from share.core.rate import seconds
 from share.core.records import Records
@@ -102,10 +103,12 @@ class Edge:
                 self._keep(*event.changes)
                 for finding in event.findings:
                     self._found(finding, now_ns)
+                self._runs.emptied(event.emptied)
             case Kept():
                 self._acknowledge(*self._safekeeping.kept(event.ticket))
             case Tick():
                 self._notice_silence(now_ns)
+                self._forget_emptied(now_ns)
 
     # ------------------------------------------------------------------ messages
 
@@ -231,6 +234,8 @@ class Edge:
         self._welcome(peer_id, self._runs[peer_id], now_ns)
 
     def _objection(self, event: Received, hello: wire.Hello, now_ns: int) -> str | None:
+        if self._runs.was_forgotten(event.peer):
+            return f"this run of '{hello.name}' was forgotten while it was away: start the agent again"
         return self._admission.objection(event, hello, self._runs, now_ns)
 
     def _refuse(self, peer_id: bytes, reason: str, now_ns: int, version: int = VERSION) -> None:
@@ -249,8 +254,15 @@ class Edge:
         self._runs.add(peer_id, peer)
         self._effects.append(Join(peer.key, peer.hello))
 
+    def _forget_emptied(self, now_ns: int) -> None:
+        for peer in self._runs.forgettable():
+            self._forget(peer, self._runs.forget(peer))
+            self._keep(ForgetRun(peer.key))
+            self._record_seldom(now_ns, "forgotten", peer, f"nothing is left of its run {peer.key}")
+
     def _forget(self, peer: Peer, was_latest: bool) -> None:
-        """Of a run that was never of use."""
+        """Of a run of which there is nothing."""
+        self._effects.append(Forget(peer.key))
         if was_latest:
             self._schedule.drop(peer.hello.name)
 
@@ -285,6 +297,7 @@ class Edge:
             self._complain(peer, str(error), now_ns)
             return
         if complaint:
+            peer.refusals.add(complaint, now_ns)
             self._record_seldom(now_ns, "odometry doubted", peer, complaint)
         assert peer.foot is not None
         run = (KeepRun(peer.key, peer.hello),) if begins else ()  # no run without a keyframe is kept
@@ -385,6 +398,7 @@ class Edge:
             "strangers": dict(self._strangers),
             "refused": refused_lines(self._runs.values(), self._strangers_refused, now_ns),
             "internal_errors": self._internal_errors,
+            "forgotten_runs": self._runs.forgotten,
             "version": __version__,
             "config": to_mapping(self._config),
         }

@@ -31,6 +31,7 @@ from share.core.edge_events import (
     Effect,
     EndTracking,
     Event,
+    Forget,
     Found,
     Join,
     Keep,
@@ -309,7 +310,7 @@ class EdgeRun:
         match effect:
             case Send():
                 self._link.send(effect.peer, effect.frames)
-            case Join() | Present() | Add() if self._mapping is not None:
+            case Join() | Present() | Add() | Forget() if self._mapping is not None:
                 self._mapping.send(effect)
             case BeginTracking() | Track() | EndTracking():
                 self._trackers.do(effect)

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from share.config import Config, GraphConfig
 from share.core.backoff import Backoff
-from share.core.edge_events import Add, Found, Join, Present
+from share.core.edge_events import Add, Forget, Found, Join, Present
 from share.core.finding import Finding
 from share.core.keeping import Kept
 from share.core.mapper import Mapper
@@ -68,7 +68,7 @@ class _Solved:
 
 
 def map_all(inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
-    """For a `Companion`: takes Restore, Join, Present and Add, until END; answers Found, Mapped, Restored
+    """For a `Companion`: takes Restore, Join, Present, Add and Forget, until END; answers Found, Mapped, Restored
     and SolverLost."""
     _Mapping(inbox, answer, settings).go()
 
@@ -128,6 +128,8 @@ class _Mapping:
                 self._mapper.join(message.key, message.hello)
             case Present():
                 self._mapper.present(message.key, message.here)
+            case Forget():
+                self._guarded("forget", partial(self._mapper.forget, message.key), None)
             case Add():
                 add = partial(self._mapper.add, message.key, message.keyframe)
                 self._findings += self._guarded("keyframe", add, [], message.key)
@@ -180,8 +182,9 @@ class _Mapping:
         if self._is_moved and time.monotonic() >= self._poses_at:
             self._is_moved, self._poses_at = False, time.monotonic() + _POSES_S
             changes = (*changes, self._mapper.poses())
-        if self._findings or changes:
-            self._answer(Found(tuple(self._findings), changes))
+        emptied = self._mapper.take_emptied()
+        if self._findings or changes or emptied:
+            self._answer(Found(tuple(self._findings), changes, emptied))
             self._findings = []
         if time.monotonic() >= self._report_at:
             self._report_at = time.monotonic() + _REPORT_S
