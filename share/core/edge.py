@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 from share import __version__
 from share.config import Config
 from share.core.admission import Admission, new_key
+from share.core.allowance import Allowance
 from share.core.edge_events import (
     Add,
     Effect,
@@ -67,6 +68,7 @@ class Edge:
         self._strangers: Counter[str] = Counter()
         self._strangers_refused = Refusals()
         self._admission = Admission(config.edge, self.tracks)
+        self._allowance = Allowance()
         self._records, self._versions = Records(began_ns), OtherVersions()
         self._internal_errors = 0
         self._safekeeping = Safekeeping(keeps)
@@ -280,9 +282,13 @@ class Edge:
 
     def _in_order(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> list[Keyframe]:
         """What can be applied now; nothing of an agent that sends more than is taken in."""
-        if (reason := peer.too_many(now_ns)) is not None:
-            peer.refusals.add(reason, now_ns)
-            return []
+        if keyframe.id >= peer.inorder.next_keyframe:  # else it costs nothing
+            name = peer.hello.name
+            reason = peer.too_many() or self._allowance.objection(name, keyframe, now_ns)
+            if reason is not None:
+                peer.refusals.add(reason, now_ns)
+                peer.held_back.note(reason, now_ns)
+                return []
         try:
             return peer.inorder.push(keyframe)
         except ValueError as error:

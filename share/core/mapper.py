@@ -91,6 +91,10 @@ class Mapper:
         self._accounts[agent] = _Account()
         self._atlas.join(agent, hello.name)
 
+    def name(self, agent: str) -> str:
+        """Of the agent whose run it is."""
+        return self._hellos[agent].name if agent in self._hellos else agent
+
     def present(self, agent: str, here: bool) -> None:
         """Nobody waits for a run that is not heard."""
         self._atlas.present(agent, here)

@@ -13,7 +13,7 @@ from share.core.finding import Finding, in_map
 from share.core.inorder import InOrder
 from share.core.keeping import Kept, placed
 from share.core.peer_status import PeerStatus
-from share.core.rate import SECOND_NS, TokenBucket
+from share.core.rate import SECOND_NS
 from share.geometry import se3
 from share.merge.join import Key, Loop
 from share.types import F64, Keyframe
@@ -24,9 +24,7 @@ _LEAP_M, _LEAP_M_S = 2.0, 10.0  # further than this, and so much more a second, 
 # these differ by up to 3 cm after 8 s and 6 m, and by 2.7 degrees while a headset learns what is up.
 _OFF_M, _OFF_A_METRE, _OFF_RAD = 0.3, 0.05, float(np.radians(12.0))
 _AGAIN, _RECENT_S = 10, 10.0  # refused messages that are worth a person's while, and for how long
-# Keyframes of one agent that are taken in: at once what a full ledger sends to a new edge, then more a second
-# than any camera gives. What exceeds it is not applied, and its agent sends it again.
-_KEYFRAME_BURST, _KEYFRAME_HZ = 1000.0, 50.0
+_HELD_S = 2.0  # that it is said of an agent that its keyframes were not taken in
 _MAX_UNSAFE = 256  # keyframes that may wait for the disk: an agent has 16 under way
 _MOST_VARIANCE = 100.0  # rad^2, m^2: says nothing; more would only upset the solver
 
@@ -73,12 +71,6 @@ class Known:
     finding: Finding | None = None
 
 
-def _keyframe_rate() -> TokenBucket:
-    bucket = TokenBucket(_KEYFRAME_BURST)
-    bucket.hz = _KEYFRAME_HZ
-    return bucket
-
-
 @dataclass
 class Refusals:
     """Messages of a peer that were not accepted: how many, and why and when the newest was not."""
@@ -98,6 +90,23 @@ class Refusals:
 
 
 @dataclass
+class HeldBack:
+    """Keyframes that were not taken in, since there were too many, and are sent again."""
+
+    reason: str = ""
+    at_ns: int = 0
+
+    def note(self, reason: str, now_ns: int) -> None:
+        self.reason, self.at_ns = reason, now_ns
+
+    def said(self, status: dict[str, Any], now_ns: int) -> dict[str, Any]:
+        """`status` with the reason, while that is news."""
+        if not self.reason or now_ns - self.at_ns > _HELD_S * SECOND_NS:
+            return status
+        return {**status, "reason": "; ".join(filter(None, (status["reason"], self.reason)))}
+
+
+@dataclass
 class Peer:
     """safe: all its keyframes below this number will be there after a crash, and so are acknowledged.
     unsafe: how many are applied and not safe yet."""
@@ -111,7 +120,7 @@ class Peer:
     status: PeerStatus = field(default_factory=PeerStatus)
     counts: Counter[str] = field(default_factory=Counter)
     refusals: Refusals = field(default_factory=Refusals)
-    keyframe_rate: TokenBucket = field(default_factory=_keyframe_rate)
+    held_back: HeldBack = field(default_factory=HeldBack)
     revision: int = 0
     gone: bool = False
     newest: Finding | None = None  # the newest correction; who has been away may not have got it
@@ -124,11 +133,9 @@ class Peer:
         """Whether it is gone and never sent a keyframe."""
         return self.gone and self.inorder.next_keyframe == 0
 
-    def too_many(self, now_ns: int) -> str | None:
+    def too_many(self) -> str | None:
         """Why no other keyframe is applied now; None if one may be."""
-        if self.unsafe >= _MAX_UNSAFE:
-            return f"{self.unsafe} keyframes wait for the disk"
-        return None if self.keyframe_rate.take(now_ns) else "keyframes come faster than they can be taken in"
+        return f"{self.unsafe} keyframes wait for the disk" if self.unsafe >= _MAX_UNSAFE else None
 
     def place(self, keyframe: Keyframe) -> tuple[Keyframe, str | None]:
         """The next keyframe in order as the map may have it, and what was wrong with it.
@@ -160,7 +167,7 @@ class Peer:
         return {
             "kind": str(self.hello.kind),
             "run": self.key,
-            **self.status.report(now_ns, self.heard_ns if self.was_heard else None),
+            **self.held_back.said(self.status.report(now_ns, self.heard_ns if self.was_heard else None), now_ns),
             "gone": self.gone,
             **{name: self.counts[name] for name in _COUNTS},
             "refused_messages": self.refusals.n,
