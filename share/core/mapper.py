@@ -352,7 +352,9 @@ class Mapper:
         most = self._config.edge.max_keyframes
         if not self._leaving and len(self._atlas) > max(most * _SLACK, self._crowded):
             self._leaving = self._atlas.redundant(len(self._atlas) - most)
-            self._crowded = 0.0 if self._leaving else len(self._atlas) * _SLACK  # nothing may go: not each time
+            self._crowded = (
+                0.0 if self._leaving else len(self._atlas) * _SLACK
+            )  # nothing may go: not each time
         if not self._leaving:
             return
         self._see_restored()

@@ -167,7 +167,9 @@ class Peer:
         return {
             "kind": str(self.hello.kind),
             "run": self.key,
-            **self.held_back.said(self.status.report(now_ns, self.heard_ns if self.was_heard else None), now_ns),
+            **self.held_back.said(
+                self.status.report(now_ns, self.heard_ns if self.was_heard else None), now_ns
+            ),
             "gone": self.gone,
             **{name: self.counts[name] for name in _COUNTS},
             "refused_messages": self.refusals.n,

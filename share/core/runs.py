@@ -10,7 +10,9 @@ from share.merge.join import Key
 from share.wire.messages import peer_id
 
 _MAX_IDLE = 256  # gone without a keyframe; the oldest is forgotten
-_MAX_FORGOTTEN = 65_536  # runs that are known to have been forgotten; of the others nobody was heard for hours
+_MAX_FORGOTTEN = (
+    65_536  # runs that are known to have been forgotten; of the others nobody was heard for hours
+)
 
 
 class Runs(Mapping[bytes, Peer]):
@@ -21,7 +23,9 @@ class Runs(Mapping[bytes, Peer]):
         self._peers: dict[bytes, Peer] = {}
         self._by_key: dict[str, bytes] = {}
         self._latest: dict[str, Peer] = {}  # run of each name
-        self._emptied: dict[str, int] = {}  # runs of which the map has nothing any more, and their newest keyframe
+        self._emptied: dict[
+            str, int
+        ] = {}  # runs of which the map has nothing any more, and their newest keyframe
         self._forgotten: dict[bytes, None] = {}
         self.forgotten = 0  # how many, since the edge began
 

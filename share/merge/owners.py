@@ -54,9 +54,7 @@ class Owners:
         return {name: at for at, name in enumerate(self._latest)}
 
 
-def dues(
-    held: Counter[str], most: Counter[str], count: int, heard_of: Mapping[str, int]
-) -> Counter[str]:
+def dues(held: Counter[str], most: Counter[str], count: int, heard_of: Mapping[str, int]) -> Counter[str]:
     """How many of `count` each name gives: again and again the one that holds most, of several the one heard
     of longest ago. So nobody who holds no more than a fair share gives anything.
 

@@ -69,8 +69,8 @@ class _Solved:
 
 
 def map_all(inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
-    """For a `Companion`: takes Restore, Join, Present, Add and Forget, until END; answers Found, Mapped, Restored
-    and SolverLost."""
+    """For a `Companion`: takes Restore, Join, Present, Add and Forget, until END; answers Found, Mapped,
+    Restored and SolverLost."""
     _Mapping(inbox, answer, settings).go()
 
 

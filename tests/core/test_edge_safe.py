@@ -37,7 +37,9 @@ def keyframe(
     T_odom_body = T_odom_body @ se3.exp(np.array([0, 0, yaw, 0, 0, 0]))
     T = T_odom_body if reference < 0 else T
     stamp_ns = (200 * id if stamp_ms is None else stamp_ms) * MS
-    return Keyframe(id, reference, stamp_ns, T, 1e-6 * np.eye(6), T_odom_body, np.zeros(3), 0.0, EMPTY, id - 1)
+    return Keyframe(
+        id, reference, stamp_ns, T, 1e-6 * np.eye(6), T_odom_body, np.zeros(3), 0.0, EMPTY, id - 1
+    )
 
 
 def tell(edge: Edge, message: m.Message) -> list[ed.Effect]:

@@ -137,7 +137,7 @@ def test_a_run_that_comes_back_before_it_is_forgotten_goes_on(tmp_path: Path) ->
     """What the mapper said of it is of before."""
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = crowded(store, runs=6)
-        gone = [run for run in life.mapper.report()["agents"] if run.startswith("eve")][0]
+        gone = next(run for run in life.mapper.report()["agents"] if run.startswith("eve"))
         step = Keyframe(8, 7, 8 * S, at(1.0), 1e-6 * np.eye(6), at(8), np.zeros(3), 0.0, EMPTY, 7)
         number = next(k for k in range(6) if f"-{m.public_tag(100 + k)[:4]}" in gone)
         life.tell(100 + number, hello_of("eve", 100 + number))
