@@ -18,24 +18,21 @@ from share.core.gating import Gating
 from share.core.keeping import (
     Change,
     DropLoop,
-    KeepLink,
     KeepLoop,
     KeepPoses,
     Kept,
     KeptKeyframe,
-    Retire,
-    edge_to,
 )
 from share.core.lookups import Lookups, form_of, served_as
+from share.core.map_news import changes_of, kept_link, placed_again
 from share.core.search import Effort, Search
 from share.core.steps import Look, Query, Solve, Step, Verify
 from share.errors import describe
 from share.graph.change import Solution
-from share.merge.atlas import Applied, Atlas, Placed
+from share.merge.atlas import Applied, Atlas
 from share.merge.join import Key, Loop
 from share.merge.judge import Decision
 from share.merge.parting import Parted
-from share.merge.thinning import Link, TakenOut
 from share.metrics.latency import summary
 from share.place.index import PlaceIndex
 from share.place.verify import Refusal, Sight, Verified
@@ -114,7 +111,7 @@ class Mapper:
         """A keyframe, in order, each once."""
         self._accounts[agent].newest = keyframe.id
         keyframe, link = self._atlas.tied(agent, keyframe)
-        self._changes += [] if link is None else [_kept_link(link)]
+        self._changes += [] if link is None else [kept_link(link)]
         number = self._atlas.add_keyframe(agent, keyframe, rank=self._rank(agent))
         self._see(number, agent, keyframe)
         self._lookups.add(agent, served_as(self._config, self._hellos[agent]), number)
@@ -133,9 +130,7 @@ class Mapper:
         agents = [name.rpartition("/")[0] for name in kept.stretches]
         ranks = [self._rank(a, name in founders) for a, name in zip(agents, kept.stretches, strict=True)]
         stretches = list(zip(agents, ranks, strict=True))
-        placed = [
-            _placed(found, edge_to(found, kept.links), found.at in kept.links) for found in kept.keyframes
-        ]
+        placed = [placed_again(found, kept.links) for found in kept.keyframes]
         numbers = self._atlas.restore(stretches, placed, kept.loops, poses)
         self._unseen = list(zip(numbers, kept.keyframes, strict=True))
 
@@ -244,7 +239,7 @@ class Mapper:
         return taken
 
     def take_emptied(self) -> tuple[Key, ...]:
-        """Runs of which nothing is left since the last call, each with the newest keyframe that came of it."""
+        """Runs of which nothing is left since the last call, each with the newest keyframe that came."""
         taken, self._emptied = tuple(self._emptied), []
         return taken
 
@@ -364,7 +359,7 @@ class Mapper:
             self._index.remove(out.number)
             del self._sights[out.number]
         self._counts["taken_out"] += len(taken)
-        self._changes += _changes_of(taken)
+        self._changes += changes_of(taken)
         empty = {out.key.agent for out in taken if self._atlas.is_forgotten(out.key.agent)}
         self._emptied += [Key(agent, self._accounts[agent].newest) for agent in empty]
 
@@ -403,24 +398,3 @@ class Mapper:
 
 def _told(merges: Counter[str]) -> dict[str, int]:
     return {what: merges[what] for what in ("requested", "skipped", "done")}
-
-
-def _placed(found: KeptKeyframe, edge: KeepLink, linked: bool) -> Placed:
-    return Placed(
-        found.at, found.stretch, found.ordinal, found.keyframe, edge.T_ref_body, edge.cov, not linked
-    )
-
-
-def _kept_link(link: Link) -> KeepLink:
-    reference = -1 if link.reference is None else link.reference.id
-    return KeepLink(link.key, reference, link.T_ref_body, link.cov)
-
-
-def _changes_of(taken: list[TakenOut]) -> list[Change]:
-    """In the order in which they happened: a link may lead to one that goes next."""
-    changes: list[Change] = []
-    for out in taken:
-        if out.link is not None:
-            changes.append(_kept_link(out.link))
-        changes += [Retire((out.key,)), *(KeepLoop(loop) for loop in out.moved)]
-    return changes

@@ -20,8 +20,8 @@ from share.types import F64, Keyframe
 from share.wire.messages import Hello
 
 _LEAP_M, _LEAP_M_S = 2.0, 10.0  # further than this, and so much more a second, nobody moves between keyframes
-# T_ref_body is of what the filter knows now, T_odom_body of what it knew then (docs/edge-map.md): of honest agents
-# these differ by up to 3 cm after 8 s and 6 m, and by 2.7 degrees while a headset learns what is up.
+# T_ref_body is of what the filter knows now, T_odom_body of what it knew then (docs/edge-map.md): of honest
+# agents these differ by up to 3 cm after 8 s and 6 m, and by 2.7 degrees while a headset learns what is up.
 _OFF_M, _OFF_A_METRE, _OFF_RAD = 0.3, 0.05, float(np.radians(12.0))
 _AGAIN, _RECENT_S = 10, 10.0  # refused messages that are worth a person's while, and for how long
 _HELD_S = 2.0  # that it is said of an agent that its keyframes were not taken in
@@ -140,8 +140,8 @@ class Peer:
     def place(self, keyframe: Keyframe) -> tuple[Keyframe, str | None]:
         """The next keyframe in order as the map may have it, and what was wrong with it.
 
-        The step of one that leaps, or whose step is not that between its two poses, is not believed: it begins a
-        stretch, in the same odom. A covariance beyond all measure is bounded.
+        The step of one that leaps, or whose step is not that between its two poses, is not believed: it
+        begins a stretch, in the same odom. A covariance beyond all measure is bounded.
         Raises ValueError where what it refers to is not the keyframe before it.
         """
         complaint = None

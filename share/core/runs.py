@@ -91,7 +91,7 @@ class Runs(Mapping[bytes, Peer]):
         return was_latest
 
     def was_forgotten(self, peer_id: bytes) -> bool:
-        """Whether keyframes of this run were acknowledged in this life of the edge and are not known any more."""
+        """Whether this run was, in this life of the edge: keyframes that were acknowledged are not known."""
         return peer_id in self._forgotten
 
     def forget_idle(self) -> tuple[Peer, bool] | None:

@@ -67,8 +67,9 @@ def _sum(
 
 
 def _at(report: Mapping[str, Any], path: tuple[str, ...]) -> int:
+    found: Any = report
     for key in path:
-        if key not in report:
+        if key not in found:
             return 0
-        report = report[key]
-    return int(report)  # type: ignore[call-overload]
+        found = found[key]
+    return int(found)

@@ -1,4 +1,4 @@
-"""Keyframes that wait to be taken into the map, of each name in turn: who sends many waits for itself alone."""
+"""Keyframes that wait to be taken into the map, of each name in turn: who sends many waits for itself."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Turns(Generic[T]):
         self._waiting.setdefault(name, deque()).append(what)
 
     def next(self, spent_ms: float = 0.0) -> T | None:
-        """What is taken in now. spent_ms: on those before it, since a keyframe was last looked up. None: there
-        is nothing, or it is time to look one up."""
+        """What is taken in now. spent_ms: on those before it, since a keyframe was last looked up. None:
+        there is nothing, or it is time to look one up."""
         if not self._waiting or spent_ms >= _MOST_MS:
             return None
         name = next(iter(self._waiting))

@@ -35,9 +35,8 @@ from share.types import F64, Correction, Keyframe
 
 @dataclass(frozen=True, eq=False)
 class Applied:
-    """What a solution changed. corrections: by agent. reason: for events.jsonl. tied, dropped: loops that
-    are believed since, and those that are no longer. waiting: agents who do not hear of it yet, since it
-    knows them to so many m only."""
+    """What a solution changed. corrections: by agent. tied, dropped: loops that are believed since, and those
+    that are no longer. waiting: agents who do not hear of it yet, since it knows them to so many m only."""
 
     corrections: dict[str, Correction]
     reason: str
@@ -212,9 +211,7 @@ class Atlas:
             at[chart.trails.stretches[stretch].name] = stretch
         numbers = []
         for found in keyframes:
-            cov = found.cov
-            if found.as_sent:
-                cov = believed(self._config, found.T_ref_body, found.cov)
+            cov = believed(self._config, found.T_ref_body, found.cov) if found.as_sent else found.cov
             T_odom_body = found.keyframe.T_odom_body
             numbers.append(chart.trails.put(found.key, at[found.stretch], T_odom_body, found.ordinal))
             chart.place(numbers[-1], found.T_ref_body, cov, plumb_of(self._config, found.keyframe))
@@ -244,16 +241,14 @@ class Atlas:
                 if stretch not in chart.trails.live:
                     self._surety.forget([stretch])
         live = {chart.founder[stretch] for stretch in chart.trails.live}
-        chart.unsolved = {founder: None for founder in chart.unsolved if founder in live}
+        chart.unsolved = dict.fromkeys(founder for founder in chart.unsolved if founder in live)
         self._judge.forget({out.key for out in taken})
         self._parting.agreement.forget([out.number for out in taken])
         return taken
 
     def propose(self, loop: Loop) -> Decision:
-        """A verified loop from candidate a to query b: accepted, waiting, or refused, with the reason.
-
-        Raises ValueError if either keyframe is unknown.
-        """
+        """A verified loop from candidate a to query b: accepted, waiting, or refused, with the reason. Raises
+        ValueError if either keyframe is unknown."""
         if why := self._parting.forbids(loop):
             return Decision(False, f"loop {loop}: {why}")
         decision = self._judge.decide(loop)

@@ -192,7 +192,7 @@ def counts(inbox, answer, settings):
 
 
 def test_what_was_counted_before_a_mapper_died_still_counts(edge):
-    run, pauses, told = edge(counts)
+    run, _, told = edge(counts)
     for dead in range(1, 4):
         step_until(run, lambda dead=dead: len(events(told, "mapper lost")) >= dead)
         run._note()

@@ -20,7 +20,6 @@ from share.io.map_store import rows
 from share.io.map_store.rows import COLUMNS, insert
 from share.merge.join import Key
 
-
 _OF_RUN = (
     *(("run", "key"), ("run_copy", "key"), ("stretch", "run"), ("keyframe", "run"), ("link", "run")),
     *(("loop", "a_run"), ("loop", "b_run")),
