@@ -7,8 +7,8 @@ from share.types import Keyframe
 
 # Of every keypoint the mapper's work is about the same, and of a keyframe without any as of so many
 # (docs/robustness.md). An agent of the shipped settings sends keyframes of 500, at most 5 a second
-# (control.rate_max_hz), and to a new edge at once what its ledger holds, 600. Twice that rate is taken in, and
-# 700 at once.
+# (control.rate_max_hz), and to a new edge at once what its ledger holds, 600. Twice that rate is taken in,
+# and 700 at once.
 _BARE = 250
 _KEYFRAME = 500 + _BARE
 _HZ, _BURST = 10.0 * _KEYFRAME, 700.0 * _KEYFRAME

@@ -86,7 +86,7 @@ class Mapper:
         """A run of an agent, before its first keyframe."""
         self._hellos[agent] = hello
         self._accounts[agent] = _Account()
-        self._atlas.join(agent, hello.name)
+        self._atlas.enter(agent, hello.name)
 
     def name(self, agent: str) -> str:
         """Of the agent whose run it is."""

@@ -16,9 +16,9 @@ from share.config import MergeConfig
 from share.geometry import se3
 from share.graph.change import Solution
 from share.merge.agreement import Standing
-from share.merge.belief import believed, plumb_of
 from share.merge.chart import Chart
 from share.merge.culling import Culling
+from share.merge.floors import believed, plumb_line
 from share.merge.join import Key, Loop
 from share.merge.judge import Decision, Judge, that_waited
 from share.merge.owners import Owners
@@ -140,8 +140,8 @@ class Atlas:
 
     # ------------------------------------------------------------ what arrives
 
-    def join(self, agent: str, name: str) -> None:
-        """A run of an agent of this name, before its first keyframe."""
+    def enter(self, agent: str, name: str) -> None:
+        """A run of the agent of this name comes."""
         self._owners.join(agent, name)
 
     def present(self, agent: str, here: bool) -> None:
@@ -188,7 +188,7 @@ class Atlas:
         Raises ValueError for a keyframe known already or whose reference is unknown.
         """
         cov = believed(self._config, keyframe.T_ref_body, keyframe.cov)
-        plumb = plumb_of(self._config, keyframe)
+        plumb = plumb_line(self._config, keyframe)
         number = self._chart.add(agent, keyframe, cov, plumb, rank)
         self._parting.agreement.walk(number, self._chart.trails.before(number), keyframe.T_ref_body, cov)
         return number
@@ -214,7 +214,7 @@ class Atlas:
             cov = believed(self._config, found.T_ref_body, found.cov) if found.as_sent else found.cov
             T_odom_body = found.keyframe.T_odom_body
             numbers.append(chart.trails.put(found.key, at[found.stretch], T_odom_body, found.ordinal))
-            chart.place(numbers[-1], found.T_ref_body, cov, plumb_of(self._config, found.keyframe))
+            chart.place(numbers[-1], found.T_ref_body, cov, plumb_line(self._config, found.keyframe))
             self._parting.agreement.walk(numbers[-1], chart.trails.before(numbers[-1]), found.T_ref_body, cov)
             chart.poses[numbers[-1]] = T_map_body.get(found.key, chart.poses[numbers[-1]])
         for loop in loops:

@@ -23,7 +23,7 @@ STANDING = np.eye(4)
 def walk(atlas: Atlas, run: str, name: str, count: int, step_m: float = 1.0, first: int = 0) -> None:
     """So many keyframes of a run, a step forwards each."""
     if first == 0:
-        atlas.join(run, name)
+        atlas.enter(run, name)
     for k in range(first, first + count):
         T_odom_body = at(step_m * k)
         T = T_odom_body if k == 0 else at(step_m)
@@ -101,12 +101,12 @@ def test_any_number_of_small_runs_of_one_name_takes_nothing_of_anothers() -> Non
 
 def test_they_take_nothing_either_once_they_are_in_its_map() -> None:
     ann, atlas, rng = Walker("ann", 1), Atlas(CONFIG), np.random.default_rng(0)
-    atlas.join("ann", "ann")
+    atlas.enter("ann", "ann")
     for keyframe in ann.keyframes:
         atlas.add_keyframe("ann", keyframe)
     for k in range(12):
         eve = Walker(f"eve-{k}", 10 + k, n=14)
-        atlas.join(eve.name, "eve")
+        atlas.enter(eve.name, "eve")
         for keyframe in eve.keyframes:
             atlas.add_keyframe(eve.name, keyframe)
         atlas._chart.tie(loop(ann, 5 * k, eve, 3, rng))
@@ -158,7 +158,7 @@ def test_new_stretches_of_a_present_run_are_no_way_out() -> None:
     """Each is a map of its own, whose first keyframe held its gauge."""
     atlas = Atlas(CONFIG)
     walk(atlas, "ann-1", "ann", 30)
-    atlas.join("eve-1", "eve")
+    atlas.enter("eve-1", "eve")
     for k in range(100):
         keyframe = Keyframe(k, -1, k * 10**8, STANDING, STEP, STANDING, UP, UP_SIGMA, EMPTY)
         atlas.add_keyframe("eve-1", keyframe)
@@ -190,7 +190,7 @@ def test_a_stretch_that_holds_two_others_together_is_not_forgotten() -> None:
     ann, bob = Walker("ann", 1, n=20), Walker("bob", 2, n=20)
     eve, atlas, rng = Walker("eve-0", 3, n=20), Atlas(CONFIG), np.random.default_rng(0)
     for walker, name in ((ann, "ann"), (bob, "bob"), (eve, "eve")):
-        atlas.join(walker.name, name)
+        atlas.enter(walker.name, name)
         for keyframe in walker.keyframes:
             atlas.add_keyframe(walker.name, keyframe)
     for one in (loop(ann, 3, eve, 4, rng), loop(bob, 7, eve, 15, rng)):
