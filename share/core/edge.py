@@ -86,6 +86,7 @@ class Edge:
         self._record_seldom(now_ns, "internal error", peer, reason)
 
     def _react(self, event: ed.Event, now_ns: int) -> None:
+        self._forget_emptied(now_ns)  # before one of them says hello: its keyframes would be taken as known
         match event:
             case ed.Received():
                 self._receive(event, now_ns)
@@ -98,7 +99,6 @@ class Edge:
                 self._acknowledge(*self._safekeeping.kept(event.ticket))
             case ed.Tick():
                 self._notice_silence(now_ns)
-                self._forget_emptied(now_ns)
 
     # ------------------------------------------------------------------ messages
 

@@ -164,6 +164,18 @@ def test_a_crash_before_a_run_is_forgotten_is_made_up_for(tmp_path: Path) -> Non
         assert len(store.load().runs) == 2
 
 
+def test_a_run_that_such_a_crash_left_begins_anew(tmp_path: Path) -> None:
+    """Its agent is the first to be heard. What it sends is in the file, though its numbers were there."""
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = crowded(store, runs=1)
+        gone = next(run for run in life.mapper.report()["agents"] if run.startswith("eve"))
+        store.write([Retire(tuple(k.at for k in store.load().keyframes if k.key == gone))])
+        second = Life(store, session=8)
+        second.run("eve", 100, 3)
+        assert second.sent[0] == m.Welcome(8, 0)
+        assert [k.at.id for k in store.load().keyframes if k.key == gone] == [0, 1, 2]
+
+
 def test_runs_that_never_sent_a_keyframe_leave_the_mapper_too(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "room.sqlite") as store:
         life = Life(store)
