@@ -46,7 +46,7 @@ class Culling:
         return number != chart.anchor(founder) and (len(nodes) > 1 or stretch not in bridging(chart.bonds))
 
     def _chosen(self, count: int, return_expected: bool) -> list[int]:
-        chart, maps = self._chart, self._maps()
+        maps = self._maps()
         over = [founder for founder, stretches in maps.items() if self._is_over(stretches)]
         others = [founder for founder in maps if founder not in set(over)]
         stay = self._staying(others, return_expected)
@@ -54,14 +54,7 @@ class Culling:
         for founders, below in ((over, _ALIKE), (others, _ALIKE)):
             for founder in founders:
                 self._thin(maps[founder], stay, due, out, below)
-        for founder in reversed(over):
-            left = [n for s in maps[founder] for n in chart.trails.stretches[s].nodes if n not in out]
-            if left and len(left) <= due[name := self._name(left[0])]:
-                due[name] -= len(left)
-                out |= dict.fromkeys(left)
-            else:
-                self._thin(maps[founder], stay, due, out)
-        for founder in others:
+        for founder in (*reversed(over), *others):
             self._thin(maps[founder], stay, due, out)
         return list(out)
 

@@ -148,6 +148,35 @@ def test_a_run_that_comes_back_before_it_is_forgotten_goes_on(tmp_path: Path) ->
         assert gone in life.mapper.report()["agents"]
 
 
+def test_a_run_that_comes_back_to_less_is_tied_to_what_is_left_in_the_file_too(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = Life(store)
+        for name, run_id, count in (("ann", 1, 2), ("eve", 100, 20), ("eve", 101, 1)):
+            life.run(name, run_id, count, stays=name == "ann")
+        atlas = life.mapper._atlas
+        key = next(key.agent for key in atlas.everything()[0] if key.id == 19)
+        life.mapper._leaving = [
+            n for n in atlas._chart.poses if atlas.key(n) in {(key, k) for k in range(8, 20)}
+        ]
+        while life.mapper._leaving:
+            life.mapper._thin()
+        life.handle(ed.Tick())
+        life.tell(100, hello_of("eve", 100))
+        life.tell(
+            100, Keyframe(20, 19, 20 * S, at(1.0), 1e-6 * np.eye(6), at(20), np.zeros(3), 0.0, EMPTY, 19)
+        )
+        kept = store.load()
+        link = kept.links[ed.Key(key, 20)]
+        assert (link.reference, link.T_ref_body[0, 3]) == (7, 13.0)
+        second = Life(store, session=8)
+        assert np.allclose(second.mapper.poses().T_map_body, life.mapper.poses().T_map_body)
+        covs = [
+            one._atlas._chart.step(*one._atlas._chart.trails.stretches[1].nodes[-2:]).cov
+            for one in (life.mapper, second.mapper)
+        ]
+        assert np.allclose(covs[0], covs[1])
+
+
 def test_a_crash_before_a_run_is_forgotten_is_made_up_for(tmp_path: Path) -> None:
     """Its keyframes went from the file, and the run itself did not."""
     with MapStore.open(tmp_path / "room.sqlite") as store:

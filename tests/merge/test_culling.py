@@ -186,6 +186,16 @@ def test_with_more_names_than_room_those_heard_of_longest_ago_go_altogether() ->
     assert all(count == 1 for count in held(atlas).values())
 
 
+def test_where_there_is_no_other_way_the_newest_of_those_who_are_away_go_too() -> None:
+    atlas = Atlas(CONFIG)
+    walk(atlas, "ann-1", "ann", 12)
+    for k in range(9):
+        walk(atlas, f"n{k}-1", f"n{k}", 12)
+        atlas.present(f"n{k}-1", False)
+    thin(atlas, 47)
+    assert held(atlas) == Counter({"ann-1": 11} | {f"n{k}-1": 4 for k in range(9)})
+
+
 def test_a_stretch_that_holds_two_others_together_is_not_forgotten() -> None:
     ann, bob = Walker("ann", 1, n=20), Walker("bob", 2, n=20)
     eve, atlas, rng = Walker("eve-0", 3, n=20), Atlas(CONFIG), np.random.default_rng(0)
