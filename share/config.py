@@ -268,7 +268,7 @@ class EdgeConfig:
     silent_s: float = 3.0  # nothing heard of an agent for this long: it is taken as gone
     name_hold_s: float = 3.0  # a name stays taken so long after its agent was last heard
     max_agents: int = 64  # present at a time; more are refused
-    max_keyframes: int = 2000  # kept; beyond, those go of which there are others like them
+    max_keyframes: int = 2000  # kept; beyond, who holds most gives, first what has others like it
     max_waiting: int = 12  # keyframes that queue to be looked up; beyond, the oldest is only stored
     each_waiting: int = 3  # the same, of one agent
     hurry_waiting: int = 1  # so many queue: the look-up at hand tries fewer candidates,

@@ -214,6 +214,8 @@ class Town:
                     self._mapped(edge, [])
                 case ed.Add(key, keyframe):
                     self._mapped(edge, edge.mapper.add(key, keyframe))
+                case ed.Forget(key):
+                    edge.mapper.forget(key)
                 case ed.Record(fields):
                     self.records.append(fields)
 
@@ -221,7 +223,7 @@ class Town:
         """The mapper has decided something, and goes on to its next steps, each in its own time."""
         if self.edge is not edge:
             return
-        if found := ed.Found(tuple(findings), edge.mapper.take_changes()):
+        if found := ed.Found(tuple(findings), edge.mapper.take_changes(), edge.mapper.take_emptied()):
             self._in(0, lambda: self.to_edge(found) if self.edge is edge else None)
         for step in (edge.mapper.next_look(), edge.mapper.next_solve()):
             if step is not None:

@@ -16,6 +16,9 @@ class Concern:
     def __init__(self) -> None:
         self._told: dict[str, Correction] = {}
 
+    def forget(self, agent: str) -> None:
+        self._told.pop(agent, None)
+
     def concerns(self, agent: str, correction: Correction) -> bool:
         """Whether it has to be sent; if so, it counts as told. It answers a keyframe, names another map, or
         moves odom by more than a millimetre or 0.02 degrees."""

@@ -14,21 +14,11 @@ from typing import Any, ClassVar
 
 from share import __version__
 from share.config import Config
+from share.core import edge_events as ed
 from share.core.admission import Admission, new_key
-from share.core.edge_events import (
-    Add,
-    Effect,
-    Event,
-    Found,
-    Join,
-    Kept,
-    Present,
-    Received,
-    Send,
-    Tick,
-)
+from share.core.allowance import Allowance
 from share.core.finding import Finding
-from share.core.keeping import Change, KeepKeyframe, KeepRun
+from share.core.keeping import Change, ForgetRun, KeepKeyframe, KeepRun
 from share.core.peer import Known, Peer, Refusals, refused_lines
 from share.core.rate import seconds
 from share.core.records import Records
@@ -66,15 +56,16 @@ class Edge:
         self._strangers: Counter[str] = Counter()
         self._strangers_refused = Refusals()
         self._admission = Admission(config.edge, self.tracks)
+        self._allowance = Allowance()
         self._records, self._versions = Records(began_ns), OtherVersions()
         self._internal_errors = 0
         self._safekeeping = Safekeeping(keeps)
-        self._effects: list[Effect] = []
+        self._effects: list[ed.Effect] = []
         self._now_ns = 0  # of the newest event
         for run in known:
             self._runs.recall(run)
 
-    def handle(self, event: Event, now_ns: int) -> list[Effect]:
+    def handle(self, event: ed.Event, now_ns: int) -> list[ed.Effect]:
         """What `event` leads to. `now_ns` is the edge's clock and never goes back.
 
         An exception, which is a fault of ours, costs this event only: it is counted and said."""
@@ -86,30 +77,32 @@ class Edge:
             self._failed(event, error, now_ns)
         return self._effects
 
-    def _failed(self, event: Event, error: Exception, now_ns: int) -> None:
+    def _failed(self, event: ed.Event, error: Exception, now_ns: int) -> None:
         self._internal_errors += 1
-        peer = self._runs.get(event.peer) if isinstance(event, Received) else None
+        peer = self._runs.get(event.peer) if isinstance(event, ed.Received) else None
         reason = f"{type(event).__name__}: {describe(error)}"
         if peer is not None:
             peer.refusals.add(reason, now_ns)
         self._record_seldom(now_ns, "internal error", peer, reason)
 
-    def _react(self, event: Event, now_ns: int) -> None:
+    def _react(self, event: ed.Event, now_ns: int) -> None:
+        self._forget_emptied(now_ns)  # before one of them says hello: its keyframes would be taken as known
         match event:
-            case Received():
+            case ed.Received():
                 self._receive(event, now_ns)
-            case Found():
+            case ed.Found():
                 self._keep(*event.changes)
                 for finding in event.findings:
                     self._found(finding, now_ns)
-            case Kept():
+                self._runs.emptied(event.emptied)
+            case ed.Kept():
                 self._acknowledge(*self._safekeeping.kept(event.ticket))
-            case Tick():
+            case ed.Tick():
                 self._notice_silence(now_ns)
 
     # ------------------------------------------------------------------ messages
 
-    def _receive(self, event: Received, now_ns: int) -> None:
+    def _receive(self, event: ed.Received, now_ns: int) -> None:
         peer = self._runs.get(event.peer)
         counts = self._counts(peer)
         counts["bytes_up"] += sum(len(frame) for frame in event.frames)
@@ -192,7 +185,7 @@ class Edge:
     def _come_back(self, peer: Peer, now_ns: int) -> None:
         self._supersede(peer.hello.name, now_ns)
         peer.gone = False
-        self._effects.append(Present(peer.key, True))
+        self._effects.append(ed.Present(peer.key, True))
         self._record_seldom(now_ns, "back", peer, "is heard again")
 
     def _supersede(self, name: str, now_ns: int) -> None:
@@ -208,12 +201,12 @@ class Edge:
 
     def _gone(self, peer: Peer, what: str, reason: str, now_ns: int) -> None:
         peer.gone = True
-        self._effects.append(Present(peer.key, False))
+        self._effects.append(ed.Present(peer.key, False))
         self._record_seldom(now_ns, what, peer, reason)
 
     # ------------------------------------------------------------------ coming in
 
-    def _greet(self, event: Received, hello: wire.Hello, now_ns: int) -> None:
+    def _greet(self, event: ed.Received, hello: wire.Hello, now_ns: int) -> None:
         """Welcome a new run or a known one; refuse a name that somebody else is using."""
         peer_id = event.peer
         if (reason := self._objection(event, hello, now_ns)) is not None:
@@ -230,7 +223,9 @@ class Edge:
             self._record_seldom(now_ns, "joined the edge", self._runs[peer_id], joined)
         self._welcome(peer_id, self._runs[peer_id], now_ns)
 
-    def _objection(self, event: Received, hello: wire.Hello, now_ns: int) -> str | None:
+    def _objection(self, event: ed.Received, hello: wire.Hello, now_ns: int) -> str | None:
+        if self._runs.was_forgotten(event.peer):
+            return f"this run of '{hello.name}' was forgotten while it was away: start the agent again"
         return self._admission.objection(event, hello, self._runs, now_ns)
 
     def _refuse(self, peer_id: bytes, reason: str, now_ns: int, version: int = VERSION) -> None:
@@ -247,10 +242,17 @@ class Edge:
 
     def _enter(self, peer_id: bytes, peer: Peer) -> None:
         self._runs.add(peer_id, peer)
-        self._effects.append(Join(peer.key, peer.hello))
+        self._effects.append(ed.Join(peer.key, peer.hello))
+
+    def _forget_emptied(self, now_ns: int) -> None:
+        for peer in self._runs.forgettable():
+            self._forget(peer, self._runs.forget(peer))
+            self._keep(ForgetRun(peer.key))
+            self._record_seldom(now_ns, "forgotten", peer, f"nothing is left of its run {peer.key}")
 
     def _forget(self, peer: Peer, was_latest: bool) -> None:
-        """Of a run that was never of use."""
+        """Of a run of which there is nothing."""
+        self._effects.append(ed.Forget(peer.key))
         if was_latest:
             self._schedule.drop(peer.hello.name)
 
@@ -268,9 +270,13 @@ class Edge:
 
     def _in_order(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> list[Keyframe]:
         """What can be applied now; nothing of an agent that sends more than is taken in."""
-        if (reason := peer.too_many(now_ns)) is not None:
-            peer.refusals.add(reason, now_ns)
-            return []
+        if keyframe.id >= peer.inorder.next_keyframe:  # else it costs nothing
+            name = peer.hello.name
+            reason = peer.too_many() or self._allowance.objection(name, keyframe, now_ns)
+            if reason is not None:
+                peer.refusals.add(reason, now_ns)
+                peer.held_back.note(reason, now_ns)
+                return []
         try:
             return peer.inorder.push(keyframe)
         except ValueError as error:
@@ -285,11 +291,12 @@ class Edge:
             self._complain(peer, str(error), now_ns)
             return
         if complaint:
+            peer.refusals.add(complaint, now_ns)
             self._record_seldom(now_ns, "odometry doubted", peer, complaint)
         assert peer.foot is not None
         run = (KeepRun(peer.key, peer.hello),) if begins else ()  # no run without a keyframe is kept
         self._keep(*run, KeepKeyframe(peer.key, keyframe))
-        self._effects.append(Add(peer.key, keyframe))
+        self._effects.append(ed.Add(peer.key, keyframe))
 
     def _keep(self, *changes: Change) -> None:
         if (keep := self._safekeeping.keep(changes)) is not None:
@@ -340,7 +347,7 @@ class Edge:
     def _send(self, peer_id: bytes, message: wire.Down, version: int = VERSION) -> None:
         frames = encode(message, version)
         self._counts(self._runs.get(peer_id))["bytes_down"] += sum(len(frame) for frame in frames)
-        self._effects.append(Send(peer_id, frames))
+        self._effects.append(ed.Send(peer_id, frames))
 
     def _counts(self, peer: Peer | None) -> Counter[str]:
         return peer.counts if peer else self._strangers
@@ -385,6 +392,7 @@ class Edge:
             "strangers": dict(self._strangers),
             "refused": refused_lines(self._runs.values(), self._strangers_refused, now_ns),
             "internal_errors": self._internal_errors,
+            "forgotten_runs": self._runs.forgotten,
             "version": __version__,
             "config": to_mapping(self._config),
         }

@@ -10,6 +10,7 @@ from typing import Any
 from share.core.finding import Finding
 from share.core.keeping import Change
 from share.geometry.camera import Rig
+from share.merge.join import Key
 from share.types import Frame, Keyframe
 from share.wire import messages as wire
 from share.wire.codec import Bytes
@@ -37,6 +38,7 @@ class Found:
 
     findings: Sequence[Finding]
     changes: Sequence[Change] = ()
+    emptied: Sequence[Key] = ()  # runs of which nothing is left, each with its newest keyframe that came
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,13 @@ class Present:
 
 
 @dataclass(frozen=True)
+class Forget:
+    """To the mapper: nothing is left of this run, and it will not come back."""
+
+    key: str
+
+
+@dataclass(frozen=True)
 class Keep:
     """Make this safe, and answer with `Kept`. Tickets rise."""
 
@@ -155,4 +164,4 @@ class EndTracking:
 
 
 ToTracker = BeginTracking | Track | EndTracking
-Effect = Send | Join | Present | Add | Keep | Record | ToTracker
+Effect = Send | Join | Present | Add | Forget | Keep | Record | ToTracker

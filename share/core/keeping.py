@@ -93,6 +93,13 @@ class Retire:
     keys: tuple[Key, ...]
 
 
+@dataclass(frozen=True)
+class ForgetRun:
+    """A run of which nothing is left goes, with its name. Nothing of it comes afterwards."""
+
+    key: str
+
+
 @dataclass(frozen=True, eq=False)
 class KeepPoses:
     """The newest solution; it takes the place of the one before. T_map_body (N, 4, 4) of `keys`, each in
@@ -109,7 +116,7 @@ class KeepPoses:
         object.__setattr__(self, "T_map_body", checked("T_map_body", self.T_map_body, (n, 4, 4), np.float64))
 
 
-Change = KeepRun | KeepKeyframe | KeepLink | KeepLoop | DropLoop | Retire | KeepPoses
+Change = KeepRun | KeepKeyframe | KeepLink | KeepLoop | DropLoop | Retire | ForgetRun | KeepPoses
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,6 +52,11 @@ class Lookups:
         """So many wait that the one at hand should soon be done."""
         return len(self) >= self._config.hurry_waiting
 
+    def forget(self, agent: str) -> None:
+        """Nothing of it waits."""
+        for known in (self.skipped, self._waiting, self._weight, self._served):
+            known.pop(agent, None)
+
     def add(self, agent: str, kind: AgentKind, number: int) -> None:
         self._weight[agent] = _WEIGHT[kind]
         self._served.setdefault(agent, self._turn)

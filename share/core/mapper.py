@@ -18,24 +18,21 @@ from share.core.gating import Gating
 from share.core.keeping import (
     Change,
     DropLoop,
-    KeepLink,
     KeepLoop,
     KeepPoses,
     Kept,
     KeptKeyframe,
-    Retire,
-    edge_to,
 )
 from share.core.lookups import Lookups, form_of, served_as
+from share.core.map_news import changes_of, kept_link, placed_again
 from share.core.search import Effort, Search
 from share.core.steps import Look, Query, Solve, Step, Verify
 from share.errors import describe
 from share.graph.change import Solution
-from share.merge.atlas import Applied, Atlas, Placed
-from share.merge.join import Loop
+from share.merge.atlas import Applied, Atlas
+from share.merge.join import Key, Loop
 from share.merge.judge import Decision
 from share.merge.parting import Parted
-from share.merge.thinning import TakenOut
 from share.metrics.latency import summary
 from share.place.index import PlaceIndex
 from share.place.verify import Refusal, Sight, Verified
@@ -54,6 +51,7 @@ class _Account:
 
     loops_tried: int = 0
     merges: Counter[str] = field(default_factory=Counter)  # requested, skipped, done
+    newest: int = -1  # keyframe that came
 
 
 class Mapper:
@@ -76,8 +74,11 @@ class Mapper:
         self._query: Query | None = None  # that the search is about
         self._looking = self._solving = False
         self._leaving: list[int] = []  # keyframes that go next
+        self._crowded = 0.0  # so many before it is asked again which may go
         self._changes: list[Change] = []
         self._accounts: dict[str, _Account] = {}
+        self._closed = _Account()  # of runs that are forgotten
+        self._emptied: list[Key] = []
         self._ms = {kind: deque[float](maxlen=_TIMES) for kind in ("place", "verify", "solve")}
         self._counts: Counter[str] = Counter()
 
@@ -85,14 +86,32 @@ class Mapper:
         """A run of an agent, before its first keyframe."""
         self._hellos[agent] = hello
         self._accounts[agent] = _Account()
-        self._atlas.present(agent, True)
+        self._atlas.enter(agent, hello.name)
+
+    def name(self, agent: str) -> str:
+        """Of the agent whose run it is."""
+        return self._hellos[agent].name if agent in self._hellos else agent
 
     def present(self, agent: str, here: bool) -> None:
         """Nobody waits for a run that is not heard."""
         self._atlas.present(agent, here)
 
+    def forget(self, agent: str) -> None:
+        """A run of which nothing is left, and that will not come back."""
+        self._atlas.forget(agent)
+        self._lookups.forget(agent)
+        self._concern.forget(agent)
+        self._untold = {(run, map_id) for run, map_id in self._untold if run != agent}
+        del self._hellos[agent]
+        closed = self._accounts.pop(agent)
+        self._closed.loops_tried += closed.loops_tried
+        self._closed.merges += closed.merges
+
     def add(self, agent: str, keyframe: Keyframe) -> list[Finding]:
         """A keyframe, in order, each once."""
+        self._accounts[agent].newest = keyframe.id
+        keyframe, link = self._atlas.tied(agent, keyframe)
+        self._changes += [] if link is None else [kept_link(link)]
         number = self._atlas.add_keyframe(agent, keyframe, rank=self._rank(agent))
         self._see(number, agent, keyframe)
         self._lookups.add(agent, served_as(self._config, self._hellos[agent]), number)
@@ -111,9 +130,7 @@ class Mapper:
         agents = [name.rpartition("/")[0] for name in kept.stretches]
         ranks = [self._rank(a, name in founders) for a, name in zip(agents, kept.stretches, strict=True)]
         stretches = list(zip(agents, ranks, strict=True))
-        placed = [
-            _placed(found, edge_to(found, kept.links), found.at in kept.links) for found in kept.keyframes
-        ]
+        placed = [placed_again(found, kept.links) for found in kept.keyframes]
         numbers = self._atlas.restore(stretches, placed, kept.loops, poses)
         self._unseen = list(zip(numbers, kept.keyframes, strict=True))
 
@@ -221,6 +238,11 @@ class Mapper:
         taken, self._changes = tuple(self._changes), []
         return taken
 
+    def take_emptied(self) -> tuple[Key, ...]:
+        """Runs of which nothing is left since the last call, each with the newest keyframe that came."""
+        taken, self._emptied = tuple(self._emptied), []
+        return taken
+
     def poses(self) -> KeepPoses:
         """Where everything lies now."""
         keys, T_map_body, maps = self._atlas.everything()
@@ -323,8 +345,11 @@ class Mapper:
     def _thin(self) -> None:
         """Two keyframes go while one comes: all at once would hold the others up."""
         most = self._config.edge.max_keyframes
-        if not self._leaving and len(self._atlas) > most * _SLACK:
+        if not self._leaving and len(self._atlas) > max(most * _SLACK, self._crowded):
             self._leaving = self._atlas.redundant(len(self._atlas) - most)
+            self._crowded = (
+                0.0 if self._leaving else len(self._atlas) * _SLACK
+            )  # nothing may go: not each time
         if not self._leaving:
             return
         self._see_restored()
@@ -334,13 +359,15 @@ class Mapper:
             self._index.remove(out.number)
             del self._sights[out.number]
         self._counts["taken_out"] += len(taken)
-        self._changes += _changes_of(taken)
+        self._changes += changes_of(taken)
+        empty = {out.key.agent for out in taken if self._atlas.is_forgotten(out.key.agent)}
+        self._emptied += [Key(agent, self._accounts[agent].newest) for agent in empty]
 
     # ------------------------------------------------------------------ report
 
     def report(self) -> dict[str, Any]:
         """edge.json's fields of the whole, and under `agents` those of each run."""
-        accounts = self._accounts.values()
+        accounts = [*self._accounts.values(), self._closed]
         merges = _told(sum((a.merges for a in accounts), Counter()))
         return {
             "agents": {agent: self._report_of(agent) for agent in self._accounts},
@@ -371,20 +398,3 @@ class Mapper:
 
 def _told(merges: Counter[str]) -> dict[str, int]:
     return {what: merges[what] for what in ("requested", "skipped", "done")}
-
-
-def _placed(found: KeptKeyframe, edge: KeepLink, linked: bool) -> Placed:
-    return Placed(
-        found.at, found.stretch, found.ordinal, found.keyframe, edge.T_ref_body, edge.cov, not linked
-    )
-
-
-def _changes_of(taken: list[TakenOut]) -> list[Change]:
-    """In the order in which they happened: a link may lead to one that goes next."""
-    changes: list[Change] = []
-    for out in taken:
-        if (link := out.link) is not None:
-            reference = -1 if link.reference is None else link.reference.id
-            changes.append(KeepLink(link.key, reference, link.T_ref_body, link.cov))
-        changes += [Retire((out.key,)), *(KeepLoop(loop) for loop in out.moved)]
-    return changes

@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from share.core.keeping import KeepLink, KeptKeyframe, edge_to
-from share.geometry import se3
 from share.merge.join import Key
-from share.types import F64
+from share.merge.thinning import across
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +50,9 @@ def mended(keyframes: Sequence[KeptKeyframe], links: Mapping[Key, KeepLink]) -> 
 def _tie(keyframe: KeptKeyframe, edge: KeepLink, before: KeptKeyframe | None) -> KeepLink:
     if before is None:
         return KeepLink(keyframe.at, -1, keyframe.keyframe.T_odom_body, edge.cov)
-    lost = max(1, edge.reference - before.at.id)
-    cov: F64 = se3.compose_cov(edge.T_ref_body, lost * edge.cov, edge.cov)
-    T = se3.orthonormal(se3.inverse(before.keyframe.T_odom_body) @ keyframe.keyframe.T_odom_body)
-    return KeepLink(keyframe.at, before.at.id, T, (cov + cov.T) / 2)
+    own = replace(keyframe.keyframe, T_ref_body=edge.T_ref_body, cov=edge.cov)
+    T, cov = across(before.keyframe.T_odom_body, edge.reference - before.at.id, own)
+    return KeepLink(keyframe.at, before.at.id, T, cov)
 
 
 def _as_sent(keyframe: KeptKeyframe, edge: KeepLink) -> KeptKeyframe:

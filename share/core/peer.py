@@ -13,33 +13,50 @@ from share.core.finding import Finding, in_map
 from share.core.inorder import InOrder
 from share.core.keeping import Kept, placed
 from share.core.peer_status import PeerStatus
-from share.core.rate import SECOND_NS, TokenBucket
+from share.core.rate import SECOND_NS
 from share.geometry import se3
 from share.merge.join import Key, Loop
-from share.types import Keyframe
+from share.types import F64, Keyframe
 from share.wire.messages import Hello
 
 _LEAP_M, _LEAP_M_S = 2.0, 10.0  # further than this, and so much more a second, nobody moves between keyframes
+# T_ref_body is of what the filter knows now, T_odom_body of what it knew then (docs/edge-map.md): of honest
+# agents these differ by up to 3 cm after 8 s and 6 m, and by 2.7 degrees while a headset learns what is up.
+_OFF_M, _OFF_A_METRE, _OFF_RAD = 0.3, 0.05, float(np.radians(12.0))
 _AGAIN, _RECENT_S = 10, 10.0  # refused messages that are worth a person's while, and for how long
-# Keyframes of one agent that are taken in: at once what a full ledger sends to a new edge, then more a second
-# than any camera gives. What exceeds it is not applied, and its agent sends it again.
-_KEYFRAME_BURST, _KEYFRAME_HZ = 1000.0, 50.0
+_HELD_S = 2.0  # that it is said of an agent that its keyframes were not taken in
 _MAX_UNSAFE = 256  # keyframes that may wait for the disk: an agent has 16 under way
 _MOST_VARIANCE = 100.0  # rad^2, m^2: says nothing; more would only upset the solver
 
 
 @dataclass(frozen=True, eq=False)
 class Foot:
-    """The newest applied keyframe: its id, its stamp."""
+    """The newest applied keyframe: its id, its stamp, and T_odom_body (4, 4)."""
 
     id: int
     stamp_ns: int
+    T_odom_body: F64
+
+    @classmethod
+    def of(cls, keyframe: Keyframe) -> Foot:
+        return cls(keyframe.id, keyframe.stamp_ns, keyframe.T_odom_body)
 
     def leaps(self, keyframe: Keyframe) -> float:
         """How far (m) the keyframe is from here, if nobody can have moved so far meanwhile, else 0."""
         away = float(np.linalg.norm(keyframe.T_ref_body[:3, 3]))
         passed_s = max(0, keyframe.stamp_ns - self.stamp_ns) / SECOND_NS
         return away if away > _LEAP_M + _LEAP_M_S * passed_s else 0.0
+
+    def contradicts(self, keyframe: Keyframe) -> str | None:
+        """How far T_ref_body of the keyframe lies from what its T_odom_body and this one say, if that is more
+        than a filter learns of the past meanwhile."""
+        T_ref_body = se3.inverse(self.T_odom_body) @ keyframe.T_odom_body
+        T = se3.inverse(keyframe.T_ref_body) @ T_ref_body
+        off_m, off_rad = float(np.linalg.norm(T[:3, 3])), float(se3.angle(T))
+        way_m = float(np.linalg.norm(keyframe.T_ref_body[:3, 3]))
+        if off_m <= _OFF_M + _OFF_A_METRE * way_m and off_rad <= _OFF_RAD:
+            return None
+        return f"its step and its two poses differ by {off_m:.2g} m and {np.degrees(off_rad):.2g} degrees"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,12 +69,6 @@ class Known:
     foot: Foot | None
     next_keyframe: int
     finding: Finding | None = None
-
-
-def _keyframe_rate() -> TokenBucket:
-    bucket = TokenBucket(_KEYFRAME_BURST)
-    bucket.hz = _KEYFRAME_HZ
-    return bucket
 
 
 @dataclass
@@ -79,6 +90,23 @@ class Refusals:
 
 
 @dataclass
+class HeldBack:
+    """Keyframes that were not taken in, since there were too many, and are sent again."""
+
+    reason: str = ""
+    at_ns: int = 0
+
+    def note(self, reason: str, now_ns: int) -> None:
+        self.reason, self.at_ns = reason, now_ns
+
+    def said(self, status: dict[str, Any], now_ns: int) -> dict[str, Any]:
+        """`status` with the reason, while that is news."""
+        if not self.reason or now_ns - self.at_ns > _HELD_S * SECOND_NS:
+            return status
+        return {**status, "reason": "; ".join(filter(None, (status["reason"], self.reason)))}
+
+
+@dataclass
 class Peer:
     """safe: all its keyframes below this number will be there after a crash, and so are acknowledged.
     unsafe: how many are applied and not safe yet."""
@@ -92,7 +120,7 @@ class Peer:
     status: PeerStatus = field(default_factory=PeerStatus)
     counts: Counter[str] = field(default_factory=Counter)
     refusals: Refusals = field(default_factory=Refusals)
-    keyframe_rate: TokenBucket = field(default_factory=_keyframe_rate)
+    held_back: HeldBack = field(default_factory=HeldBack)
     revision: int = 0
     gone: bool = False
     newest: Finding | None = None  # the newest correction; who has been away may not have got it
@@ -105,16 +133,15 @@ class Peer:
         """Whether it is gone and never sent a keyframe."""
         return self.gone and self.inorder.next_keyframe == 0
 
-    def too_many(self, now_ns: int) -> str | None:
+    def too_many(self) -> str | None:
         """Why no other keyframe is applied now; None if one may be."""
-        if self.unsafe >= _MAX_UNSAFE:
-            return f"{self.unsafe} keyframes wait for the disk"
-        return None if self.keyframe_rate.take(now_ns) else "keyframes come faster than they can be taken in"
+        return f"{self.unsafe} keyframes wait for the disk" if self.unsafe >= _MAX_UNSAFE else None
 
     def place(self, keyframe: Keyframe) -> tuple[Keyframe, str | None]:
         """The next keyframe in order as the map may have it, and what was wrong with it.
 
-        One that leaps begins a stretch, in the same odom; a covariance beyond all measure is bounded.
+        The step of one that leaps, or whose step is not that between its two poses, is not believed: it
+        begins a stretch, in the same odom. A covariance beyond all measure is bounded.
         Raises ValueError where what it refers to is not the keyframe before it.
         """
         complaint = None
@@ -125,8 +152,11 @@ class Peer:
                 )
             if leap_m := self.foot.leaps(keyframe):
                 complaint = f"keyframe {keyframe.id} is {leap_m:.0f} m from the one before: a new stretch"
+            elif why := self.foot.contradicts(keyframe):
+                complaint = f"keyframe {keyframe.id}: {why}: a new stretch"
+            if complaint:
                 keyframe = replace(keyframe, reference=-1, T_ref_body=keyframe.T_odom_body)
-        self.foot = Foot(keyframe.id, keyframe.stamp_ns)
+        self.foot = Foot.of(keyframe)
         if (most := float(keyframe.cov.diagonal().max())) > _MOST_VARIANCE:
             complaint = complaint or f"keyframe {keyframe.id} has a variance of {most:.0e}; taken as unknown"
             keyframe = replace(keyframe, cov=keyframe.cov * (_MOST_VARIANCE / most))
@@ -137,7 +167,9 @@ class Peer:
         return {
             "kind": str(self.hello.kind),
             "run": self.key,
-            **self.status.report(now_ns, self.heard_ns if self.was_heard else None),
+            **self.held_back.said(
+                self.status.report(now_ns, self.heard_ns if self.was_heard else None), now_ns
+            ),
             "gone": self.gone,
             **{name: self.counts[name] for name in _COUNTS},
             "refused_messages": self.refusals.n,
@@ -182,13 +214,13 @@ def known_runs(kept: Kept, known_m: float) -> list[Known]:
             continue
         map_id, T_map_body = there[Key(run.key, found.id)]
         if map_id in joined:
-            out.append(Known(run.key, run.hello, Foot(found.id, found.stamp_ns), found.id + 1))
+            out.append(Known(run.key, run.hello, Foot.of(found), found.id + 1))
             continue
         T_map_odom = se3.orthonormal(T_map_body @ se3.inverse(found.T_odom_body))
         at_body = None if map_id.startswith(f"{run.key}/") else cov
         at_odom = None if at_body is None else se3.inverse_cov(found.T_odom_body, at_body)
         finding = in_map(run.key, map_id, T_map_odom, found.id, at_odom)
-        out.append(Known(run.key, run.hello, Foot(found.id, found.stamp_ns), found.id + 1, finding))
+        out.append(Known(run.key, run.hello, Foot.of(found), found.id + 1, finding))
     return out
 
 

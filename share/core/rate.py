@@ -45,14 +45,14 @@ class TokenBucket:
         self._refill(now_ns)
         self.hz = hz
 
-    def take(self, now_ns: int, preferred: bool = True) -> bool:
-        """Whether one may pass now."""
+    def take(self, now_ns: int, preferred: bool = True, cost: float = 1.0) -> bool:
+        """Whether one may pass now; cost: one that counts as so many."""
         self._refill(now_ns)
         if self.hz is None:
             return True
-        if self._tokens < (1 if preferred else self._burst) - 1e-9:
+        if self._tokens < (cost if preferred else self._burst) - 1e-9:
             return False
-        self._tokens -= 1
+        self._tokens -= cost
         return True
 
     def wait_s(self, now_ns: int) -> float:

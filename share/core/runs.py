@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 from share.core.inorder import InOrder
 from share.core.peer import Known, Peer
+from share.merge.join import Key
 from share.wire.messages import peer_id
 
 _MAX_IDLE = 256  # gone without a keyframe; the oldest is forgotten
+_MAX_FORGOTTEN = (
+    65_536  # runs that are known to have been forgotten; of the others nobody was heard for hours
+)
 
 
 class Runs(Mapping[bytes, Peer]):
@@ -19,6 +23,11 @@ class Runs(Mapping[bytes, Peer]):
         self._peers: dict[bytes, Peer] = {}
         self._by_key: dict[str, bytes] = {}
         self._latest: dict[str, Peer] = {}  # run of each name
+        self._emptied: dict[
+            str, int
+        ] = {}  # runs of which the map has nothing any more, and their newest keyframe
+        self._forgotten: dict[bytes, None] = {}
+        self.forgotten = 0  # how many, since the edge began
 
     def __getitem__(self, peer: bytes) -> Peer:
         return self._peers[peer]
@@ -49,6 +58,41 @@ class Runs(Mapping[bytes, Peer]):
         peer = Peer(run.hello, run.key, 0, InOrder(asked), asked, run.foot, gone=True, greeted=False)
         peer.newest, peer.was_heard = run.finding, False
         self.add(peer_id(run.hello.run_id), peer)
+        if run.foot is None:
+            self._emptied[run.key] = -1
+
+    def emptied(self, runs: Iterable[Key]) -> None:
+        """The map has nothing of these any more, that has had their keyframes up to those."""
+        self._emptied.update(runs)
+
+    def forgettable(self) -> list[Peer]:
+        """Runs that are gone and of which nothing is left. One that has come back meanwhile is kept."""
+        out = []
+        for key, newest in list(self._emptied.items()):
+            peer = self._peers[self._by_key[key]] if key in self._by_key else None
+            if peer is None or (peer.foot is not None and peer.foot.id > newest):
+                del self._emptied[key]
+            elif peer.gone and not peer.unsafe:
+                out.append(peer)
+        return out
+
+    def forget(self, peer: Peer) -> bool:
+        """For good; returns whether it was its name's present one."""
+        peer_id = self._by_key.pop(peer.key)
+        del self._peers[peer_id]
+        self._emptied.pop(peer.key, None)
+        if was_latest := self.is_latest(peer):
+            del self._latest[peer.hello.name]
+        if peer.foot is not None:
+            self.forgotten += 1
+            self._forgotten[peer_id] = None
+            if len(self._forgotten) > _MAX_FORGOTTEN:
+                del self._forgotten[next(iter(self._forgotten))]
+        return was_latest
+
+    def was_forgotten(self, peer_id: bytes) -> bool:
+        """Whether this run was, in this life of the edge: keyframes that were acknowledged are not known."""
+        return peer_id in self._forgotten
 
     def forget_idle(self) -> tuple[Peer, bool] | None:
         """Who joins again and again without a keyframe fills no memory: the run that is forgotten now, if one
@@ -56,8 +100,5 @@ class Runs(Mapping[bytes, Peer]):
         idle = [(peer.heard_ns, peer_id) for peer_id, peer in self._peers.items() if peer.is_idle]
         if len(idle) < _MAX_IDLE:
             return None
-        peer = self._peers.pop(min(idle)[1])
-        del self._by_key[peer.key]
-        if was_latest := self.is_latest(peer):
-            del self._latest[peer.hello.name]
-        return peer, was_latest
+        peer = self._peers[min(idle)[1]]
+        return peer, self.forget(peer)

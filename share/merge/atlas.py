@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,14 +17,17 @@ from share.geometry import se3
 from share.graph.change import Solution
 from share.merge.agreement import Standing
 from share.merge.chart import Chart
+from share.merge.culling import Culling
+from share.merge.floors import believed, plumb_line
 from share.merge.join import Key, Loop
 from share.merge.judge import Decision, Judge, that_waited
+from share.merge.owners import Owners
 from share.merge.parting import Parted, Parting
 from share.merge.promising import promising_first
 from share.merge.solving import SolveJob
 from share.merge.surety import Found, Surety
 from share.merge.survey import Survey
-from share.merge.thinning import TakenOut, redundant, take_out
+from share.merge.thinning import Link, TakenOut, take_out, tied_again
 from share.place.scale import Scale
 from share.place.verify import Sight
 from share.types import F64, Correction, Keyframe
@@ -32,9 +35,8 @@ from share.types import F64, Correction, Keyframe
 
 @dataclass(frozen=True, eq=False)
 class Applied:
-    """What a solution changed. corrections: by agent. reason: for events.jsonl. tied, dropped: loops that
-    are believed since, and those that are no longer. waiting: agents who do not hear of it yet, since it
-    knows them to so many m only."""
+    """What a solution changed. corrections: by agent. tied, dropped: loops that are believed since, and those
+    that are no longer. waiting: agents who do not hear of it yet, since it knows them to so many m only."""
 
     corrections: dict[str, Correction]
     reason: str
@@ -68,7 +70,8 @@ class Atlas:
         self._judge = Judge(config, self._chart, Survey(self._chart, seen))
         self._answers: dict[str, int] = {}  # agent -> its newest keyframe that a loop came from
         self._surety = Surety(config.enter_m, config.enter_patience)
-        self._absent: set[str] = set()
+        self._owners = Owners()
+        self._culling = Culling(config, self._chart, self._owners)
         self._parting = Parting(config.scale_tolerance, self._chart, self._judge, seen)
 
     # ------------------------------------------------------------ what is known
@@ -92,16 +95,15 @@ class Atlas:
     def sizes(self) -> dict[str, int]:
         """How many keyframes each map has."""
         out: dict[str, int] = {}
-        for number, stretch in enumerate(self._chart.trails.stretches):
-            name = self._chart.name(number)
-            out[name] = out.get(name, 0) + len(stretch.nodes)
+        for stretch in sorted(self._chart.trails.live):
+            name = self._chart.name(stretch)
+            out[name] = out.get(name, 0) + len(self._chart.trails.stretches[stretch].nodes)
         return out
 
     def T_map_odom(self, agent: str) -> F64 | None:
         """Where the agent's present odometry lies in its map; None before its first keyframe."""
-        stretch = self._chart.trails.current(agent)
-        nodes = [] if stretch is None else self._chart.trails.stretches[stretch].nodes
-        return self._chart.placement(nodes[-1]) if nodes else None
+        newest = self._chart.trails.newest(agent)
+        return None if newest is None else self._chart.placement(newest)
 
     def key(self, number: int) -> Key:
         """Of the keyframe with this number."""
@@ -138,20 +140,46 @@ class Atlas:
 
     # ------------------------------------------------------------ what arrives
 
+    def enter(self, agent: str, name: str) -> None:
+        """A run of the agent of this name comes."""
+        self._owners.join(agent, name)
+
     def present(self, agent: str, here: bool) -> None:
         """Who is not heard need not be told where he is, and nobody waits for him. Once he is heard again, a
         map that he does not know of is due."""
-        if not here:
-            self._absent.add(agent)
-        elif agent in self._absent:
-            self._absent.remove(agent)
-            if (stretch := self._chart.trails.current(agent)) is not None:
+        if self._owners.present(agent, here) and here:
+            stretch = self._chart.trails.current(agent)
+            if stretch is not None and stretch in self._chart.trails.live:
                 self._tell_soon(stretch)
+
+    def is_forgotten(self, agent: str) -> bool:
+        """Whether it is not heard, and nothing of it is left."""
+        return self._owners.is_absent(agent) and self._chart.trails.newest(agent) is None
+
+    def forget(self, agent: str) -> None:
+        """A run of which nothing is left will not come back."""
+        self._owners.forget(agent)
+        self._answers.pop(agent, None)
+        self._chart.trails.forget(agent)
 
     def _tell_soon(self, stretch: int) -> None:
         founder = self._chart.founder[stretch]
         if founder != stretch and self._surety.told(stretch, founder) is None:
             self._chart.unsolved[founder] = None
+
+    def tied(self, agent: str, keyframe: Keyframe) -> tuple[Keyframe, Link | None]:
+        """Before it is added: a keyframe whose reference was taken out, tied to what is left of its stretch,
+        and the odometry edge that leads to it now. None: as it came."""
+        chart, reference = self._chart, Key(agent, keyframe.reference)
+        current = chart.trails.current(agent)
+        if keyframe.reference < 0 or chart.trails.has(reference) or current is None:
+            return keyframe, None
+        newest = chart.trails.newest(agent)
+        link = tied_again(agent, keyframe, None if newest is None else chart.trails.nodes[newest])
+        if link.reference is None:
+            return keyframe, link
+        kept = replace(link, cov=believed(self._config, link.T_ref_body, link.cov))
+        return replace(keyframe, reference=link.reference.id, T_ref_body=link.T_ref_body, cov=link.cov), kept
 
     def add_keyframe(self, agent: str, keyframe: Keyframe, rank: int = 0) -> int:
         """Its number here. A keyframe without a reference founds a map of its own; of maps that are joined,
@@ -159,7 +187,8 @@ class Atlas:
 
         Raises ValueError for a keyframe known already or whose reference is unknown.
         """
-        cov, plumb = self._believed(keyframe.T_ref_body, keyframe.cov), self._plumb(keyframe)
+        cov = believed(self._config, keyframe.T_ref_body, keyframe.cov)
+        plumb = plumb_line(self._config, keyframe)
         number = self._chart.add(agent, keyframe, cov, plumb, rank)
         self._parting.agreement.walk(number, self._chart.trails.before(number), keyframe.T_ref_body, cov)
         return number
@@ -182,10 +211,10 @@ class Atlas:
             at[chart.trails.stretches[stretch].name] = stretch
         numbers = []
         for found in keyframes:
-            cov = self._believed(found.T_ref_body, found.cov) if found.as_sent else found.cov
+            cov = believed(self._config, found.T_ref_body, found.cov) if found.as_sent else found.cov
             T_odom_body = found.keyframe.T_odom_body
             numbers.append(chart.trails.put(found.key, at[found.stretch], T_odom_body, found.ordinal))
-            chart.place(numbers[-1], found.T_ref_body, cov, self._plumb(found.keyframe))
+            chart.place(numbers[-1], found.T_ref_body, cov, plumb_line(self._config, found.keyframe))
             self._parting.agreement.walk(numbers[-1], chart.trails.before(numbers[-1]), found.T_ref_body, cov)
             chart.poses[numbers[-1]] = T_map_body.get(found.key, chart.poses[numbers[-1]])
         for loop in loops:
@@ -198,45 +227,28 @@ class Atlas:
         return numbers
 
     def redundant(self, count: int) -> list[int]:
-        """Numbers of so many keyframes, if there are as many that may go, of which there are others like them
-        in the same map; the largest maps give first."""
-        chart, c, stay = self._chart, self._config, self._staying()
-        by_map: dict[int, list[int]] = {}
-        for n in chart.poses:
-            by_map.setdefault(chart.founder[chart.trails.nodes[n].stretch], []).append(n)
-        out: list[int] = []
-        for numbers in sorted(by_map.values(), key=len, reverse=True):
-            may_go = [i for i, n in enumerate(numbers) if n not in stay]
-            if may_go and len(out) < count:
-                poses = np.array([chart.poses[n] for n in numbers])
-                chosen = redundant(poses, may_go, count - len(out), c.place_m, c.place_rad)
-                out += [numbers[i] for i in chosen]
-        return out
+        """Numbers of so many keyframes, if there are as many that may go: see `Culling`."""
+        return self._culling.choose(count)
 
     def take_out(self, numbers: Iterable[int]) -> list[TakenOut]:
         """These keyframes, but for those that have to stay by now."""
-        chart, stay = self._chart, self._staying()
-        going = [n for n in numbers if n in chart.poses and n not in stay]
-        taken = [self._parting.as_told(take_out(chart, n, self._config.most_loops)) for n in going]
-        chart.find_maps()
+        chart, taken = self._chart, list[TakenOut]()
+        for number in numbers:
+            if number in chart.poses and self._culling.may_go(number):
+                stretch = chart.trails.nodes[number].stretch
+                taken.append(self._parting.as_told(take_out(chart, number, self._config.most_loops)))
+                chart.find_maps()
+                if stretch not in chart.trails.live:
+                    self._surety.forget([stretch])
+        live = {chart.founder[stretch] for stretch in chart.trails.live}
+        chart.unsolved = dict.fromkeys(founder for founder in chart.unsolved if founder in live)
         self._judge.forget({out.key for out in taken})
         self._parting.agreement.forget([out.number for out in taken])
         return taken
 
-    def _staying(self) -> set[int]:
-        """Keyframes that hold a map's gauge, and the newest of every agent."""
-        chart, gap = self._chart, self._config.min_loop_gap
-        current = {
-            s for stretch in chart.trails.stretches if (s := chart.trails.current(stretch.agent)) is not None
-        }
-        newest = {n for s in current for n in chart.trails.stretches[s].nodes[-gap:]}
-        return newest | {chart.anchor(f) for f in set(chart.founder) if chart.trails.stretches[f].nodes}
-
     def propose(self, loop: Loop) -> Decision:
-        """A verified loop from candidate a to query b: accepted, waiting, or refused, with the reason.
-
-        Raises ValueError if either keyframe is unknown.
-        """
+        """A verified loop from candidate a to query b: accepted, waiting, or refused, with the reason. Raises
+        ValueError if either keyframe is unknown."""
         if why := self._parting.forbids(loop):
             return Decision(False, f"loop {loop}: {why}")
         decision = self._judge.decide(loop)
@@ -272,21 +284,6 @@ class Atlas:
         """Whether what this keyframe saw speaks against a young join of its map: it is undone."""
         return self._judge.review(number)
 
-    def _believed(self, T_ref_body: F64, cov: F64) -> F64:
-        """Agents are surer of themselves than they should be; none is surer than the floor, which grows with
-        the step."""
-        c = self._config
-        turn, way = float(se3.angle(T_ref_body)), float(np.linalg.norm(T_ref_body[:3, 3]))
-        rad2 = np.radians(c.odometry_floor_deg) ** 2 + (c.odometry_floor_per_rad * turn) ** 2
-        m2 = c.odometry_floor_m**2 + (c.odometry_floor_per_m * way) ** 2
-        return c.odometry_scale**2 * cov + np.diag([rad2] * 3 + [m2] * 3)
-
-    def _plumb(self, keyframe: Keyframe) -> F64:
-        """See `share.graph.plumb`: no camera sits on its IMU better than it was calibrated."""
-        size = float(np.linalg.norm(keyframe.up))
-        sigma = np.hypot(keyframe.up_sigma, np.radians(self._config.gravity_floor_deg))
-        return keyframe.up / (size * sigma) if size else np.zeros(3)
-
     # ------------------------------------------------------------ the solver's side
 
     def due(self) -> list[str]:
@@ -320,7 +317,7 @@ class Atlas:
             s
             for s in stretches
             if trails.current(agent := trails.stretches[s].agent) == s
-            and (agent not in self._absent or self._surety.heard(s, founder))
+            and (not self._owners.is_absent(agent) or self._surety.heard(s, founder))
             and (agent in self._answers or self._surety.told(s, founder) is None)
         )
 
@@ -337,7 +334,8 @@ class Atlas:
         chart = self._chart
         founder = job.stretches[0]
         if tuple(chart.stretches_of(founder)) != job.stretches:
-            chart.unsolved[chart.founder[founder]] = None
+            if founder in chart.trails.live:
+                chart.unsolved[chart.founder[founder]] = None
             self._answers = dict(job.answers) | self._answers
             chart.ties.moved(n for n in solution.numbers.tolist() if n in chart.poses)
             return Applied({}, f"map {job.map_id}: joined or split while it was solved, due again")

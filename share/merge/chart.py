@@ -181,7 +181,7 @@ class Chart:
 
     def named(self, map_id: str) -> int:
         """The founder of a map. Raises ValueError if there is none of that name."""
-        for founder in set(self.founder):
+        for founder in {self.founder[stretch] for stretch in self.trails.live}:
             if self.trails.stretches[founder].name == map_id:
                 return founder
         raise ValueError(f"there is no map {map_id}")
@@ -192,8 +192,7 @@ class Chart:
 
     def stretches_of(self, founder: int) -> list[int]:
         """Those of a map that have keyframes, its founder first, if that has any."""
-        mine = (s for s, f in enumerate(self.founder) if f == founder and self.trails.stretches[s].nodes)
-        return sorted(mine, key=self.rank)
+        return sorted((s for s in self.trails.live if self.founder[s] == founder), key=self.rank)
 
     def nodes_of(self, founder: int) -> list[int]:
         return [n for s in self.stretches_of(founder) for n in self.trails.stretches[s].nodes]

@@ -37,6 +37,11 @@ class Surety:
         """An earlier life has told him of this map; how surely he is known there is yet to be found."""
         self._told[stretch] = (founder, None)
 
+    def forget(self, stretches: Collection[int]) -> None:
+        """These have no keyframes any more."""
+        for stretch in stretches:
+            self._told.pop(stretch, None)
+
     def heard(self, stretch: int, founder: int) -> bool:
         """Whether he has heard of this map."""
         return stretch in self._told and self._told[stretch][0] == founder

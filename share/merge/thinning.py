@@ -6,7 +6,8 @@ What is left covers the same views; odometry and loops of a keyframe that goes a
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +17,11 @@ from share.graph.contract import contract
 from share.graph.posegraph import Edge
 from share.merge.chart import Chart
 from share.merge.join import Key, Loop
-from share.types import F64
+from share.merge.trails import Node
+from share.types import F64, Keyframe
 
 _ROWS = 256
+_ALONE = 1e9  # as unlike as that is who has no other beside it
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,27 +45,54 @@ class TakenOut:
     moved: tuple[Loop, ...]
 
 
-def redundant(poses: F64, may_go: Collection[int], count: int, apart_m: float, apart_rad: float) -> list[int]:
-    """Which `count` of poses (N, 4, 4) to take out, among indices `may_go`: again and again one of the two
-    that are most alike, the one that has the nearer second neighbour.
+def redundant(
+    poses: F64, whose: Sequence[str | None], due: Counter[str], apart_m: float, apart_rad: float, below: float
+) -> list[int]:
+    """Which of poses (N, 4, 4) to take out: again and again one of the two that are most alike, the one that
+    has the nearer second neighbour, while they are no less alike than `below`.
 
-    Two poses are as unlike as |shift| / apart_m + angle / apart_rad.
+    whose: of each pose; of those of None none goes. due: how many go of each name; counted down. Two poses
+    are as unlike as |shift| / apart_m + angle / apart_rad.
     """
     gap = _unlike(poses, apart_m, apart_rad)
     np.fill_diagonal(gap, np.inf)
-    free = np.zeros(len(poses), bool)
-    free[list(may_go)] = True
-    nearest = np.concatenate([_two_least(gap[rows]) for rows in _blocks(len(poses))]) if len(gap) > 2 else gap
+    names = np.array([name or "" for name in whose])
+    free = np.array([name is not None and due[name] > 0 for name in whose], bool)
+    nearest = np.concatenate([_two_least(gap[rows]) for rows in _blocks(len(poses))])
     out: list[int] = []
-    for _ in range(min(count, int(free.sum()))):
-        rank = np.where(free, nearest[:, 0] + 1e-3 * nearest[:, 1], np.inf)
-        gone = int(rank.argmin())
+    while free.any():
+        rank = np.minimum(nearest[:, 0] + 1e-3 * nearest[:, 1], _ALONE)
+        gone = int(np.where(free, rank, np.inf).argmin())
+        if nearest[gone, 0] > below:
+            break
         out.append(gone)
         free[gone] = False
+        due[str(names[gone])] -= 1
+        if not due[str(names[gone])]:
+            free[names == names[gone]] = False
         stale = np.flatnonzero(gap[gone] <= nearest[:, 1])
         gap[gone], gap[:, gone] = np.inf, np.inf
         nearest[stale] = _two_least(gap[stale])
     return out
+
+
+def across(T_odom_before: F64, lost: int, keyframe: Keyframe) -> tuple[F64, F64]:
+    """T_before_body (4, 4) of a keyframe whose reference is not there any more, from one before it on its
+    stretch, and its covariance (6, 6). lost: how many steps lie between that and the reference.
+
+    Both stand in one odometry, so their relative pose is known: T_odom_before^-1 T_odom_body. Of the steps in
+    between nothing is left; each is taken to be as uncertain as the step that is known.
+    """
+    cov: F64 = se3.compose_cov(keyframe.T_ref_body, max(1, lost) * keyframe.cov, keyframe.cov)
+    return se3.orthonormal(se3.inverse(T_odom_before) @ keyframe.T_odom_body), (cov + cov.T) / 2
+
+
+def tied_again(agent: str, keyframe: Keyframe, before: Node | None) -> Link:
+    """The odometry edge to such a keyframe from the newest that is left of its stretch, if one is."""
+    key = Key(agent, keyframe.id)
+    if before is None:
+        return Link(key, None, keyframe.T_odom_body, keyframe.cov)
+    return Link(key, before.key, *across(before.T_odom_body, keyframe.reference - before.key.id, keyframe))
 
 
 def take_out(chart: Chart, number: int, most_loops: int) -> TakenOut:
@@ -105,7 +135,9 @@ def _blocks(count: int) -> list[slice]:
 
 
 def _two_least(gap: F64) -> F64:
-    """Of each row, (N, 2)."""
+    """Of each row, (N, 2); inf where there are none."""
+    if gap.shape[1] < 2:
+        return np.full((len(gap), 2), np.inf)
     return np.partition(gap, 1, axis=1)[:, :2].copy()
 
 

@@ -33,24 +33,29 @@ class Stretch:
 
 
 class Trails:
-    """Nodes by number, in the order of arrival, and the stretches that they make up, oldest first."""
+    """Nodes by number, in the order of arrival, and the stretches that they make up, oldest first; live:
+    those that have nodes."""
 
     def __init__(self) -> None:
         self.nodes: dict[int, Node] = {}
         self.stretches: list[Stretch] = []
+        self.live: dict[int, None] = {}
         self._next = 0
         self._at: dict[Key, int] = {}
         self._current: dict[str, int] = {}  # agent -> stretch that it is on
         self._begun: dict[str, int] = {}  # agent -> how many stretches
 
     def add(self, agent: str, keyframe: Keyframe, rank: int = 0) -> int:
-        """The number of the new node. rank: of a stretch that it begins. Raises ValueError for a keyframe
-        known already, or one whose reference is unknown: the caller applies each once and in order."""
+        """The number of the new node. rank: of a stretch that it begins. Where all of its stretch was taken
+        out, that goes on with it. Raises ValueError for a keyframe known already, or one whose reference is
+        unknown: the caller applies each once and in order."""
         key = Key(agent, keyframe.id)
         if key in self._at:
             raise ValueError(f"keyframe {key} was added before")
         if keyframe.reference < 0:
             return self.put(key, self.begin(agent, rank), keyframe.T_odom_body)
+        if (current := self._current.get(agent)) is not None and current not in self.live:
+            return self.put(key, current, keyframe.T_odom_body)
         before = self.nodes[self.number(Key(agent, keyframe.reference))]
         return self.put(key, before.stretch, keyframe.T_odom_body)
 
@@ -68,6 +73,7 @@ class Trails:
         number, self._next = self._next, self._next + 1
         self.nodes[number] = Node(key, stretch, at.count if ordinal is None else ordinal, T_odom_body)
         at.nodes.append(number)
+        self.live[stretch] = None
         at.count = self.nodes[number].ordinal + 1
         self._at[key] = number
         return number
@@ -75,8 +81,24 @@ class Trails:
     def take_out(self, number: int) -> None:
         """Forget a node; its stretch goes on without it."""
         node = self.nodes.pop(number)
-        self.stretches[node.stretch].nodes.remove(number)
+        nodes = self.stretches[node.stretch].nodes
+        nodes.remove(number)
+        if not nodes:
+            del self.live[node.stretch]
         del self._at[node.key]
+
+    def forget(self, agent: str) -> None:
+        """An agent that has no nodes any more. Its stretches stay as numbers without any."""
+        self._current.pop(agent, None)
+        self._begun.pop(agent, None)
+
+    def newest(self, agent: str) -> int | None:
+        """The newest node of the agent's present stretch."""
+        nodes = self.stretches[self._current[agent]].nodes if agent in self._current else []
+        return nodes[-1] if nodes else None
+
+    def has(self, key: Key) -> bool:
+        return key in self._at
 
     def number(self, key: Key) -> int:
         """Raises ValueError if no such keyframe is there."""

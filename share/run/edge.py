@@ -31,6 +31,7 @@ from share.core.edge_events import (
     Effect,
     EndTracking,
     Event,
+    Forget,
     Found,
     Join,
     Keep,
@@ -44,6 +45,9 @@ from share.core.edge_events import (
     Tick,
     Track,
 )
+from share.core.keeping import Kept as KeptMap
+from share.core.peer import Known
+from share.core.totals import Totals
 from share.core.tracking_edge import TrackingEdge
 from share.errors import StoreError
 from share.io.files import atomic_write, check_replaceable, claim
@@ -115,10 +119,12 @@ class EdgeRun:
         self._began_ns = time.monotonic_ns()
         self._refused: Counter[str] = Counter()  # handshakes, by what was said of them
         self._trouble: dict[str, float] = {}  # what to say until when
+        self._of_agents: dict[str, float] = {}  # the same, where it is one agent's alone
         self._report: dict[str, Any] = {}
         self._report_at = 0.0
         self._heap = Heap()
-        self._begin()
+        self._totals = Totals()
+        self._begin(self._found())
 
     def stop(self) -> None:
         """From any thread or a signal handler."""
@@ -174,8 +180,11 @@ class EdgeRun:
         disks = [writer.trouble for writer in (self._keeper, self._scribe) if writer is not None]
         standing = [*disks, self._standstill(now)]
         self._trouble = {text: until for text, until in self._trouble.items() if now < until}
+        self._of_agents = {text: until for text, until in self._of_agents.items() if now < until}
+        report = self._totals.added(self._machine.report(self._mapped))
         self._report = {
-            **self._machine.report(self._mapped),
+            **report,
+            "refused": [*self._of_agents, *report["refused"]],
             "refused_handshakes": self._refused.total(),
             "trouble": [*self._trouble, *(text for text in standing if text is not None)],
             "uptime_s": round((time.monotonic_ns() - self._began_ns) * 1e-9, 3),
@@ -192,10 +201,14 @@ class EdgeRun:
             return f"the solver has been at one solution for {solving_s:.0f} s: no corrections meanwhile"
         return None
 
-    def _begin(self, after_s: float = 0.0) -> None:
+    def _found(self) -> tuple[KeptMap | None, list[Known]]:
+        """What a new life begins with. Raises StoreError if the map's file cannot be read."""
+        return (None, []) if POLICIES[self._settings.edge.policy].raw else self._restarts.found()
+
+    def _begin(self, found: tuple[KeptMap | None, list[Known]], after_s: float = 0.0) -> None:
         """A new life: agents notice by its number, and send again what it lacks.
 
-        after_s: its mapper begins then. Raises StoreError if the map's file cannot be read.
+        after_s: its mapper begins then.
         """
         self._mapped: dict[str, Any] = {}
         self._solved_at: float | None = None
@@ -210,10 +223,9 @@ class EdgeRun:
                 self._settings, secrets.randbits(63), began_ns=self._began_ns, room=room()
             )
         else:
-            self._begin_mapping(after_s)
+            self._begin_mapping(*found, after_s)
 
-    def _begin_mapping(self, after_s: float) -> None:
-        kept, known = self._restarts.found()
+    def _begin_mapping(self, kept: KeptMap | None, known: list[Known], after_s: float) -> None:
         store, writable = self._restarts.store, self._restarts.writable
         self._machine = Edge(self._settings, secrets.randbits(63), writable, known, self._began_ns)
         about = (self._settings,)
@@ -259,7 +271,8 @@ class EdgeRun:
                 case Kept() | Ready() | Answered() as answer:
                     self._handle(answer)
                 case Lost() as lost if not self._stopping:
-                    self._trouble[f"the tracker of {lost.key} {lost.how}"] = time.monotonic() + _UNWELL_S
+                    text = f"agent's run {lost.key}: its tracker {lost.how}"
+                    self._of_agents[text] = time.monotonic() + _UNWELL_S
                     self._handle(lost)
                 case Mapped() as mapped:
                     if _solved(mapped.report) > _solved(self._mapped):
@@ -288,7 +301,9 @@ class EdgeRun:
             if self._keeper is not None and not self._keeper.drain(_DRAIN_S):
                 raise StoreError("the map's disk does not answer")
             self._forget_answers()
-            self._begin(pause_s)
+            found = self._found()
+            self._totals.ended(self._totals.added(self._machine.report(self._mapped)))
+            self._begin(found, pause_s)
             self._begin_at = None
         except StoreError as error:  # nothing is taken in or acknowledged until it can be read
             self._say("map", f"{error}; tried again in {pause_s:g} s")
@@ -309,7 +324,7 @@ class EdgeRun:
         match effect:
             case Send():
                 self._link.send(effect.peer, effect.frames)
-            case Join() | Present() | Add() if self._mapping is not None:
+            case Join() | Present() | Add() | Forget() if self._mapping is not None:
                 self._mapping.send(effect)
             case BeginTracking() | Track() | EndTracking():
                 self._trackers.do(effect)

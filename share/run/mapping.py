@@ -11,11 +11,12 @@ from typing import Any, TypeVar
 
 from share.config import Config, GraphConfig
 from share.core.backoff import Backoff
-from share.core.edge_events import Add, Found, Join, Present
+from share.core.edge_events import Add, Forget, Found, Join, Present
 from share.core.finding import Finding
 from share.core.keeping import Kept
 from share.core.mapper import Mapper
 from share.core.steps import Solve
+from share.core.turns import Turns
 from share.graph.solver import Solver
 from share.process import Heap
 from share.run.companion import END, Companion, Inbox
@@ -68,8 +69,8 @@ class _Solved:
 
 
 def map_all(inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
-    """For a `Companion`: takes Restore, Join, Present and Add, until END; answers Found, Mapped, Restored
-    and SolverLost."""
+    """For a `Companion`: takes Restore, Join, Present, Add and Forget, until END; answers Found, Mapped,
+    Restored and SolverLost."""
     _Mapping(inbox, answer, settings).go()
 
 
@@ -82,6 +83,7 @@ class _Mapping:
         self._is_restoring = False
         self._solving: Solve | None = None
         self._solving_since = 0.0
+        self._turns = Turns[Add]()
         self._findings: list[Finding] = []
         self._report_at = self._poses_at = 0.0
         self._is_moved = False
@@ -99,8 +101,9 @@ class _Mapping:
     def _work(self) -> None:
         look = None
         while not self._ended:
-            for message in self._arrived(wait=look is None):
+            for message in self._arrived(wait=look is None and not self._turns):
                 self._hear(message)
+            self._take_in()
             self._give_solver()
             self._tell()
             look = self._guarded("place", self._mapper.next_look, None)
@@ -128,15 +131,26 @@ class _Mapping:
                 self._mapper.join(message.key, message.hello)
             case Present():
                 self._mapper.present(message.key, message.here)
+            case Forget():
+                self._guarded("forget", partial(self._mapper.forget, message.key), None)
             case Add():
-                add = partial(self._mapper.add, message.key, message.keyframe)
-                self._findings += self._guarded("keyframe", add, [], message.key)
+                self._turns.add(self._mapper.name(message.key), message)
             case _Solved():
                 self._solved(message.result, message.ms)
             case _Lost():
                 self._replace_solver(message.how)
             case _ if message is END:
                 self._ended = True
+
+    def _take_in(self) -> None:
+        """Keyframes that wait; at the end all of them."""
+        began = time.perf_counter()
+        while True:
+            spent_ms = 0.0 if self._ended else 1e3 * (time.perf_counter() - began)
+            if (add := self._turns.next(spent_ms)) is None:
+                return
+            work = partial(self._mapper.add, add.key, add.keyframe)
+            self._findings += self._guarded("keyframe", work, [], add.key)
 
     def _guarded(self, what: str, work: Callable[[], T], otherwise: T, agent: str | None = None) -> T:
         """A fault of ours costs this message or step, never the process: the map file would bring it back."""
@@ -180,8 +194,9 @@ class _Mapping:
         if self._is_moved and time.monotonic() >= self._poses_at:
             self._is_moved, self._poses_at = False, time.monotonic() + _POSES_S
             changes = (*changes, self._mapper.poses())
-        if self._findings or changes:
-            self._answer(Found(tuple(self._findings), changes))
+        emptied = self._mapper.take_emptied()
+        if self._findings or changes or emptied:
+            self._answer(Found(tuple(self._findings), changes, emptied))
             self._findings = []
         if time.monotonic() >= self._report_at:
             self._report_at = time.monotonic() + _REPORT_S

@@ -92,7 +92,7 @@ def test_names_that_came_long_ago_take_no_memory() -> None:
 
 
 def test_who_is_known_comes_again_as_often_as_it_likes() -> None:
-    known = [Known(f"bob-{k:04x}", hello_of("bob", 100 + k), Foot(4, 0), 5) for k in range(12)]
+    known = [Known(f"bob-{k:04x}", hello_of("bob", 100 + k), Foot(4, 0, np.eye(4)), 5) for k in range(12)]
     edge = Edge(Config(), 7, keeps=True, known=known)
     for _ in range(200):  # a hello that is repeated, and a reconnect
         assert refusal(come(edge, "ann", 1)) is None

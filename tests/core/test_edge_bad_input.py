@@ -15,7 +15,7 @@ from share.core import events as ev
 from share.core.agent import Agent
 from share.core.edge import Edge
 from share.core.mapper import Mapper
-from share.core.peer import Known
+from share.core.peer import Foot, Known
 from share.core.steps import Query
 from share.errors import WireError
 from share.geometry import se3
@@ -78,7 +78,7 @@ def test_a_number_that_is_used_again_changes_nothing():
 
 def test_two_runs_of_one_name_whose_tags_begin_alike():
     tag = m.public_tag(0xB000B)
-    edge = Edge(Config(), 8, known=[Known(f"ann-{tag[:4]}", HELLO, None, 0)])
+    edge = Edge(Config(), 8, known=[Known(f"ann-{tag[:4]}", HELLO, Foot(0, 0, np.eye(4)), 1)])
     (join,) = of(tell(edge, replace(HELLO, run_id=0xB000B), 0xB000B), ed.Join)
     assert join.key == f"ann-{tag[:5]}"
     assert of(tell(edge, keyframe(0), 0xB000B), ed.Add)[0].key == f"ann-{tag[:5]}"
@@ -165,7 +165,7 @@ def test_hello_at_once_when_the_link_is_back():
 
 def test_who_is_not_greeted_yet_is_told_the_newest_correction_with_the_welcome():
     """Until then it counts revisions of our predecessor, and would not take it."""
-    known = Known("ann-000b", HELLO, None, 0)
+    known = Known("ann-000b", HELLO, Foot(0, 0, np.eye(4)), 1)
     edge, mapper = Edge(Config(), 8, known=[known]), Mapper(Config())
     mapper.join("ann-000b", HELLO)
     tell(edge, m.Ping(1, 0))

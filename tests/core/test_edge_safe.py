@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hellos import hello_of
 
 from share.config import Config
@@ -13,7 +14,7 @@ from share.core.edge import Edge
 from share.core.keeping import KeepKeyframe, KeepRun
 from share.core.peer import Foot, Known
 from share.geometry import se3
-from share.types import Keyframe, View
+from share.types import F64, Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
 
@@ -22,11 +23,23 @@ EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
 HELLO = hello_of("ann", 11)
 
 
-def keyframe(id: int, reference: int, forward_m: float = 0.2, stamp_ms: int | None = None) -> Keyframe:
-    """The agent says that it stands as far from its odom as it came in one step."""
-    T = se3.compose(np.eye(3), np.array([forward_m, 0.0, 0.0]))
+def keyframe(
+    id: int,
+    reference: int,
+    forward_m: float = 0.2,
+    stamp_ms: int | None = None,
+    at_m: float | None = None,
+    yaw: float = 0.0,
+) -> Keyframe:
+    """A step forwards, to where that leads from 0.2 m a keyframe; at_m, yaw: or there in its odom."""
+    at_m = 0.2 * (id - 1) + forward_m if at_m is None else at_m
+    T, T_odom_body = (se3.compose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (forward_m, at_m))
+    T_odom_body = T_odom_body @ se3.exp(np.array([0, 0, yaw, 0, 0, 0]))
+    T = T_odom_body if reference < 0 else T
     stamp_ns = (200 * id if stamp_ms is None else stamp_ms) * MS
-    return Keyframe(id, reference, stamp_ns, T, 1e-6 * np.eye(6), T, np.zeros(3), 0.0, EMPTY, id - 1)
+    return Keyframe(
+        id, reference, stamp_ns, T, 1e-6 * np.eye(6), T_odom_body, np.zeros(3), 0.0, EMPTY, id - 1
+    )
 
 
 def tell(edge: Edge, message: m.Message) -> list[ed.Effect]:
@@ -65,7 +78,7 @@ def test_several_kept_at_once_are_acknowledged_once() -> None:
 
 
 def test_a_known_run_goes_on_where_it_was() -> None:
-    foot = Foot(4, 800 * MS)
+    foot = Foot(4, 800 * MS, at(0.8))
     edge = Edge(Config(), 8, keeps=True, known=[Known("ann-000b", HELLO, foot, 5)])
     effects = tell(edge, HELLO)
     (welcome,) = [decode([bytes(f) for f in e.frames]) for e in of(effects, ed.Send)]
@@ -88,8 +101,49 @@ def test_a_leap_begins_a_stretch_in_the_same_odom() -> None:
     (record,) = of(effects, ed.Record)
     assert record.fields["event"] == "odometry doubted"
     assert "100 m" in record.fields["reason"]
-    (add,) = of(tell(edge, keyframe(2, 1)), ed.Add)
+    (add,) = of(tell(edge, keyframe(2, 1, at_m=100.2)), ed.Add)
     assert add.keyframe.reference == 1
+
+
+@pytest.mark.parametrize(
+    ("bad", "off"),
+    [
+        ({"at_m": 1.0}, "0.8 m"),
+        ({"forward_m": 0.9, "at_m": 0.2}, "0.7 m"),
+        ({"yaw": 0.4}, "23 degrees"),
+    ],
+)
+def test_a_step_that_is_not_between_its_two_poses_is_not_believed(bad: dict[str, float], off: str) -> None:
+    edge = Edge(Config(), 7)
+    tell(edge, HELLO)
+    tell(edge, keyframe(0, -1))
+    effects = tell(edge, keyframe(1, 0, **bad))
+    (add,) = of(effects, ed.Add)
+    assert add.keyframe.reference == -1
+    assert np.array_equal(add.keyframe.T_ref_body, add.keyframe.T_odom_body)
+    (record,) = of(effects, ed.Record)
+    assert record.fields["event"] == "odometry doubted"
+    assert off in record.fields["reason"]
+    assert "\n" not in record.fields["reason"]
+    assert edge.report({})["agents"]["ann"]["refused_messages"] == 1
+
+
+def test_what_a_filter_learns_of_its_past_is_no_contradiction() -> None:
+    """As much and more than was measured of honest agents."""
+    edge = Edge(Config(), 7)
+    tell(edge, HELLO)
+    tell(edge, keyframe(0, -1))
+    (add,) = of(tell(edge, keyframe(1, 0, yaw=float(np.radians(5.0)))), ed.Add)
+    assert add.keyframe.reference == 0
+    T = add.keyframe.T_odom_body
+    step = Keyframe(2, 1, 8400 * MS, at(6.0), 1e-6 * np.eye(6), T @ at(6.1), np.zeros(3), 0.0, EMPTY, 1)
+    effects = tell(edge, step)
+    assert [add.keyframe.reference for add in of(effects, ed.Add)] == [1]
+    assert not of(effects, ed.Record)
+
+
+def at(x: float) -> F64:
+    return se3.compose(np.eye(3), np.array([x, 0.0, 0.0]))
 
 
 def test_far_is_no_leap_if_time_enough_has_passed() -> None:

@@ -158,3 +158,10 @@ def test_a_join_that_was_undone_and_made_again_is_waited_for_anew(solved_between
         atlas._chart.drop(list(atlas._chart.ties.loops))
         if solved_between:
             settle(atlas)
+
+
+def test_of_a_stretch_without_keyframes_nothing_is_remembered() -> None:
+    surety = Surety(0.05, 3)
+    surety.remember(2, 0)
+    surety.forget([2])
+    assert not surety.heard(2, 0)

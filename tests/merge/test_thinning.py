@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Collection
+
 import numpy as np
 import pytest
 from atlas_sim import Walker, error, loop, near_loops
@@ -30,20 +33,41 @@ def at(x: float, yaw: float = 0.0) -> F64:
     return se3.exp(np.array([0, 0, yaw, 0, 0, 0])) + np.array([[0, 0, 0, x]] + [[0.0] * 4] * 3)
 
 
+def chosen(poses: F64, may_go: Collection[int], count: int, below: float = np.inf) -> list[int]:
+    whose = ["ann" if k in may_go else None for k in range(len(poses))]
+    return redundant(poses, whose, Counter(ann=count), 0.7, 0.5, below)
+
+
 def test_of_what_is_alike_one_stays() -> None:
     poses = np.array([at(0), at(0.05), at(1), at(2), at(2.01), at(3)])
-    assert sorted(redundant(poses, range(6), 2, 0.7, 0.5)) in ([0, 4], [1, 4], [0, 3], [1, 3])
-    assert 4 in redundant(poses, range(6), 1, 0.7, 0.5) or 3 in redundant(poses, range(6), 1, 0.7, 0.5)
+    assert sorted(chosen(poses, range(6), 2)) in ([0, 4], [1, 4], [0, 3], [1, 3])
+    assert 4 in chosen(poses, range(6), 1) or 3 in chosen(poses, range(6), 1)
 
 
 def test_turned_elsewhere_is_not_alike() -> None:
     poses = np.array([at(0), at(0.01, yaw=2.0), at(0.3), at(0.6)])
-    assert redundant(poses, range(4), 1, 0.7, 0.5)[0] != 1
+    assert chosen(poses, range(4), 1)[0] != 1
 
 
 def test_only_what_may_go_goes() -> None:
     poses = np.array([at(0.001 * k) for k in range(6)])
-    assert sorted(redundant(poses, [1, 4], 5, 0.7, 0.5)) == [1, 4]
+    assert sorted(chosen(poses, [1, 4], 5)) == [1, 4]
+
+
+def test_what_is_not_alike_enough_stays() -> None:
+    poses = np.array([at(0), at(0.05), at(1), at(2), at(2.01), at(3)])
+    assert len(chosen(poses, range(6), 6, below=0.5)) == 2
+    assert len(chosen(poses, range(6), 6)) == 6
+    assert chosen(poses[:1], [0], 1) == [0]
+    assert chosen(poses[:1], [0], 1, below=0.5) == []
+
+
+def test_each_gives_what_is_due_of_it() -> None:
+    poses = np.array([at(0.01 * k) for k in range(12)])
+    due = Counter(ann=2, bob=1)
+    gone = redundant(poses, ["ann", "bob", "eve"] * 4, due, 0.7, 0.5, np.inf)
+    assert Counter(k % 3 for k in gone) == {0: 2, 1: 1}
+    assert due.total() == 0
 
 
 def test_a_keyframe_in_the_middle_leaves_its_neighbours_tied() -> None:

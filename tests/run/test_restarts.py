@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from map_changes import small_map
 
-from share.config import Config
+from share.config import Config, EdgeConfig
+from share.core.edge_events import Lost
 from share.errors import StoreError
 from share.io.map_store import MapStore
 from share.run import edge as edge_module
 from share.run.companion import END
 from share.run.edge import EdgeRun
-from share.run.mapping import Restore, Restored
+from share.run.mapping import Mapped, Restore, Restored
 from share.run.restarts import Restarts
 
 
@@ -181,3 +182,34 @@ def test_the_edge_waits_for_a_disk_that_cannot_be_read(edge, monkeypatch):
     monkeypatch.setattr(run._restarts, "found", found)
     step_until(run, lambda: run._begin_at is None)
     assert run._mapping is not None
+
+
+def counts(inbox, answer, settings):
+    """A mapper that has looked up seven keyframes and dies."""
+    answer(Mapped({"loops": {"tried": 7, "accepted": 2}, "place_ms": {"n": 7}, "maps": {}}))
+    time.sleep(0.1)
+    os._exit(3)
+
+
+def test_what_was_counted_before_a_mapper_died_still_counts(edge):
+    run, _, told = edge(counts)
+    for dead in range(1, 4):
+        step_until(run, lambda dead=dead: len(events(told, "mapper lost")) >= dead)
+        run._note()
+        assert run.report()["loops"] == {"tried": 7 * dead, "accepted": 2 * dead}
+        assert run.report()["place_ms"]["n"] == 7 * dead
+
+
+def test_a_tracker_that_dies_is_its_agents_trouble(monkeypatch):
+    """Not the edge's: whoever could end one by its frames would have /health say 503."""
+    settings = Config(edge=EdgeConfig(policy="streamed"))
+    run = EdgeRun(settings, Link(), None, lambda fields: None)
+    try:
+        run._inbox.put(Lost("ann-0001", 0, "was ended by SIGKILL"))
+        run._step()
+        run._note()
+        assert run.report()["trouble"] == []
+        assert run.report()["refused"] == ["agent's run ann-0001: its tracker was ended by SIGKILL"]
+    finally:
+        run.stop()
+        run.go()

@@ -116,6 +116,25 @@ def test_health_says_who_is_there():
     assert health == expected
 
 
+def test_what_a_peer_says_wrong_is_in_health_and_does_not_make_it_503():
+    """Whoever restarts an edge because of that would do the attacker's work."""
+    edge = Edge(Config(), session=5)
+    for k in range(100):
+        edge.handle(Received(peer_id(1), [b"nonsense"]), 10**9)
+        edge.handle(Received(peer_id(2), encode(hello_of("ann", 2))), 10**9 + k)
+        edge.handle(Received(peer_id(2), [b"nonsense"]), 10**9 + k)
+    with serving(lambda: edge.report({})) as server:
+        status, _, body = get(server, "/health")
+        samples = metrics(get(server, "/metrics")[2])
+    health = json.loads(body)
+    assert (status, health["status"], health["trouble"]) == (200, "ok", [])
+    assert [line.split(":")[0] for line in health["refused"]] == [
+        "agent 'ann'",
+        "peers that have not joined",
+    ]
+    assert not any(value for (name, _), value in samples.items() if name == "share_edge_troubles")
+
+
 def test_health_is_503_where_something_is_wrong():
     trouble = ["the map file cannot be written"]
     with serving(lambda: {**REPORT, "trouble": trouble}) as server:

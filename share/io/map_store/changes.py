@@ -8,6 +8,7 @@ from typing import Any
 from share.core.keeping import (
     Change,
     DropLoop,
+    ForgetRun,
     KeepKeyframe,
     KeepLink,
     KeepLoop,
@@ -18,6 +19,11 @@ from share.core.keeping import (
 from share.io.map_store import rows
 from share.io.map_store.rows import COLUMNS, insert
 from share.merge.join import Key
+
+_OF_RUN = (
+    *(("run", "key"), ("run_copy", "key"), ("stretch", "run"), ("keyframe", "run"), ("link", "run")),
+    *(("loop", "a_run"), ("loop", "b_run")),
+)
 
 
 def apply(db: sqlite3.Connection, change: Change) -> None:
@@ -41,6 +47,8 @@ def apply(db: sqlite3.Connection, change: Change) -> None:
         case Retire():
             for key in change.keys:
                 _retire(db, key)
+        case ForgetRun():
+            _forget_run(db, change.key)
         case KeepPoses():
             db.execute("DELETE FROM poses")
             insert(db, "poses", rows.of_poses(change))
@@ -94,6 +102,11 @@ def _retire(db: sqlite3.Connection, key: Key) -> None:
     db.execute("DELETE FROM loop WHERE b_run = ? AND b_id = ?", key)
     if _next(db, key.agent) < following:  # it was the newest: the rest no longer says so
         _remember_next(db, key.agent, following)
+
+
+def _forget_run(db: sqlite3.Connection, run: str) -> None:
+    for table, column in _OF_RUN:
+        db.execute(f"DELETE FROM {table} WHERE {column} = ?", (run,))
 
 
 def _remember_next(db: sqlite3.Connection, run: str, following: int) -> None:

@@ -1,0 +1,106 @@
+"""How much one agent may make the mapper work, and whose turn it is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hellos import hello_of
+
+from share.config import Config
+from share.core.allowance import Allowance
+from share.core.edge import Edge
+from share.core.edge_events import Add, Received, Send
+from share.core.turns import Turns
+from share.types import Keyframe, View
+from share.wire import messages as m
+from share.wire.codec import decode, encode
+
+S = 1_000_000_000
+MS = S // 1000
+
+
+def keyframe(id: int, points: int) -> Keyframe:
+    view = View(np.zeros((points, 2)), np.zeros((points, 3)), np.zeros((points, 32), np.uint8))
+    T = np.eye(4)
+    return Keyframe(id, id - 1, id * S, T, 1e-6 * np.eye(6), T, np.zeros(3), 0.0, view, id - 1)
+
+
+def taken_in(allowance: Allowance, points: int, hz: float, seconds: float, name: str = "eve") -> int:
+    times = (round(k * S / hz) for k in range(int(seconds * hz)))
+    one = keyframe(0, points)
+    return sum(allowance.objection(name, one, at_ns) is None for at_ns in times)
+
+
+def test_an_honest_agent_is_never_held_back() -> None:
+    """Its whole ledger at once, and from then on as many as control.rate_max_hz allows."""
+    config = Config()
+    allowance, one = Allowance(), keyframe(0, config.tracker.view_features)
+    burst = [allowance.objection("ann", one, 0) for _ in range(config.agent.keep_keyframes)]
+    assert not any(burst)
+    hz = config.control.rate_max_hz
+    assert taken_in(allowance, 500, hz, 60, name="ann") == 60 * hz
+
+
+def test_of_large_keyframes_fewer_are_taken_in() -> None:
+    allowance = Allowance()
+    assert taken_in(allowance, 2000, 50, 60) < 60 * 50 / 4
+    after = taken_in(allowance, 2000, 50, 60)
+    assert 60 * 3 <= after <= 60 * 4
+    assert taken_in(Allowance(), 0, 50, 600) < 600 * 32 + 2000
+
+
+def test_a_new_run_gives_no_new_allowance_and_another_name_has_its_own() -> None:
+    allowance = Allowance()
+    taken_in(allowance, 2000, 50, 60)
+    assert taken_in(allowance, 2000, 50, 1) <= 4
+    assert taken_in(allowance, 500, 5, 20, name="ann") == 100
+
+
+def test_what_is_not_taken_in_is_not_acknowledged_and_is_said() -> None:
+    edge = Edge(Config(), 7)
+    hello, now_ns = hello_of("eve", 5), S
+
+    def tell(message: m.Message) -> list[Any]:
+        return edge.handle(Received(m.peer_id(5), [bytes(f) for f in encode(message)]), now_ns)
+
+    tell(hello)
+    applied, acked = 0, m.Ack(0)
+    for k in range(300):
+        effects = tell(keyframe(k, 2000))
+        applied += sum(isinstance(effect, Add) for effect in effects)
+        (acked,) = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, Send)]
+    assert 100 < applied < 250
+    assert acked == m.Ack(applied)
+    report = edge.report({})
+    eve = report["agents"]["eve"]
+    assert "5000 keypoints a second" in eve["reason"]
+    assert eve["refused_messages"] == 300 - applied
+    assert report["refused"] == [f"agent 'eve': {300 - applied} messages refused, the last: {eve['reason']}"]
+    now_ns += 10 * S  # sent again, it is taken in
+    assert any(isinstance(effect, Add) for effect in tell(keyframe(applied, 2000)))
+    now_ns += 10 * S
+    tell(m.Ping(0, 0))
+    assert edge.report({})["agents"]["eve"]["reason"] == ""
+
+
+def test_each_name_in_turn() -> None:
+    turns = Turns[int]()
+    for k in range(100):
+        turns.add("eve", k)
+    turns.add("ann", 1000)
+    turns.add("ann", 1001)
+    turns.add("bob", 2000)
+    assert [turns.next() for _ in range(6)] == [0, 1000, 2000, 1, 1001, 2]
+    assert len(turns) == 97
+    assert [turns.next() for _ in range(97)] == list(range(3, 100))
+    assert turns.next() is None
+
+
+@pytest.mark.parametrize("spent_ms", [10.0, 1e6])
+def test_looking_up_has_its_turn_too(spent_ms: float) -> None:
+    turns = Turns[int]()
+    turns.add("eve", 1)
+    assert turns.next(spent_ms) is None
+    assert turns.next(9.9) == 1

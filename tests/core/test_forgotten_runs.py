@@ -1,0 +1,214 @@
+"""Runs of one name without end: the map, its file and the edge stay bounded, and others keep theirs."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from hellos import hello_of
+
+from share.config import Config
+from share.core import edge_events as ed
+from share.core.edge import Edge
+from share.core.keeping import ForgetRun, Retire
+from share.core.mapper import Mapper
+from share.core.peer import known_runs
+from share.geometry import se3
+from share.io.map_store import MapStore
+from share.types import F64, Keyframe, View
+from share.wire import messages as m
+from share.wire.codec import decode, encode
+
+S = 1_000_000_000
+EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
+MOST = 60
+CONFIG = replace(Config(), edge=replace(Config().edge, max_keyframes=MOST))
+
+
+def at(x: float) -> F64:
+    return se3.compose(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+class Life:
+    """An edge, its mapper, and the map's file; lossless: whether changes are kept."""
+
+    def __init__(self, store: MapStore, session: int = 7) -> None:
+        kept = store.load()
+        self.store, self.mapper = store, Mapper(CONFIG)
+        self.edge = Edge(CONFIG, session, keeps=True, known=known_runs(kept, 0.05))
+        if kept.runs:
+            self.mapper.restore(kept)
+        self.sent: list[m.Message] = []
+        self.left_out: list[type] = []  # changes that the disk loses
+        self.now_ns = S
+
+    def handle(self, event: ed.Event) -> None:
+        for effect in self.edge.handle(event, self.now_ns):
+            match effect:
+                case ed.Send():
+                    self.sent.append(decode([bytes(f) for f in effect.frames]))
+                case ed.Join():
+                    self.mapper.join(effect.key, effect.hello)
+                case ed.Present():
+                    self.mapper.present(effect.key, effect.here)
+                case ed.Forget():
+                    self.mapper.forget(effect.key)
+                case ed.Add():
+                    self.mapper.add(effect.key, effect.keyframe)
+                case ed.Keep():
+                    self.store.write([c for c in effect.changes if type(c) not in self.left_out])
+                    self.handle(ed.Kept(effect.ticket))
+        changes, emptied = self.mapper.take_changes(), self.mapper.take_emptied()
+        if changes or emptied:
+            self.handle(ed.Found((), changes, emptied))
+
+    def tell(self, run_id: int, message: m.Message) -> None:
+        self.handle(ed.Received(m.peer_id(run_id), [bytes(f) for f in encode(message)]))
+
+    def run(self, name: str, run_id: int, count: int, stays: bool = False) -> None:
+        """A run with so many keyframes, 1 m apart; then it leaves."""
+        self.tell(run_id, hello_of(name, run_id))
+        for k in range(count):
+            step = at(k) if k == 0 else at(1.0)
+            up = np.zeros(3)
+            self.tell(run_id, Keyframe(k, k - 1, k * S, step, 1e-6 * np.eye(6), at(k), up, 0.0, EMPTY, k - 1))
+        if not stays:
+            self.tell(run_id, m.Bye())
+        self.now_ns += 10 * S
+        self.tell(1, m.Ping(0, 0))  # ann is still there
+        self.handle(ed.Tick())
+
+    def held(self) -> Counter[str]:
+        return Counter(key.agent.partition("-")[0] for key in self.mapper.poses().keys)
+
+
+def crowded(store: MapStore, runs: int = 30) -> Life:
+    """ann with 30 keyframes, and one small run of eve after the other."""
+    life = Life(store)
+    life.run("ann", 1, 30, stays=True)
+    for k in range(runs):
+        life.run("eve", 100 + k, 8)
+    return life
+
+
+def test_runs_without_end_take_nothing_of_anothers_and_leave_nothing(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = crowded(store)
+        report = life.edge.report(life.mapper.report())
+        assert life.held()["ann"] == 30
+        assert len(life.mapper.poses().keys) <= 1.05 * MOST
+        assert len(report["agents"]) == len(life.mapper.report()["agents"]) <= 6
+        assert report["forgotten_runs"] + len(report["agents"]) == 31
+        assert report["maps"].keys() == {f"{run}/0" for run in life.mapper.report()["agents"]}
+        kept = store.load()
+    assert {run.key for run in kept.runs} == life.mapper.report()["agents"].keys()
+    assert {k.at for k in kept.keyframes} == set(life.mapper.poses().keys)
+    assert {name.rpartition("/")[0] for name in kept.stretches} == {run.key for run in kept.runs}
+    assert kept.complaints == ()
+
+
+def test_the_map_that_is_left_is_found_again(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = crowded(store)
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        second = Life(store, session=8)
+        assert second.mapper.report()["maps"] == life.mapper.report()["maps"]
+        for k in range(10):
+            second.run("eve", 300 + k, 8)
+        assert second.held()["ann"] == 30
+        assert len(second.mapper.poses().keys) <= 1.05 * MOST
+
+
+def test_a_run_that_was_forgotten_and_comes_back_is_told_to_start_again(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = crowded(store)
+        life.tell(100, hello_of("eve", 100))
+        refused = life.sent[-1]
+        assert isinstance(refused, m.Refused)
+        assert "start the agent again" in refused.reason
+        life.now_ns += 100 * S
+        life.tell(999, hello_of("eve", 999))
+        assert isinstance(life.sent[-1], m.Welcome)
+
+
+def test_a_run_that_comes_back_before_it_is_forgotten_goes_on(tmp_path: Path) -> None:
+    """What the mapper said of it is of before."""
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = crowded(store, runs=6)
+        gone = next(run for run in life.mapper.report()["agents"] if run.startswith("eve"))
+        step = Keyframe(8, 7, 8 * S, at(1.0), 1e-6 * np.eye(6), at(8), np.zeros(3), 0.0, EMPTY, 7)
+        number = next(k for k in range(6) if f"-{m.public_tag(100 + k)[:4]}" in gone)
+        life.tell(100 + number, hello_of("eve", 100 + number))
+        life.tell(100 + number, step)
+        life.handle(ed.Found((), (), (ed.Key(gone, 7),)))
+        life.tell(100 + number, m.Bye())
+        life.handle(ed.Tick())
+        assert gone in life.mapper.report()["agents"]
+
+
+def test_a_run_that_comes_back_to_less_is_tied_to_what_is_left_in_the_file_too(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = Life(store)
+        for name, run_id, count in (("ann", 1, 2), ("eve", 100, 20), ("eve", 101, 1)):
+            life.run(name, run_id, count, stays=name == "ann")
+        atlas = life.mapper._atlas
+        key = next(key.agent for key in atlas.everything()[0] if key.id == 19)
+        life.mapper._leaving = [
+            n for n in atlas._chart.poses if atlas.key(n) in {(key, k) for k in range(8, 20)}
+        ]
+        while life.mapper._leaving:
+            life.mapper._thin()
+        life.handle(ed.Tick())
+        life.tell(100, hello_of("eve", 100))
+        life.tell(
+            100, Keyframe(20, 19, 20 * S, at(1.0), 1e-6 * np.eye(6), at(20), np.zeros(3), 0.0, EMPTY, 19)
+        )
+        kept = store.load()
+        link = kept.links[ed.Key(key, 20)]
+        assert (link.reference, link.T_ref_body[0, 3]) == (7, 13.0)
+        second = Life(store, session=8)
+        assert np.allclose(second.mapper.poses().T_map_body, life.mapper.poses().T_map_body)
+        covs = [
+            one._atlas._chart.step(*one._atlas._chart.trails.stretches[1].nodes[-2:]).cov
+            for one in (life.mapper, second.mapper)
+        ]
+        assert np.allclose(covs[0], covs[1])
+
+
+def test_a_crash_before_a_run_is_forgotten_is_made_up_for(tmp_path: Path) -> None:
+    """Its keyframes went from the file, and the run itself did not."""
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = crowded(store, runs=2)
+        gone = next(run for run in life.mapper.report()["agents"] if run.startswith("eve"))
+        keys = tuple(k.at for k in store.load().keyframes if k.key == gone)
+        store.write([Retire(keys)])
+        second = Life(store, session=8)
+        assert gone in second.mapper.report()["agents"]
+        second.handle(ed.Tick())
+        assert gone not in second.mapper.report()["agents"]
+        assert gone not in {run.key for run in store.load().runs}
+        store.write([ForgetRun(gone)])  # again: nothing happens
+        assert len(store.load().runs) == 2
+
+
+def test_a_run_that_such_a_crash_left_begins_anew(tmp_path: Path) -> None:
+    """Its agent is the first to be heard. What it sends is in the file, though its numbers were there."""
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = crowded(store, runs=1)
+        gone = next(run for run in life.mapper.report()["agents"] if run.startswith("eve"))
+        store.write([Retire(tuple(k.at for k in store.load().keyframes if k.key == gone))])
+        second = Life(store, session=8)
+        second.run("eve", 100, 3)
+        assert second.sent[0] == m.Welcome(8, 0)
+        assert [k.at.id for k in store.load().keyframes if k.key == gone] == [0, 1, 2]
+
+
+def test_runs_that_never_sent_a_keyframe_leave_the_mapper_too(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = Life(store)
+        life.run("ann", 1, 2, stays=True)
+        for k in range(300):
+            life.run(f"n{k}", 1000 + k, 0)
+        assert len(life.mapper.report()["agents"]) <= 258
