@@ -66,7 +66,7 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (Scene, "seen", "slant and runaways"),
     (Scene, "_wake", "keyframe: wake"),
     (Scene, "_forget", "keyframe: forget"),
-    (Scene, "_inverse_depth", "keyframe: depth"),
+    (Scene, "_inverse_depths", "keyframe: depth"),
     (features, "looks", "keyframe: patches"),
     (tracker, "make_view", "keyframe: view"),
     (corners, "detect", "keyframe: corners"),

@@ -118,6 +118,17 @@ class InertialTracker:
         assert self._scene is not None
         return self._scene.footing()
 
+    def give_up(self, frame: Frame) -> None:
+        """Something failed in or after `frame`, the last: the filter may be in any state."""
+        self._window = None
+        self._lose(frame)
+        self._image, self._stamp_ns = frame.image0, frame.stamp_ns
+
+    @property
+    def doubted(self) -> int:
+        """How many samples of the IMU were not believed."""
+        return self._samples.doubted
+
     def predict(self, t_ns: int, imu: ImuBatch | None = None) -> F64 | None:
         """T_odom_body (4, 4) at a time after the last frame's, IMU time: for renderers, between frames.
 
@@ -137,11 +148,12 @@ class InertialTracker:
 
     def _follow(self, frame: Frame, scene: Scene) -> TrackResult:
         before, imu = scene.state.T, self._heard(frame, scene.state)
+        doubted = self._samples.doubt(scene.state.stamp_ns) is not None
         since_s = (frame.stamp_ns - self._stamp_ns) * 1e-9
         measured = self._propagate(frame, scene.state, imu)
         scene.step(since_s, measured)
         left, seen = self._look(frame, scene)
-        heard = imu is not None
+        heard = imu is not None and not (doubted and self._ready)
         if measured and self._window is None:
             self._agreement.add(self._surprise, since_s)
         scene.seen(left, seen)
@@ -225,6 +237,11 @@ class InertialTracker:
             noise = without(self._noise, self._coasting, np.arange(6) >= 3)
             self._rate = ekf.propagate(s, without_force(s, imu, to_ns, gravity), to_ns, noise, gravity)
             return True
+        if (doubt := self._samples.doubt(s.stamp_ns)) is not None:
+            noise = without(self._noise, self._coasting, doubt.axes)
+            self._rate = ekf.propagate(s, imu, to_ns, noise, gravity)
+            ekf.doubt(s, doubt.turn, 0.0, doubt.speed)
+            return not doubt.axes[:3].any()
         clipped = self._samples.clipped(imu)
         noise = without(self._noise, self._coasting, clipped)
         imu = unclipped(imu, clipped[:3], self._rate + s.bg)
