@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from share.geometry import se3
 from share.geometry.camera import BASELINE_M, Camera, ImuNoise, Rig, rays
@@ -16,7 +17,6 @@ _LEAST_PX = 32  # of an image's side: less holds no features
 _FIELD_DEG = (5.0, 170.0)  # from edge to edge, as the lens has it
 _SQUARE = 2.0  # times that a pixel may be longer than wide, or a camera's focal length than another's
 _GRID = (17, 13)  # of pixels that a lens is tried at
-_STEEPEST = np.tan(np.radians(85.0))  # of a ray
 _EXACT_PX = 0.5  # of the way there and back
 _FOLDED, _SHARED = 0.1, 0.2  # parts of an image: that may have no ray; that another camera has to see
 _SEEN_M = (1.0, 5.0)  # what is held before two cameras
@@ -62,7 +62,7 @@ def _of_lens(camera: Camera) -> Iterator[str]:
     if not 1 / _SQUARE <= camera.fx / camera.fy <= _SQUARE:
         yield f"focal lengths {camera.fx:g} and {camera.fy:g} px: pixels are nearly square; calibrate again"
     with np.errstate(all="ignore"):
-        px, uv, known = _tried(camera)
+        uv, known = _tried(camera)
     folded = 1 - known.mean()
     if folded > _FOLDED:
         yield (
@@ -70,30 +70,28 @@ def _of_lens(camera: Camera) -> Iterator[str]:
             "corners"
         )
         return
-    across = np.degrees(_field(px, uv, known))
-    least, most = _FIELD_DEG
+    across, (least, most) = _field(uv[known]), _FIELD_DEG
     if not least <= across.min() <= across.max() <= most:
         yield (
-            f"it would see {across[0]:.3g} by {across[1]:.3g} degrees, not {least:g} to {most:g}; focal lengths are in "
-            "pixels of the images that are recorded"
+            f"it would see {across[0]:.3g} by {across[1]:.3g} degrees, not {least:g} to {most:g}; focal "
+            "lengths are in pixels of the images that are recorded"
         )
 
 
-def _tried(camera: Camera) -> tuple[F64, F64, np.ndarray]:
-    """px (N, 2) all over the image, their normalised coordinates (N, 2), and which (N,) really are: the same
+def _tried(camera: Camera) -> tuple[F64, NDArray[np.bool_]]:
+    """Of pixels all over the image their normalised coordinates (N, 2), and which (N,) really are: the same
     way up as in the middle, and back to where they came from."""
     x, y = np.linspace(0, camera.width - 1, _GRID[0]), np.linspace(0, camera.height - 1, _GRID[1])
     px = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     uv = camera.normalise(px)
     back = np.abs(camera.distort(uv) - px).max(axis=1)
     upright = np.linalg.det(camera.jacobian(uv)) > 0
-    return px, uv, (back < _EXACT_PX) & upright & (np.abs(uv).max(axis=1) < _STEEPEST)
+    return uv, (back < _EXACT_PX) & upright
 
 
-def _field(px: F64, uv: F64, known: np.ndarray) -> F64:
-    """Across and upright (2,), rad: what the known pixels span."""
-    angles = np.arctan(uv[known])
-    out: F64 = angles.max(axis=0) - angles.min(axis=0)
+def _field(uv: F64) -> F64:
+    """Across and upright (2,), degrees: what the rays (N, 2) span."""
+    out: F64 = np.degrees(np.ptp(np.arctan(uv), axis=0))
     return out
 
 
@@ -129,8 +127,8 @@ def _of_depth(cam0: Camera, depth: Camera, T_depth_cam0: F64) -> Iterator[str]:
 def _shared(camera: Camera, other: Camera, T_other_camera: F64) -> float:
     """The part of the camera's image that the other sees, where things are neither near nor far."""
     with np.errstate(all="ignore"):
-        _, uv, known = _tried(camera)
-        _, theirs, valid = _tried(other)
+        uv, known = _tried(camera)
+        theirs, valid = _tried(other)
         widest = np.abs(theirs[valid]).max(axis=0, initial=0.0)
         seen = []
         for z in _SEEN_M:
