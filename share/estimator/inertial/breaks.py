@@ -51,8 +51,9 @@ class Breaks:
         self._stamp_ns, self._value = 0, np.zeros(6)  # of the last that was believed
         self._steps = np.zeros((0, 6))  # the last few between such
         self._newest: tuple[int, F64] | None = None  # of any
-        self._run: list[F64] = []  # steps of the run that goes on
-        self._since_ns: int | None = None  # of its first sample
+        self._run: list[F64] = []  # steps of samples, the doubted ones too, while a run goes on
+        self._since_ns: int | None = None  # of its first sample,
+        self._until_ns = 0  # and of its last so far
         self._left: tuple[_Left, ...] = ()
 
     def copy(self) -> Breaks:
@@ -97,11 +98,12 @@ class Breaks:
         between = max(_TIMES, (stamp_ns - self._stamp_ns) / max(step_ns, 1))
         lately = self._steps.max(axis=0, initial=0.0)
         leaps = far > between * lately + _MORE * max(1.0, step_ns / _USUAL_NS)
+        self._run.append(np.abs(value - newest[1]))
         if not leaps.any():
             self._accept(stamp_ns, value, far)
             return True
-        self._run.append(np.abs(value - newest[1]))
         self._since_ns = stamp_ns if self._since_ns is None else self._since_ns
+        self._until_ns = stamp_ns
         if stamp_ns - self._since_ns > _LONGEST_NS:
             self._begin(stamp_ns, value, np.array(self._run[-_LATELY:]))
             return True
@@ -116,5 +118,8 @@ class Breaks:
         self._run, self._since_ns = [], None
 
     def _accept(self, stamp_ns: int, value: F64, far: F64) -> None:
-        steps = self._steps if self._since_ns is not None else np.concatenate([self._steps, far[None]])
-        self._begin(stamp_ns, value, steps[-_LATELY:])
+        """As expected; but a run of samples of which some lie right by chance goes on."""
+        if self._since_ns is None or stamp_ns - self._until_ns > _APART_NS:
+            self._begin(stamp_ns, value, np.concatenate([self._steps, far[None]])[-_LATELY:])
+        else:
+            self._stamp_ns, self._value = stamp_ns, value
