@@ -257,7 +257,8 @@ def main() -> None:
         if kind is not None and kind != "refused":
             print(f"{kind[:160]} <- {what}", flush=True)
         if noted:
-            print(f"   {len(noted)} warnings, {noted[0].message} at {noted[0].filename[-30:]}:{noted[0].lineno} <- {what}")
+            first = noted[0]
+            print(f"   {len(noted)} warnings: {first.message}, {first.filename}:{first.lineno} <- {what}")
     print(dict(tally), f"slowest {slowest[0]:.1f} s: {slowest[1]}")
 
 

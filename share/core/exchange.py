@@ -28,8 +28,8 @@ class Exchange:
 
     @property
     def unproven_ns(self) -> int:
-        """Twice what `offset_ns` can be wrong by if one of the two times of the other clock is made up: that one
-        was read within the exchange, which the own clock has timed, is all that the other cannot feign."""
+        """Twice what `offset_ns` can be wrong by if one of the two times of the other clock is made up: that
+        one was read within the exchange, which the own clock has timed, is all that it cannot feign."""
         return (self.back_ns - self.sent_ns) + (self.replied_ns - self.received_ns)
 
     @property

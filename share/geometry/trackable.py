@@ -1,6 +1,6 @@
 """What a tracker needs of a rig, beyond what cameras and IMUs can be at all (`share.geometry.camera`).
 
-A rig that lacks it is a mistake in a calibration: tracked all the same, it would give no poses or wrong ones."""
+A rig that lacks it is a mistake in a calibration: it would give no poses, or wrong ones."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def _field(uv: F64) -> F64:
 
 def _of_pair(cam0: Camera, cam1: Camera, T_cam1_cam0: F64) -> Iterator[str]:
     if not 1 / _SQUARE <= cam0.focal / cam1.focal <= _SQUARE:
-        yield f"cam1: its focal length is {cam1.focal:g} px, that of cam0 {cam0.focal:g}; they must look alike"
+        yield f"cam1: focal length {cam1.focal:g} px, but {cam0.focal:g} of cam0; they must look alike"
     shared = _shared(cam0, cam1, T_cam1_cam0)
     if shared < _SHARED:
         yield (
@@ -107,8 +107,8 @@ def _of_pair(cam0: Camera, cam1: Camera, T_cam1_cam0: F64) -> Iterator[str]:
     roll = abs(np.degrees(np.arctan2(T_cam1_cam0[1, 0], T_cam1_cam0[0, 0])))
     if roll > _ROLL_DEG:
         yield (
-            f"T_cam1_cam0: cam1's images are turned by {roll:.0f} degrees against cam0's; turn them and their "
-            "calibration upright"
+            f"T_cam1_cam0: cam1's images are turned by {roll:.0f} degrees against cam0's; turn them upright, "
+            "and their calibration"
         )
 
 

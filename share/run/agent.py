@@ -46,7 +46,7 @@ from share.run.lateness import Lateness
 from share.run.pipeline import check_trackable, frames_of
 from share.run.scribe import Scribe, Written
 from share.strict import to_mapping
-from share.types import Frame, TrackState
+from share.types import Frame
 from share.wire import messages as m
 
 TICK_MS = 50

@@ -268,7 +268,7 @@ CALIBRATIONS = {
         "cam0: its distortion folds",
     ),
     "no view in common": (
-        CAMCHAIN.replace("[[1, 0, 0, -0.05], [0, 1, 0, 0], [0, 0, 1, 0]", "[[-1, 0, 0, -0.05], [0, 1, 0, 0], [0, 0, -1, 0]"),
+        CAMCHAIN.replace("[[1, 0, 0", "[[-1, 0, 0").replace("[0, 0, 1, 0]", "[0, 0, -1, 0]"),
         "cam1 sees 0 % of what cam0 sees",
     ),
     "another resolution's": (CAMCHAIN.replace("320.4", "1320.4"), "lies outside an image of 640x480"),

@@ -71,7 +71,7 @@ def test_the_truth_is_within_what_is_stated_however_uneven_the_ways(up_us: float
 
 @pytest.mark.parametrize("read_at", [0.0, 0.5, 1.0])
 def test_an_edge_that_says_that_it_kept_the_question_long_makes_no_claim_surer(read_at: float) -> None:
-    """Of 30 ms that it took it says to have had the question for all but 0.2. Wherever within the exchange its
+    """Of the 30 ms that it took it says to have had the question for all but 0.2. Wherever within these its
     one true reading was made, here 7 s off, the offset is within what is stated."""
     clock, took, kept = ClockFilter(ClockConfig()), 30 * MS, 30 * MS - 200 * US
     for k in range(200):

@@ -15,9 +15,11 @@ from share.types import F64, ImuBatch
 
 _LATELY = 20  # steps that tell how a body moves
 _TIMES = 4.0  # as far as the farthest of them, or as many of them as lie between,
-_MORE = np.repeat([1.0, 12.0], 3)  # and this, rad/s and m/s^2: no body moves farther from one to the next.
+_MORE = np.repeat([0.7, 8.0], 3)  # and this, rad/s and m/s^2: no body moves farther from one to the next.
 # Of 195,000 samples of seven drones and hand-held recordings (EuRoC, TUM-VI) none has more than 0.35 and 3.9.
-_USUAL_NS = 5_000_000  # between two samples, 200 Hz; the last bound is for steps up to this, and grows with them
+_ODD_TIMES, _ODD_MORE = 2.0, np.repeat([0.1, 2.0], 3)  # the same of what may be wrong, if images say so too,
+_ODD_NS = 200_000_000  # for so long after
+_USUAL_NS = 5_000_000  # 200 Hz; what is added is for samples so far apart, and grows with the distance
 _APART_NS = 25_000_000  # samples further apart say nothing of each other
 _LONGEST_NS = 200_000_000  # of a run; what lasts longer is how things are now
 _KEPT_NS = 5_000_000_000
@@ -26,8 +28,8 @@ _MOST_RAD, _MOST_M_S = 0.3, 3.0  # that a body may have turned or gained without
 
 @dataclass(frozen=True, eq=False)
 class Doubt:
-    """axes (6,): gyro, then accelerometer, that say nothing for a while. turn rad, speed m/s: what the samples
-    would add if they were true."""
+    """axes (6,): gyro, then accelerometer, that say nothing for a while. turn rad, speed m/s: what the
+    samples would add if they were true."""
 
     axes: NDArray[np.bool_]
     turn: float
@@ -55,6 +57,7 @@ class Breaks:
         self._since_ns: int | None = None  # of its first sample,
         self._until_ns = 0  # and of its last so far
         self._left: tuple[_Left, ...] = ()
+        self._odd_ns: int | None = None  # the last sample that is believed, but odd
 
     def copy(self) -> Breaks:
         """That goes its own way from here."""
@@ -70,6 +73,8 @@ class Breaks:
         if self._since_ns is None and self._newest is not None:
             steps = np.abs(np.diff(values, axis=0, prepend=self._value[None]))
             if (steps <= _MORE).all():  # as nearly always
+                if (steps > _ODD_MORE).any():
+                    self._look(imu, steps)
                 self._steps = np.concatenate([self._steps, steps])[-_LATELY:]
                 self._stamp_ns, self._value = int(imu.stamps_ns[-1]), values[-1]
                 self._newest = (self._stamp_ns, self._value)
@@ -88,6 +93,18 @@ class Breaks:
         axes = np.any([one.excess > 0 for one in left], axis=0)
         return Doubt(axes, min(turn, _MOST_RAD), min(speed, _MOST_M_S))
 
+    def is_odd(self, now_ns: int) -> bool:
+        """Whether one of the last samples that were believed may be wrong all the same."""
+        return self._odd_ns is not None and now_ns - self._odd_ns < _ODD_NS
+
+    def _look(self, imu: ImuBatch, steps: F64) -> None:
+        """Whether one of these steps (N, 6) is odd."""
+        lately = np.concatenate([self._steps, steps])
+        for k, step in enumerate(steps, len(self._steps)):
+            before = lately[max(0, k - _LATELY) : k].max(axis=0, initial=0.0)
+            if (step > _ODD_TIMES * before + _ODD_MORE).any():
+                self._odd_ns = int(imu.stamps_ns[k - len(self._steps)])
+
     def _is_good(self, stamp_ns: int, value: F64) -> bool:
         newest, self._newest = self._newest, (stamp_ns, value)
         if newest is None or stamp_ns - newest[0] > _APART_NS:
@@ -100,6 +117,8 @@ class Breaks:
         leaps = far > between * lately + _MORE * max(1.0, step_ns / _USUAL_NS)
         self._run.append(np.abs(value - newest[1]))
         if not leaps.any():
+            if (far > _ODD_TIMES * lately + _ODD_MORE).any():
+                self._odd_ns = stamp_ns
             self._accept(stamp_ns, value, far)
             return True
         self._since_ns = stamp_ns if self._since_ns is None else self._since_ns

@@ -47,6 +47,10 @@ class Samples:
         """How many samples were left out."""
         return self._breaks.count
 
+    def odd(self, now_ns: int) -> bool:
+        """Whether the last ones may be wrong, though they were believed."""
+        return self._breaks.is_odd(now_ns)
+
     def doubt(self, from_ns: int) -> Doubt | None:
         """What of the samples since `from_ns` is doubted."""
         return self._breaks.doubt(from_ns)

@@ -276,7 +276,9 @@ class InertialTracker:
             return seen
         rows, good, HP, S = self._judged(s, rows, rows_now)
         gap = frame.stamp_ns - self._stamp_ns > _GAP_NS
-        if gap and good.mean() < _MINORITY and self._agreed(s, left):
+        if (
+            (gap and good.mean() < _MINORITY) or (self._samples.odd(s.stamp_ns) and good.mean() < _MAJORITY)
+        ) and self._agreed(s, left):
             ekf.doubt(s, *_DOUBT)
             rows, good, HP, S = self._judged(s, rows, rows_now)
         if good.all():
