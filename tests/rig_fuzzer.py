@@ -53,8 +53,8 @@ def walk(count: int) -> Walk:
 
 
 def _imu(after: float, until: float) -> ImuBatch:
-    """What a perfect IMU says in (after, until]."""
-    t = np.arange(round(after / STEP_S) + 1, round(until / STEP_S) + 2) * STEP_S
+    """What a perfect IMU says in (after, until], and the first sample beyond."""
+    t = np.arange(round(after / STEP_S) + 2, round(until / STEP_S) + 2) * STEP_S
     before, now, then = (
         plain_walk.poses("walker", t + d, SEED) @ se3.inverse(RIG.T_body_cam0) for d in (-_H, 0.0, _H)
     )

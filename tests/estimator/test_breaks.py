@@ -31,7 +31,9 @@ def doubted(values: np.ndarray, each: int = 10, step: int = STEP) -> list[int]:
     """Numbers of the samples that are left out, in frames of so many."""
     breaks, kept = Breaks(), []
     for k in range(0, len(values), each):
-        kept += (breaks.believed(batch(values[k : k + each], k, step)).stamps_ns // step).tolist()
+        part = values[k : k + each]
+        good = breaks.believed((k + np.arange(len(part))) * step, part)
+        kept += [k + n for n in range(len(part)) if good is None or good[n]]
     assert breaks.count == len(values) - len(kept)
     return sorted(set(range(len(values))) - set(kept))
 
@@ -84,9 +86,9 @@ def test_what_lasts_is_how_things_are() -> None:
 
 def test_after_a_gap_nothing_is_held_against_what_was_before() -> None:
     breaks, values = Breaks(), walking()
-    breaks.believed(batch(values[:200]))
     values[200:, 0] += 9.0
-    assert len(breaks.believed(batch(values[200:], 400))) == 200
+    assert breaks.believed(np.arange(200) * STEP, values[:200]) is None
+    assert breaks.believed(np.arange(400, 600) * STEP, values[200:]) is None
 
 
 def test_what_is_doubted_is_known_for_the_frame_that_it_is_in() -> None:
@@ -123,6 +125,5 @@ def test_of_what_was_recorded_nothing_is(path: Path) -> None:
     stamps, values = table[:, 0].astype(np.int64), table[:, 1:7]
     breaks = Breaks()
     for k in range(0, len(values), 10):
-        part = values[k : k + 10]
-        breaks.believed(ImuBatch(stamps[k : k + 10], part[:, :3], part[:, 3:]))
+        breaks.believed(stamps[k : k + 10], values[k : k + 10])
     assert breaks.count == 0

@@ -29,11 +29,14 @@ class Samples:
 
     def add(self, imu: ImuBatch) -> None:
         """Samples that are not later than what is there are left out."""
-        old = self.all
-        start = int(np.searchsorted(imu.stamps_ns, old.stamps_ns[-1], side="right")) if len(old) else 0
-        imu = self._breaks.believed(imu.take(slice(start, None)))
-        self._most = np.abs(np.hstack([imu.gyro, imu.accel])).max(axis=0, initial=0.0).clip(self._most)
-        self.all = old.take(slice(-_KEPT, None)).join(imu)
+        start = int(np.searchsorted(imu.stamps_ns, self._breaks.newest_ns, side="right"))
+        imu = imu.take(slice(start, None)) if start else imu
+        values = np.hstack([imu.gyro, imu.accel])
+        good = self._breaks.believed(imu.stamps_ns, values)
+        if good is not None:
+            imu, values = imu.take(good), values[good]
+        self._most = np.abs(values).max(axis=0, initial=0.0).clip(self._most)
+        self.all = self.all.take(slice(-_KEPT, None)).join(imu)
 
     def with_more(self, imu: ImuBatch) -> Samples:
         """These and later ones; this one stays as it is."""

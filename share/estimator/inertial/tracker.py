@@ -148,7 +148,8 @@ class InertialTracker:
 
     def _follow(self, frame: Frame, scene: Scene) -> TrackResult:
         before, imu = scene.state.T, self._heard(frame, scene.state)
-        doubted = self._samples.doubt(scene.state.stamp_ns) is not None
+        doubt = self._samples.doubt(scene.state.stamp_ns)
+        doubted = doubt is not None and bool(doubt.axes.any())
         since_s = (frame.stamp_ns - self._stamp_ns) * 1e-9
         measured = self._propagate(frame, scene.state, imu)
         scene.step(since_s, measured)
@@ -237,19 +238,18 @@ class InertialTracker:
             noise = without(self._noise, self._coasting, np.arange(6) >= 3)
             self._rate = ekf.propagate(s, without_force(s, imu, to_ns, gravity), to_ns, noise, gravity)
             return True
-        if (doubt := self._samples.doubt(s.stamp_ns)) is not None:
-            noise = without(self._noise, self._coasting, doubt.axes)
-            self._rate = ekf.propagate(s, imu, to_ns, noise, gravity)
-            ekf.doubt(s, doubt.turn, 0.0, doubt.speed)
-            return not doubt.axes[:3].any()
-        clipped = self._samples.clipped(imu)
-        noise = without(self._noise, self._coasting, clipped)
+        clipped, doubt = self._samples.clipped(imu), self._samples.doubt(s.stamp_ns)
+        silent = clipped if doubt is None else clipped | doubt.axes
+        noise = without(self._noise, self._coasting, silent)
         imu = unclipped(imu, clipped[:3], self._rate + s.bg)
         self._rate = ekf.propagate(s, imu, to_ns, noise, gravity)
+        if doubt is not None:
+            ekf.doubt(s, doubt.turn, 0.0, doubt.speed)
+            return not silent[:3].any()
         slow = np.linalg.norm(self._rate) < _REST_RATE and np.linalg.norm(s.v) < _SLOW_M_S
         if slow and self._samples.still(to_ns):
             ekf.rest(s, _REST_M_S, self._config.gate)
-        return not clipped[:3].any()
+        return not silent[:3].any()
 
     def _taken_ns(self, frame: Frame, s: State) -> int:
         """When the image was taken, IMU time."""
