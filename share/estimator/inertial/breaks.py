@@ -41,7 +41,7 @@ class Doubt:
 
 @dataclass(frozen=True, eq=False)
 class _Left:
-    """A sample that is doubted: on which axes (6,) it is left out, by how much it is off (6,), and how long."""
+    """A sample that is doubted: on which axes (6,) it is left out; by how much it is off (6,), how long."""
 
     stamp_ns: int
     axes: NDArray[np.bool_]
