@@ -39,7 +39,7 @@ from share.emulate.demo import FALLBACK, SCENE  # noqa: E402
 from share.emulate.recipe import Recipe  # noqa: E402
 from share.emulate.render.context import missing  # noqa: E402
 from share.emulate.session import cached_session, make_session  # noqa: E402
-from share.estimator.inertial import ekf, features, find, parsac, tracker  # noqa: E402
+from share.estimator.inertial import ekf, features, find, keyframes, parsac  # noqa: E402
 from share.estimator.inertial.scene import Scene  # noqa: E402
 from share.estimator.inertial.tracker import InertialTracker  # noqa: E402
 from share.estimator.visual import VisualTracker  # noqa: E402
@@ -66,9 +66,9 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (Scene, "seen", "slant and runaways"),
     (Scene, "_wake", "keyframe: wake"),
     (Scene, "_forget", "keyframe: forget"),
-    (Scene, "_inverse_depth", "keyframe: depth"),
+    (Scene, "_inverse_depths", "keyframe: depth"),
     (features, "looks", "keyframe: patches"),
-    (tracker, "make_view", "keyframe: view"),
+    (keyframes, "make_view", "keyframe: view"),
     (corners, "detect", "keyframe: corners"),
     (VisualTracker, "_find", "klt"),
     (VisualTracker, "_pose", "pose"),

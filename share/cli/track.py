@@ -102,11 +102,14 @@ def _tracked(opened: Source, settings: Config, line: LiveLine) -> TrackRun:
     from share.run.stop import on_stop
     from share.run.track import track
 
+    def say(text: str) -> None:
+        line.say(f"share: {opened.name}: {text}")
+
     if not isinstance(opened, LiveSource):
         with progress(opened.images_count, "tracking") as bar:
-            return track(opened, settings, lambda result: bar(1))
+            return track(opened, settings, lambda result: bar(1), say)
     with on_stop(opened.stop):
-        run = track(opened, settings, live.Shown(opened.feed, line))
+        run = track(opened, settings, live.Shown(opened.feed, line), say)
     line.end()
     return run
 

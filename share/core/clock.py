@@ -29,7 +29,7 @@ class ClockFilter:
     Measurement: RFC 5905, section 8. An exchange that took longer than the quickest recent one
     waited in a queue, and how that wait was shared out between the ways is unknown: its variance
     grows with the square of the excess. A constant asymmetry of the path cannot be seen by any
-    such filter and is not in `sigma_ns`; it is at most half of the least round trip.
+    such filter and is not in `sigma_ns`; `asymmetry_ns` bounds it.
     """
 
     def __init__(self, config: ClockConfig) -> None:
@@ -49,6 +49,7 @@ class ClockFilter:
         self._base_ns = 0  # the state is relative to this offset, so that it stays small
         self._at_ns = 0
         self._recent_ns: deque[int] = deque(maxlen=self._config.least_of)
+        self._unproven_ns: deque[int] = deque(maxlen=self._config.least_of)
         self._refused_in_a_row = 0
         self._agreeing = 0  # exchanges since the clock was last set
 
@@ -69,6 +70,7 @@ class ClockFilter:
         rtt_ns, offset_ns = exchange.delay_ns, exchange.offset_ns
         middle_ns = (sent_ns + back_ns) // 2
         self._recent_ns.append(rtt_ns)
+        self._unproven_ns.append(exchange.unproven_ns)
         self.rtt_ms = smoothed(self.rtt_ms, rtt_ns / 1e6)
         variance = self._variance(rtt_ns)
         if self._filter is None:
@@ -92,8 +94,9 @@ class ClockFilter:
 
     @property
     def asymmetry_ns(self) -> int | None:
-        """What `offset_ns` can be wrong by unseen: half of the least recent round trip."""
-        return -(-min(self._recent_ns) // 2) if self._recent_ns else None
+        """What `offset_ns` can be wrong by unseen: half of the least recent round trip by our own clock. That
+        the edge held the question for long is its word: it makes this no less, but more."""
+        return -(-min(self._unproven_ns) // 2) if self._unproven_ns else None
 
     @property
     def drift_ppm(self) -> float | None:

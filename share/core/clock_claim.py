@@ -17,8 +17,9 @@ from share.core.clock import ClockFilter
 @dataclass(frozen=True)
 class ClockClaim:
     """Of the edge's monotonic clock minus the agent's, ms. sigma_ms: standard deviation by the filter;
-    asymmetry_ms: half of the least recent round trip, which no filter sees; None before exchanges that agree.
-    offset_ms: None too where it is not claimed."""
+    asymmetry_ms: half of the least recent round trip by the agent's own clock, which no filter sees and no
+    word of the edge makes smaller; None before exchanges that agree. offset_ms: None too where it is not
+    claimed."""
 
     offset_ms: float | None
     sigma_ms: float | None

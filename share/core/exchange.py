@@ -27,6 +27,12 @@ class Exchange:
         return (self.back_ns - self.sent_ns) - (self.replied_ns - self.received_ns)
 
     @property
+    def unproven_ns(self) -> int:
+        """Twice what `offset_ns` can be wrong by if one of the two times of the other clock is made up: that
+        one was read within the exchange, which the own clock has timed, is all that it cannot feign."""
+        return (self.back_ns - self.sent_ns) + (self.replied_ns - self.received_ns)
+
+    @property
     def is_possible(self) -> bool:
         """Whether it can be of clocks that nobody set meanwhile."""
         return self.back_ns >= self.sent_ns and self.replied_ns >= self.received_ns and self.delay_ns >= 0

@@ -14,6 +14,7 @@ from share.core.edge import Edge
 from share.core.edge_events import Answered, Event, Lost, Ready, Received, ToTracker
 from share.core.peer import Peer
 from share.core.window import Window
+from share.geometry import trackable
 from share.geometry.camera import Rig
 from share.types import Frame
 from share.wire import messages as wire
@@ -98,8 +99,12 @@ class TrackingEdge(Edge):
 
     def _objection(self, event: Received, hello: wire.Hello, now_ns: int) -> str | None:
         known = self._runs.get(event.peer)
-        return super()._objection(event, hello, now_ns) or self._full(
-            None if known is None else known.key, hello.rig
+        if known is not None:
+            return super()._objection(event, hello, now_ns) or self._full(known.key, hello.rig)
+        return (
+            super()._objection(event, hello, now_ns)
+            or trackable.objection(hello.rig)
+            or self._full(None, hello.rig)
         )
 
     def _full(self, key: str | None, rig: Rig) -> str | None:

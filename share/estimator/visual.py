@@ -105,6 +105,17 @@ class VisualTracker:
             self._anchor(frame)
         self._map.set_view(view)
 
+    def give_up(self, frame: Frame) -> None:
+        """Something failed in or after `frame`, the last: where it is now is not known."""
+        self._lose(frame)
+        self._tracks, self._unsettled, self._to_anchor = _NO_TRACKS, None, False
+        self._image, self._stamp_ns = frame.image0, frame.stamp_ns
+
+    @property
+    def doubted(self) -> int:
+        """How many samples of an IMU were not believed: none is used."""
+        return 0
+
     def footing(self) -> Footing:
         """Of the frame just tracked, one with a pose."""
         assert self._T_odom_cam is not None
@@ -135,8 +146,7 @@ class VisualTracker:
         tracks = self._find(frame.image0, T_predicted)
         estimate, tracks = self._pose(tracks)
         if estimate is None or not self._plausible(T_last, estimate, dt):
-            self._lost_since_ns, self._velocity = frame.stamp_ns, np.zeros(6)
-            self._turns.begin()
+            self._lose(frame)
             return TrackResult(TrackState.LOST, None)
         T_odom_cam = se3.inverse(estimate.T)
         self._velocity = se3.log(se3.inverse(T_last) @ T_odom_cam) / dt
@@ -260,6 +270,10 @@ class VisualTracker:
             self._map = LocalMap(self._config.max_keyframes)
             return TrackResult(TrackState.INITIALISING, None, waits=Wait.VIEW)
         return TrackResult(TrackState.OK, self._T_odom_body(), True, len(self._tracks.ids), True)
+
+    def _lose(self, frame: Frame) -> None:
+        self._lost_since_ns, self._velocity = frame.stamp_ns, np.zeros(6)
+        self._turns.begin()
 
     def _recover(self, frame: Frame) -> TrackResult:
         """Find ourselves in the local map; after a while, begin a new stretch where we were lost."""

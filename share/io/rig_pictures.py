@@ -12,6 +12,7 @@ import numpy as np
 from share.calibration.bundle import View
 from share.core.measurement import CAM0, CAM1
 from share.errors import DataError, UsageError
+from share.geometry import trackable
 from share.geometry.camera import Camera, Rig
 from share.geometry.target import Target
 from share.io.board_views import Pictures, find_views, open_pictures
@@ -42,6 +43,9 @@ def open_rig_pictures(source: str, camera: str | None) -> RigPictures:
     first = open_pictures(source, (CAM0,), chain)
     if first.rig is None:
         raise UsageError(f"{source}: does not say what its cameras are like; give --camera FILE")
+    for name, eye in (("cam0", first.rig.cam0), ("cam1", first.rig.cam1)):
+        if eye is not None and (why := trackable.lens_objection(eye)) is not None:
+            raise UsageError(f"{source if chain is None else chain}: {name}: {why}")
     two = first.rig.cam1 is not None
     pictures = open_pictures(source, (CAM0, CAM1), chain, _ALONE) if two else first
     own = first.rig.T_body_cam0 if first.rig.imu is not None else None

@@ -50,6 +50,7 @@ class RunLog:
     contradicted: int = 0  # frames in which images and IMU told of different motions
     waited: Counter[Wait] = field(default_factory=Counter)  # frames, by what was still waited for
     stretches: int = 0  # of unbroken odometry; poses of different ones do not compare
+    imu_doubted: int = 0  # samples of the IMU that the tracker did not believe
     _frames: int = 0
     _begun: bool = False  # the first line, the columns' names, is written
 
@@ -106,6 +107,7 @@ class RunLog:
             "lost_s": rows.lost_s,
             "stretches": self.stretches,
             "contradicted": self.contradicted,
+            "imu_doubted": self.imu_doubted,
             "track_ms": parts.track_ms.report(),
             "corrected_ms": parts.corrected_ms.report(),
             "latency_ms": parts.latency_ms.report(),

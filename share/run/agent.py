@@ -29,8 +29,7 @@ from share.core import events as ev
 from share.core.agent import Agent
 from share.core.lines import Lasting
 from share.core.sequencer import SequencerCounters
-from share.errors import DataError, ShareError
-from share.estimator.result import TrackResult
+from share.errors import DataError
 from share.io.live import LiveSource
 from share.io.pose_feed import PoseFeed
 from share.io.source import Source
@@ -41,12 +40,13 @@ from share.run.agent_files import AgentFiles
 from share.run.arrivals import Arrivals, Played, Seen
 from share.run.errors import Errors, Unknown
 from share.run.guard import Guard
+from share.run.guarded_tracker import GuardedTracker
 from share.run.late import Late
 from share.run.lateness import Lateness
-from share.run.pipeline import frames_of, tracker_for
+from share.run.pipeline import check_trackable, frames_of
 from share.run.scribe import Scribe, Written
 from share.strict import to_mapping
-from share.types import Frame, TrackState
+from share.types import Frame
 from share.wire import messages as m
 
 TICK_MS = 50
@@ -121,7 +121,8 @@ class AgentRun:
 
     def _prepare(self) -> None:
         """Raises what is wrong with the source before there is a link."""
-        self._tracker = tracker_for(self._source, self._settings)
+        check_trackable(self._source.name, self._source.rig)
+        self._tracker = GuardedTracker(self._source.rig, self._settings, self._guard)
 
     def stop(self) -> None:
         """End early, in good order: no more frames, but what was sent is still waited for."""
@@ -179,7 +180,7 @@ class AgentRun:
 
     def _track_one(self, frame: Frame, arrived_ns: int) -> None:
         cpu = time.thread_time()
-        result = self._result(frame)
+        result = self._tracker.track(frame)
         tracked = ev.FrameTracked(
             index=frame.index,
             stamp_ns=frame.stamp_ns,
@@ -195,20 +196,13 @@ class AgentRun:
         self._post(tracked)  # the pose goes out before others are served
         self._log.add_result(result.new_stretch, result.sound, result.waits)
         if result.keyframe:
-            self._post(ev.KeyframeMade(tracked, self._errors.keyframe(frame, self._tracker)))
-            self._tracker.settle()
+            self._tracker.attempt("making a keyframe", frame, partial(self._keyframe, frame, tracked))
+        self._log.imu_doubted = self._tracker.doubted
         self._log.cpu_s += time.thread_time() - cpu
 
-    def _result(self, frame: Frame) -> TrackResult:
-        """Of a tracker that fails, LOST; the next frame begins a new one, since nothing is known of this."""
-        try:
-            return self._tracker.track(frame)
-        except ShareError:
-            raise
-        except Exception as error:
-            self._guard.note("tracking a frame", error)
-            self._tracker = tracker_for(self._source, self._settings)
-            return TrackResult(TrackState.LOST, None)
+    def _keyframe(self, frame: Frame, tracked: ev.FrameTracked) -> None:
+        self._post(ev.KeyframeMade(tracked, self._errors.keyframe(frame, self._tracker)))
+        self._tracker.settle()
 
     def _post(self, event: ev.AgentEvent) -> None:
         """Waits for room, as long as anybody takes what is posted."""

@@ -13,6 +13,7 @@ from share.core.sequencer import Bundle, SequencerCounters, sequence, streams_of
 from share.errors import DataError, MisfitError, UsageError
 from share.estimator.inertial.tracker import InertialTracker
 from share.estimator.visual import VisualTracker
+from share.geometry import trackable
 from share.geometry.camera import Rig
 from share.io.images import load
 from share.io.source import Source
@@ -127,8 +128,8 @@ def tracker_for(source: Source, config: Config) -> VisualTracker | InertialTrack
 
 def check_trackable(name: str, rig: Rig) -> None:
     """Raises UsageError unless some estimator fits the rig of the source `name`."""
-    if rig.imu is None and rig.cam1 is None and rig.depth is None:
-        raise UsageError(f"{name}: one camera alone gives no scale; stereo, depth or an IMU is needed")
+    if (why := trackable.objection(rig)) is not None:
+        raise UsageError(f"{name}: {why}")
 
 
 def tracker_of(rig: Rig, config: Config) -> VisualTracker | InertialTracker:

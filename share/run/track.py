@@ -18,8 +18,11 @@ from share.io.source import Source
 from share.io.trajectory import Trajectory
 from share.metrics.ate import Ate, ate
 from share.metrics.runlog import RunLog
-from share.run.pipeline import frames_of, tracker_for
+from share.run.guard import Guard
+from share.run.guarded_tracker import GuardedTracker
+from share.run.pipeline import check_trackable, frames_of
 from share.strict import to_mapping
+from share.types import Frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +33,17 @@ class TrackRun:
     report: dict[str, Any]
 
 
-def track(source: Source, settings: config.Config, told: Callable[[TrackResult], None]) -> TrackRun:
-    """Track every frame in turn, of a live camera the newest. `told` is what came of each."""
-    tracker, log, counters = tracker_for(source, settings), RunLog(), SequencerCounters()
+def track(
+    source: Source,
+    settings: config.Config,
+    told: Callable[[TrackResult], None],
+    say: Callable[[str], None] = lambda text: None,
+) -> TrackRun:
+    """Track every frame in turn, of a live camera the newest. `told` is what came of each; `say` is for a
+    person. Raises UsageError where no tracker can use the rig."""
+    check_trackable(source.name, source.rig)
+    guard = Guard(say)
+    tracker, log, counters = GuardedTracker(source.rig, settings, guard), RunLog(), SequencerCounters()
     stamps, poses = [], []
     for frame in frames_of(source, settings, counters, spent=log.add_decode):
         began, cpu = time.perf_counter(), time.process_time()
@@ -40,16 +51,17 @@ def track(source: Source, settings: config.Config, told: Callable[[TrackResult],
         track_ms = 1e3 * (time.perf_counter() - began)
         log.add_result(result.new_stretch, result.sound, result.waits)
         if result.keyframe:
-            tracker.keyframe(frame)
-            tracker.settle()
+            tracker.keep(frame)
         log.cpu_s += time.process_time() - cpu
         log.add(frame.stamp_ns, track_ms, result.state, result.keyframe)
         if result.T_odom_body is not None:
             stamps.append(frame.stamp_ns)
             poses.append(result.T_odom_body)
         told(result)
+    log.imu_doubted = tracker.doubted
     trajectory = Trajectory(np.array(stamps, np.int64), np.array(poses).reshape(-1, 4, 4))
     report = report_of(log, counters, settings) | {"left_out": source.losses.counts}
+    report["failed_steps"] = guard.failed
     return TrackRun(trajectory, report | source.report())
 
 

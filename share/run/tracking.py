@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -16,7 +17,8 @@ from share.geometry.camera import Rig
 from share.io.machine import cores, free_bytes
 from share.process import Heap
 from share.run.companion import END, Companion, Inbox
-from share.run.pipeline import tracker_of
+from share.run.guard import Guard
+from share.run.guarded_tracker import GuardedTracker
 from share.types import Frame
 from share.wire.messages import Tracked
 
@@ -87,7 +89,8 @@ def track_all(
     inbox: Inbox, answer: Callable[[FromTracker], None], settings: Config, rig: Rig, key: str, life: int
 ) -> None:
     """For a `Companion`: takes frames, answers Ready and then each with Answered, until END."""
-    tracker, heap = tracker_of(rig, settings), Heap()
+    guard = Guard(lambda text: print(f"share: tracking {key}: {text}", file=sys.stderr, flush=True))
+    tracker, heap = GuardedTracker(rig, settings, guard), Heap()
     broken = life > 0  # there was another before, in another odom
     answer(Ready(key, life))
     while (frame := inbox.get()) is not END:
@@ -96,8 +99,7 @@ def track_all(
         broken = broken and not new_stretch
         answer(Answered(key, life, _told(frame, result, new_stretch)))
         if result.keyframe:  # after its pose is out; what it shows to others is for nobody
-            tracker.keyframe(frame)
-            tracker.settle()
+            tracker.keep(frame)
         heap.tidy(time.monotonic())
 
 

@@ -263,6 +263,15 @@ CALIBRATIONS = {
     "not rigid": (CAMCHAIN.replace("[0, 0, 1, 0]", "[0, 0, 2, 0]"), "T_cn_cnm1: is not a rigid transform"),
     "NaN": (CAMCHAIN.replace("320.4", ".nan"), "intrinsics: has values that are not finite"),
     "negative focal length": (CAMCHAIN.replace("[385", "[-385"), "cam0"),
+    "a lens that folds": (
+        CAMCHAIN.replace("480]}", "480], distortion_model: radtan, distortion_coeffs: [-30, 0, 0, 0]}"),
+        "cam0: its distortion folds",
+    ),
+    "no view in common": (
+        CAMCHAIN.replace("[[1, 0, 0", "[[-1, 0, 0").replace("[0, 0, 1, 0]", "[0, 0, -1, 0]"),
+        "cam1 sees 0 % of what cam0 sees",
+    ),
+    "another resolution's": (CAMCHAIN.replace("320.4", "1320.4"), "lies outside an image of 640x480"),
     "three intrinsics": (CAMCHAIN.replace(", 239.6", ""), "intrinsics: expected 4 numbers, found 3"),
     "one camera": (CAMCHAIN[: CAMCHAIN.index("cam1")], "stereo, depth or an IMU is needed"),
     "another sensor": (CAMCHAIN.replace("cam1", "depth").replace("T_cn_cnm1", "T_depth_cam0"), "has depth"),

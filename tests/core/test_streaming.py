@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
-from hellos import hello_of
+from hellos import NOISE, hello_of, rig_of
 
 from share.config import Config, EdgeConfig, StreamConfig
 from share.core import edge_events as ed
@@ -324,10 +324,26 @@ def test_no_more_are_tracked_than_there_is_room_for():
     assert not [e for e in effects if isinstance(e, ed.BeginTracking)]
 
 
+def test_a_rig_that_no_tracker_can_use_is_refused_at_hello():
+    edge, rig = TrackingEdge(CONFIG, 1), rig_of()
+    folding = replace(rig.cam0, distortion=(-30.0, 0.0, 0.0, 0.0))
+    refused = [
+        (replace(rig, cam0=folding), "cam0: its distortion folds"),
+        (replace(rig, imu=None), "one camera alone gives no scale"),
+        (replace(rig, T_body_cam0=se3.compose(np.eye(3), np.array([0, 0, 400.0]))), "400 m from the IMU"),
+    ]
+    for k, (rig, says) in enumerate(refused):
+        hello = replace(hello_of(f"agent{k}", 100 + k), streams=True, rig=rig)
+        effects = edge.handle(ed.Received(m.peer_id(100 + k), encode(hello)), 0)
+        assert not [e for e in effects if isinstance(e, ed.BeginTracking)]
+        [told] = [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, ed.Send)]
+        assert isinstance(told, m.Refused) and says in told.reason
+
+
 def test_large_images_need_more_room():
     """Each tracker of 3800x2400 takes 392 MB of it, of 640x480 110."""
     edge = TrackingEdge(CONFIG, 1, room=Room(8, "4 cores, 1.0 GB free", 1_000_000_000))
-    large = Rig(Camera(3800, 2400, 3000.0, 3000.0, 1900.0, 1200.0), np.eye(4))
+    large = Rig(Camera(3800, 2400, 3000.0, 3000.0, 1900.0, 1200.0), np.eye(4), imu=NOISE)
     begun, refused = 0, []
     for k in range(12):
         hello = replace(hello_of(f"agent{k}", 100 + k), streams=True, rig=large)

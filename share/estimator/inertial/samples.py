@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from share.estimator.inertial.breaks import Breaks, Doubt
 from share.estimator.inertial.state import State
 from share.geometry import se3
 from share.types import F64, ImuBatch
@@ -19,25 +20,43 @@ _MUCH = np.repeat([0.5, 11.0], 3)  # rad/s and m/s^2, which no scale ends below
 
 
 class Samples:
-    """In order of time, the last few seconds."""
+    """In order of time, the last few seconds; without those that are doubted (`breaks`)."""
 
     def __init__(self) -> None:
         self.all = ImuBatch.empty()
         self._most = np.zeros(6)  # of each axis, ever
+        self._breaks = Breaks()
 
     def add(self, imu: ImuBatch) -> None:
         """Samples that are not later than what is there are left out."""
-        old = self.all
-        self._most = np.abs(np.hstack([imu.gyro, imu.accel])).max(axis=0, initial=0.0).clip(self._most)
-        start = int(np.searchsorted(imu.stamps_ns, old.stamps_ns[-1], side="right")) if len(old) else 0
-        self.all = old.take(slice(-_KEPT, None)).join(imu.take(slice(start, None)))
+        start = int(np.searchsorted(imu.stamps_ns, self._breaks.newest_ns, side="right"))
+        imu = imu.take(slice(start, None)) if start else imu
+        values = np.hstack([imu.gyro, imu.accel])
+        good = self._breaks.believed(imu.stamps_ns, values)
+        if good is not None:
+            imu, values = imu.take(good), values[good]
+        self._most = np.abs(values).max(axis=0, initial=0.0).clip(self._most)
+        self.all = self.all.take(slice(-_KEPT, None)).join(imu)
 
     def with_more(self, imu: ImuBatch) -> Samples:
         """These and later ones; this one stays as it is."""
         out = Samples()
-        out.all, out._most = self.all, self._most
+        out.all, out._most, out._breaks = self.all, self._most, self._breaks.copy()
         out.add(imu)
         return out
+
+    @property
+    def doubted(self) -> int:
+        """How many samples were left out."""
+        return self._breaks.count
+
+    def odd(self, now_ns: int) -> bool:
+        """Whether the last ones may be wrong, though they were believed."""
+        return self._breaks.is_odd(now_ns)
+
+    def doubt(self, from_ns: int) -> Doubt | None:
+        """What of the samples since `from_ns` is doubted."""
+        return self._breaks.doubt(from_ns)
 
     @property
     def last_ns(self) -> int:

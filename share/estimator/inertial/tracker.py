@@ -118,6 +118,17 @@ class InertialTracker:
         assert self._scene is not None
         return self._scene.footing()
 
+    def give_up(self, frame: Frame) -> None:
+        """Something failed in or after `frame`, the last: the filter may be in any state."""
+        self._window = None
+        self._lose(frame)
+        self._image, self._stamp_ns = frame.image0, frame.stamp_ns
+
+    @property
+    def doubted(self) -> int:
+        """How many samples of the IMU were not believed."""
+        return self._samples.doubted
+
     def predict(self, t_ns: int, imu: ImuBatch | None = None) -> F64 | None:
         """T_odom_body (4, 4) at a time after the last frame's, IMU time: for renderers, between frames.
 
@@ -137,11 +148,13 @@ class InertialTracker:
 
     def _follow(self, frame: Frame, scene: Scene) -> TrackResult:
         before, imu = scene.state.T, self._heard(frame, scene.state)
+        doubt = self._samples.doubt(scene.state.stamp_ns)
+        doubted = doubt is not None and bool(doubt.axes.any())
         since_s = (frame.stamp_ns - self._stamp_ns) * 1e-9
         measured = self._propagate(frame, scene.state, imu)
         scene.step(since_s, measured)
         left, seen = self._look(frame, scene)
-        heard = imu is not None
+        heard = imu is not None and not (doubted and self._ready)
         if measured and self._window is None:
             self._agreement.add(self._surprise, since_s)
         scene.seen(left, seen)
@@ -225,14 +238,18 @@ class InertialTracker:
             noise = without(self._noise, self._coasting, np.arange(6) >= 3)
             self._rate = ekf.propagate(s, without_force(s, imu, to_ns, gravity), to_ns, noise, gravity)
             return True
-        clipped = self._samples.clipped(imu)
-        noise = without(self._noise, self._coasting, clipped)
+        clipped, doubt = self._samples.clipped(imu), self._samples.doubt(s.stamp_ns)
+        silent = clipped if doubt is None else clipped | doubt.axes
+        noise = without(self._noise, self._coasting, silent)
         imu = unclipped(imu, clipped[:3], self._rate + s.bg)
         self._rate = ekf.propagate(s, imu, to_ns, noise, gravity)
+        if doubt is not None:
+            ekf.doubt(s, doubt.turn, 0.0, doubt.speed)
+            return not silent[:3].any()
         slow = np.linalg.norm(self._rate) < _REST_RATE and np.linalg.norm(s.v) < _SLOW_M_S
         if slow and self._samples.still(to_ns):
             ekf.rest(s, _REST_M_S, self._config.gate)
-        return not clipped[:3].any()
+        return not silent[:3].any()
 
     def _taken_ns(self, frame: Frame, s: State) -> int:
         """When the image was taken, IMU time."""
@@ -259,7 +276,9 @@ class InertialTracker:
             return seen
         rows, good, HP, S = self._judged(s, rows, rows_now)
         gap = frame.stamp_ns - self._stamp_ns > _GAP_NS
-        if gap and good.mean() < _MINORITY and self._agreed(s, left):
+        if (
+            (gap and good.mean() < _MINORITY) or (self._samples.odd(s.stamp_ns) and good.mean() < _MAJORITY)
+        ) and self._agreed(s, left):
             ekf.doubt(s, *_DOUBT)
             rows, good, HP, S = self._judged(s, rows, rows_now)
         if good.all():

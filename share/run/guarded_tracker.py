@@ -1,0 +1,79 @@
+"""A tracker whose failures cost the frame that they come in, and not the process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import TypeVar
+
+from share.config import Config
+from share.errors import ShareError
+from share.estimator.result import TrackResult
+from share.geometry.camera import Rig
+from share.run.guard import Guard
+from share.run.pipeline import tracker_of
+from share.types import Candidate, Footing, Frame, TrackState
+
+T = TypeVar("T")
+
+
+class GuardedTracker:
+    """The estimator that fits a rig, see `InertialTracker`. What fails in it, a matrix that has no inverse or
+    a library that refuses its numbers, is counted and said by `guard`. The frame is LOST, and the next one
+    looks for itself among the places that the tracker knows; if that fails too, a new one begins."""
+
+    def __init__(self, rig: Rig, config: Config, guard: Guard) -> None:
+        self._make = partial(tracker_of, rig, config)
+        self._tracker, self._guard = self._make(), guard
+        self._has_posed = False  # since it failed last
+
+    def track(self, frame: Frame) -> TrackResult:
+        result = self.attempt("tracking a frame", frame, lambda: self._tracker.track(frame))
+        if result is None:
+            return TrackResult(TrackState.LOST, None)
+        self._has_posed = self._has_posed or result.T_odom_body is not None
+        return result
+
+    def attempt(self, what: str, frame: Frame, step: Callable[[], T]) -> T | None:
+        """Of `frame`, the last; None where it fails. An error that is for a person goes on."""
+        try:
+            return step()
+        except ShareError:
+            raise
+        except Exception as error:
+            self._guard.note(what, error)
+            self._give_up(frame)
+            return None
+
+    def keep(self, frame: Frame) -> None:
+        """Makes `frame` a keyframe, where nobody else is to have it."""
+        self.attempt("making a keyframe", frame, partial(self._keep, frame))
+
+    def _keep(self, frame: Frame) -> None:
+        self._tracker.keyframe(frame)
+        self._tracker.settle()
+
+    def keyframe(self, frame: Frame) -> Candidate:
+        """Within `attempt`; so `settle` and `footing`."""
+        return self._tracker.keyframe(frame)
+
+    def settle(self) -> None:
+        self._tracker.settle()
+
+    def footing(self) -> Footing:
+        return self._tracker.footing()
+
+    @property
+    def doubted(self) -> int:
+        """How many IMU samples this tracker did not believe."""
+        return self._tracker.doubted
+
+    def _give_up(self, frame: Frame) -> None:
+        had_posed, self._has_posed = self._has_posed, False
+        try:
+            if had_posed:
+                self._tracker.give_up(frame)
+                return
+        except Exception as error:
+            self._guard.note("looking for itself again", error)
+        self._tracker = self._make()

@@ -1,0 +1,105 @@
+"""Runs of wrong IMU samples, of all lengths and sizes: poses stay, and their state and covariance say it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rig_fuzzer
+from plain_walk import RIG
+
+from share.config import Config
+from share.estimator.inertial.tracker import InertialTracker
+from share.estimator.result import TrackResult
+from share.types import Frame, ImuBatch, TrackState
+
+AT = 5  # the frame that they come in
+
+
+@pytest.fixture(scope="module")
+def walk() -> tuple[Frame, ...]:
+    return rig_fuzzer.walk(12).frames
+
+
+@pytest.fixture(scope="module")
+def clean(walk: tuple[Frame, ...]) -> list[TrackResult]:
+    return tracked(walk)[0]
+
+
+def tracked(frames: tuple[Frame, ...]) -> tuple[list[TrackResult], InertialTracker]:
+    tracker, results = InertialTracker(RIG, Config().inertial, Config().tracker), []
+    for frame in frames:
+        results.append(tracker.track(frame))
+        if results[-1].keyframe:
+            tracker.keyframe(frame)
+            tracker.settle()
+    return results, tracker
+
+
+def spoiled(walk: tuple[Frame, ...], first: int, count: int, axis: int, by: float) -> tuple[Frame, ...]:
+    """`count` samples from number `first` of frame AT on have `by` added."""
+    out, left = list(walk), count
+    for k in range(AT, len(walk)):
+        imu, here = walk[k].imu, first if k == AT else 0
+        values = np.hstack([imu.gyro, imu.accel])
+        part = values[here : here + left]
+        part[:, axis] += by
+        left -= len(part)
+        out[k] = replace(walk[k], imu=ImuBatch(imu.stamps_ns, values[:, :3], values[:, 3:]))
+    assert left == 0
+    return tuple(out)
+
+
+def apart_m(a: list[TrackResult], b: list[TrackResult]) -> list[float]:
+    return [
+        float(np.linalg.norm(x.T_odom_body[:3, 3] - y.T_odom_body[:3, 3])) for x, y in zip(a, b, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("first", "count", "axis", "by"),
+    [
+        (3, 4, 1, 10.0),
+        (3, 6, 0, -34.0),
+        (10, 10, 2, 34.0),
+        (3, 4, 3, 150.0),
+        (5, 10, 5, -60.0),
+        (12, 2, 1, 2.5),
+    ],
+)
+def test_a_run_of_wrong_samples_moves_no_pose_and_is_said(
+    walk: tuple[Frame, ...], clean: list[TrackResult], first: int, count: int, axis: int, by: float
+) -> None:
+    results, tracker = tracked(spoiled(walk, first, count, axis, by))
+    assert tracker.doubted == count
+    assert max(apart_m(results, clean)) < 0.02
+    assert results[AT].state is TrackState.VISION_ONLY
+    assert results[-1].state is TrackState.OK
+    assert np.trace(results[AT].cov) > np.trace(clean[AT].cov)
+
+
+@pytest.mark.parametrize(("axis", "by"), [(1, 0.5), (4, 8.0)])
+def test_what_is_too_small_for_that_is_outvoted_by_the_images(
+    walk: tuple[Frame, ...], clean: list[TrackResult], axis: int, by: float
+) -> None:
+    results, tracker = tracked(spoiled(walk, 3, 10, axis, by))
+    assert tracker.doubted == 0
+    assert max(apart_m(results, clean)) < 0.02
+
+
+def test_in_the_dark_nobody_is_told_a_pose_that_rests_on_them(walk: tuple[Frame, ...]) -> None:
+    dark = tuple(
+        replace(frame, image0=np.zeros_like(frame.image0), image1=np.zeros_like(frame.image1))
+        if frame.index >= AT
+        else frame
+        for frame in walk
+    )
+    results, _ = tracked(spoiled(dark, 3, 10, 0, 30.0))
+    assert results[AT].state is TrackState.LOST
+    assert results[AT].T_odom_body is None
+
+
+def test_of_the_walk_itself_nothing_is_doubted(walk: tuple[Frame, ...], clean: list[TrackResult]) -> None:
+    assert {result.state for result in clean} == {TrackState.OK}
+    assert tracked(walk)[1].doubted == 0

@@ -1,0 +1,84 @@
+"""What no tracker can use is said in one line, and what people have is let through."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from share.geometry import se3
+from share.geometry.camera import Camera, ImuNoise, Rig
+from share.geometry.trackable import lens_objection, objection
+
+LENS = (-0.28340811, 0.07395907, 0.00019359, 1.76e-05)
+EUROC = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, LENS)
+NOISE = ImuNoise(1.7e-4, 2.0e-3, 1.9e-5, 3.0e-3, 200.0)
+RIG = Rig(EUROC, np.eye(4), EUROC, se3.compose(np.eye(3), np.array([-0.11, 0, 0])), imu=NOISE)
+DEPTH = replace(RIG, cam1=None, T_cam1_cam0=None, depth=EUROC, T_depth_cam0=np.eye(4))
+
+
+def turned(degrees: float, axis: int) -> np.ndarray:
+    T = se3.compose(se3.so3_exp(np.radians(degrees) * np.eye(3)[axis]), np.array([-0.11, 0, 0]))
+    return np.asarray(T)
+
+
+def both(**values: object) -> Rig:
+    camera = replace(EUROC, **values)
+    return replace(RIG, cam0=camera, cam1=camera)
+
+
+@pytest.mark.parametrize(
+    "rig",
+    [
+        RIG,
+        DEPTH,
+        RIG.without_imu(),
+        replace(RIG, cam1=None, T_cam1_cam0=None),
+        both(distortion=()),
+        both(width=64, height=48, fx=40.0, fy=40.0, cx=31.5, cy=23.5),
+        both(fx=150.0, fy=150.0, distortion=()),  # 136 degrees
+        both(distortion=(-0.4, 0.2, 0.0, 0.0, -0.05)),
+        replace(RIG, T_cam1_cam0=turned(10.0, 2)),
+        replace(RIG, T_cam1_cam0=turned(15.0, 1)),
+    ],
+    ids=lambda rig: rig.kind,
+)
+def test_what_people_have_is_let_through(rig: Rig) -> None:
+    assert objection(rig) is None
+
+
+@pytest.mark.parametrize(
+    ("rig", "says"),
+    [
+        (replace(RIG.without_imu(), cam1=None, T_cam1_cam0=None), "one camera alone gives no scale"),
+        (both(width=16, height=16, cx=8.0, cy=8.0), "16x16 px hold no features"),
+        (both(fx=1.0, fy=1.0, distortion=()), "degrees"),
+        (both(fx=1e5, fy=1e5), "degrees"),
+        (both(fx=4.0), "pixels are nearly square"),
+        (both(cx=-900.0), "lies outside an image of 752x480"),
+        (both(distortion=(-30.0, 0.0, 0.0, 0.0)), "distortion folds"),
+        (both(distortion=(1e4, -1e4, 1e4, 0.0, 1e4)), "distortion folds|degrees"),
+        (both(distortion=(0.0, 0.0, 30.0, 0.0)), "distortion folds"),
+        (replace(RIG, cam1=replace(EUROC, fx=150.0, fy=150.0, distortion=())), "must look alike"),
+        (replace(RIG, T_cam1_cam0=turned(90.0, 2)), "turned by 90 degrees"),
+        (replace(RIG, T_cam1_cam0=turned(90.0, 1)), "% of what cam0 sees"),
+        (replace(RIG, T_cam1_cam0=turned(180.0, 0)), "sees 0 % of what cam0 sees"),
+        (replace(DEPTH, T_depth_cam0=turned(90.0, 0)), "sees 0 % of what cam0 sees"),
+        (replace(DEPTH, T_depth_cam0=se3.compose(np.eye(3), np.array([25.0, 0, 0]))), "25 m from cam0"),
+        (replace(RIG, T_body_cam0=se3.compose(np.eye(3), np.array([0, 500.0, 0]))), "500 m from the IMU"),
+        (replace(RIG, imu=replace(NOISE, gyro_density=0.0)), "gyroscope_noise_density"),
+        (replace(RIG, imu=replace(NOISE, accel_density=900.0)), "accelerometer_noise_density"),
+        (replace(RIG, imu=replace(NOISE, accel_walk=900.0)), "random walk"),
+    ],
+)
+def test_what_no_tracker_can_use_is_refused_in_a_line_that_says_why(rig: Rig, says: str) -> None:
+    told = objection(rig)
+    assert told is not None
+    assert any(part in told for part in says.split("|")), told
+    assert "\n" not in told and len(told) < 250
+
+
+def test_a_lens_alone() -> None:
+    assert lens_objection(EUROC) is None
+    assert "folds" in str(lens_objection(replace(EUROC, distortion=(-30.0, 0.0, 0.0, 0.0))))

@@ -1,0 +1,122 @@
+"""No rig and no failure within a tracker ends the process that tracks."""
+
+from __future__ import annotations
+
+import resource
+import time
+
+import numpy as np
+import pytest
+import rig_fuzzer
+from plain_walk import RIG
+
+from share.config import Config
+from share.estimator.inertial import ekf
+from share.estimator.result import TrackResult
+from share.geometry import trackable
+from share.run.guard import Guard
+from share.run.guarded_tracker import GuardedTracker
+from share.types import TrackState
+from share.vision import corners
+
+
+@pytest.fixture(scope="module")
+def walk() -> rig_fuzzer.Walk:
+    return rig_fuzzer.walk(8)
+
+
+def played(walk: rig_fuzzer.Walk, tracker: GuardedTracker, fails: dict[int, pytest.MonkeyPatch]) -> list:
+    results = []
+    for frame in walk.frames:
+        if (broken := fails.get(frame.index)) is not None:
+            with broken.context() as patch:
+                patch.setattr(ekf, "_gain", _no_gain)
+                patch.setattr(corners, "count", _no_gain)
+                results.append(tracker.track(frame))
+            continue
+        results.append(tracker.track(frame))
+        if results[-1].keyframe:
+            tracker.attempt("a keyframe", frame, lambda frame=frame: rig_fuzzer._keep(tracker, frame))
+    return results
+
+
+def _no_gain(*anything: object) -> None:
+    raise np.linalg.LinAlgError("innovation covariance is not positive definite")
+
+
+def test_an_update_that_fails_costs_its_frame_and_odometry_finds_itself_again(
+    walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    guard = Guard(said.append)
+    results = played(walk, GuardedTracker(RIG, Config(), guard), {4: monkeypatch})
+    assert [result.state for result in results[:4]] == [TrackState.OK] * 4
+    assert (results[4].state, results[4].T_odom_body) == (TrackState.LOST, None)
+    assert results[-1].state is TrackState.OK
+    assert not any(result.new_stretch for result in results[1:])  # its places were kept: the same odom
+    far = np.linalg.norm(results[-1].T_odom_body[:3, 3] - results[3].T_odom_body[:3, 3])
+    assert far < 0.2
+    assert guard.failed == 1
+    assert len(said) == 1 and "LinAlgError" in said[0]
+
+
+def test_one_that_fails_twice_begins_anew(walk: rig_fuzzer.Walk) -> None:
+    guard = Guard(lambda text: None)
+    tracker = GuardedTracker(RIG, Config(), guard)
+
+    class Broken:
+        doubted = 0
+
+        def track(self, frame: object) -> TrackResult:
+            raise FloatingPointError
+
+        def give_up(self, frame: object) -> None:
+            raise ValueError
+
+    tracker._tracker = Broken()  # type: ignore[assignment]
+    tracker._has_posed = True
+    results = [tracker.track(frame) for frame in walk.frames[:4]]
+    assert [result.state for result in results[:1]] == [TrackState.LOST]
+    assert results[-1].state is TrackState.OK and guard.failed == 2
+
+
+def test_a_keyframe_that_fails_is_none(walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch) -> None:
+    guard = Guard(lambda text: None)
+    tracker = GuardedTracker(RIG, Config(), guard)
+    assert tracker.track(walk.frames[0]).keyframe
+    monkeypatch.setattr("share.estimator.inertial.keyframes.make_view", _no_gain)
+    kept = tracker.attempt("a keyframe", walk.frames[0], lambda: tracker.keyframe(walk.frames[0]))
+    assert kept is None and guard.failed == 1
+    assert tracker.track(walk.frames[1]).state is TrackState.LOST
+
+
+# ---------------------------------------------------------------- rigs that nobody has
+
+
+def test_no_rig_ends_a_tracker(walk: rig_fuzzer.Walk) -> None:
+    for what, rig in rig_fuzzer.rigs(25, seed=35):
+        states = rig_fuzzer.play(rig, walk)
+        assert states["refused"] or sum(n for k, n in states.items() if k.isupper()) == len(walk.frames), what
+
+
+def test_the_rig_of_the_walk_is_tracked_without_a_failure(walk: rig_fuzzer.Walk) -> None:
+    assert rig_fuzzer.play(RIG, walk) == {"OK": len(walk.frames)}
+
+
+def test_the_fuzzer_makes_rigs_that_are_refused_for_many_reasons_and_such_that_are_not() -> None:
+    told = [trackable.objection(rig) for _, rig in rig_fuzzer.rigs(200, seed=1)]
+    count = sum(why is not None for why in told)
+    assert 60 < count < 190
+    assert len({str(why)[:25] for why in told}) > 10
+
+
+@pytest.mark.slow
+def test_many_rigs_over_two_seconds() -> None:
+    walk = rig_fuzzer.walk(30)
+    for n, (what, rig) in enumerate(rig_fuzzer.rigs(400, seed=3535)):
+        began = time.process_time()
+        rig_fuzzer.play(rig, walk)
+        assert time.process_time() - began < 60, what
+        if n == 50:
+            held = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - held < 200_000  # kB
