@@ -22,7 +22,6 @@ from share.run.guard import Guard
 from share.run.guarded_tracker import GuardedTracker
 from share.run.pipeline import check_trackable, frames_of
 from share.strict import to_mapping
-from share.types import Frame
 
 
 @dataclass(frozen=True, eq=False)
