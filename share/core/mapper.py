@@ -85,7 +85,7 @@ class Mapper:
         """A run of an agent, before its first keyframe."""
         self._hellos[agent] = hello
         self._accounts[agent] = _Account()
-        self._atlas.present(agent, True)
+        self._atlas.enter(agent, hello.name)
 
     def present(self, agent: str, here: bool) -> None:
         """Nobody waits for a run that is not heard."""

@@ -138,6 +138,11 @@ class Atlas:
 
     # ------------------------------------------------------------ what arrives
 
+    def enter(self, agent: str, name: str) -> None:
+        """A run of the agent of this name comes."""
+        self._parting.enter(agent, name)
+        self.present(agent, True)
+
     def present(self, agent: str, here: bool) -> None:
         """Who is not heard need not be told where he is, and nobody waits for him. Once he is heard again, a
         map that he does not know of is due."""
@@ -161,7 +166,7 @@ class Atlas:
         """
         cov, plumb = self._believed(keyframe.T_ref_body, keyframe.cov), self._plumb(keyframe)
         number = self._chart.add(agent, keyframe, cov, plumb, rank)
-        self._parting.agreement.walk(number, self._chart.trails.before(number), keyframe.T_ref_body, cov)
+        self._parting.walked(number, keyframe.T_ref_body, cov)
         return number
 
     def restore(
@@ -186,7 +191,7 @@ class Atlas:
             T_odom_body = found.keyframe.T_odom_body
             numbers.append(chart.trails.put(found.key, at[found.stretch], T_odom_body, found.ordinal))
             chart.place(numbers[-1], found.T_ref_body, cov, self._plumb(found.keyframe))
-            self._parting.agreement.walk(numbers[-1], chart.trails.before(numbers[-1]), found.T_ref_body, cov)
+            self._parting.walked(numbers[-1], found.T_ref_body, cov)
             chart.poses[numbers[-1]] = T_map_body.get(found.key, chart.poses[numbers[-1]])
         for loop in loops:
             chart.tie(loop)

@@ -1,5 +1,5 @@
-"""Agents that disagree with the others are kept out of their map, or taken out if the evidence is late; whose
-metres are a little too long or too short, his are put right."""
+"""Agents that disagree with the others are kept out of their map, or taken out if the evidence is late; metres
+of an agent that are a little too long or too short are put right, and variances that are too small widened."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from share.merge.judge import Judge
 from share.merge.thinning import TakenOut
 from share.place.scale import Scale
 from share.place.verify import Sight
+from share.types import F64
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +37,17 @@ class Parting:
         self.agreement = Agreement(tolerance)
         self._chart, self._judge, self._sights = chart, judge, sights
 
+    def enter(self, run: str, name: str) -> None:
+        """A run of the agent of this name comes: what is known of the name holds for it."""
+        self.agreement.enter(run, name)
+
+    def walked(self, number: int, T_ref_body: F64, cov: F64) -> None:
+        """A new node, by odometry from the one before on its stretch."""
+        trails = self._chart.trails
+        agent = trails.nodes[number].key.agent
+        self.agreement.walk(agent, number, trails.before(number), T_ref_body, cov)
+        self._put_right()
+
     def witness(self, loop: Loop, scale: Scale | None) -> Parted:
         """A verified loop says how its agents agree; scale: of b's depths over a's. Those who do no longer
         are parted."""
@@ -51,7 +63,7 @@ class Parting:
         if not changed:
             return Parted()
         now = self.agreement.apart, self.agreement.disputed
-        who = (before[0] ^ now[0]).union(*(before[1] ^ now[1]))
+        who = map(self.agreement.subjects.newest, (before[0] ^ now[0]).union(*(before[1] ^ now[1])))
         return Parted({name: self.agreement.standing(name) for name in sorted(who)}, self._part())
 
     def kept_apart(self, agent: str) -> tuple[int, ...]:
@@ -66,9 +78,7 @@ class Parting:
         if founders[0] == founders[1]:
             return ""
         ones, others = (self._agents_of(founder) for founder in founders)
-        if unproven := self.agreement.unproven & (ones | others):
-            return f"{min(unproven)} has to be compared first, since the edge was started again"
-        return self.agreement.forbids(ones, others)
+        return self.agreement.yet_to_compare(ones, others) or self.agreement.forbids(ones, others)
 
     def put_right(self, loop: Loop, scale: Scale | None) -> Loop:
         """As it is in true metres, so far as they are known. scale: of b's depths over a's, by which T_a_b
@@ -80,26 +90,29 @@ class Parting:
         return replace(loop, T_a_b=se3.orthonormal(T))
 
     def as_told(self, out: TakenOut) -> TakenOut:
-        """What is kept of an agent's odometry is in its own metres."""
+        """What is kept of an agent's odometry is in its own metres, and not widened."""
         link = out.link
         if link is None or link.reference is None:
             return out
         T = shortened(link.T_ref_body, -self._scale_of(out.key.agent))
-        return replace(out, link=replace(link, T_ref_body=T))
+        cov = link.cov / self._chart.width.get(out.key.agent, 1.0)
+        return replace(out, link=replace(link, T_ref_body=T, cov=cov))
 
     def _scale_of(self, agent: str) -> float:
         return self._chart.scale.get(agent, 0.0)
 
     def _put_right(self) -> None:
-        for agent, log in self.agreement.scale.items():
-            if log != self._scale_of(agent):
-                self._chart.rescale(agent, log)
+        agreement, chart = self.agreement, self._chart
+        for agent in {stretch.agent for stretch in chart.trails.stretches}:
+            told = agreement.scale_of(agent), agreement.widened(agent)
+            if told != (self._scale_of(agent), chart.width.get(agent, 1.0)):
+                chart.rescale(agent, *told)
 
     def restored(self) -> None:
         """An earlier life's map. Who was set apart is not known, but he was not in the map of most agents."""
         maps = [self._agents_of(founder) for founder in sorted(set(self._chart.founder))]
         most = max(maps, key=len, default=set[str]())
-        self.agreement.unproven |= set[str]().union(*maps) - (most if len(most) > 1 else set())
+        self.agreement.subjects.doubt(set[str]().union(*maps) - (most if len(most) > 1 else set()))
 
     def _part(self) -> tuple[Loop, ...]:
         """Take back what ties agents that are kept apart, until no map has two of them."""

@@ -1,0 +1,75 @@
+"""Whose word a run's is: all runs of one name are one witness, as long as the name is not under suspicion.
+
+So a headset that is restarted before it is found out is found out all the same, with all its runs; a name
+counts once however often it came. A run that comes while its name is under suspicion is a subject of its own,
+for it may have been calibrated anew; it is kept apart until it has been compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+
+
+class Subjects:
+    """Of runs. A subject is called as its first run is; one that nobody announced is its own, of its own
+    name. unproven: subjects that are yet to be compared with others before they come into a map with them."""
+
+    def __init__(self) -> None:
+        self.unproven: set[str] = set()
+        self._of: dict[str, str] = {}
+        self._names: dict[str, str] = {}
+        self._runs: dict[str, list[str]] = {}
+        self._newest: dict[str, str] = {}  # of each name
+
+    def enter(self, run: str, name: str, suspects: Iterable[str]) -> None:
+        """A run of this name; suspects: subjects that are. What is known already changes nothing."""
+        if run in self._of:
+            return
+        before = self._newest.get(name)
+        if before is not None and before not in self.unproven.union(suspects):
+            self._add(run, before)
+            return
+        self._names[run] = name
+        self._newest[name] = run
+        self._add(run, run)
+        if before is not None:
+            self.unproven.add(run)
+
+    def doubt(self, runs: Collection[str]) -> None:
+        """Of an earlier life, of which nothing else is known: those of each name are a subject that is unproven."""
+        for run in runs:
+            self.enter(run, run, ())
+        firsts: dict[str, str] = {}
+        for run in [known for known in self._of if known in set(runs)]:
+            name = self.name(run)
+            was_newest = self.newest(self._newest[name]) == run
+            self._runs[self.of(run)].remove(run)
+            first = firsts.setdefault(name, run)
+            self._names[first] = name
+            self._add(run, first)
+            self.unproven.add(first)
+            if was_newest:
+                self._newest[name] = first
+
+    def _add(self, run: str, subject: str) -> None:
+        self._of[run] = subject
+        runs = self._runs.setdefault(subject, [])
+        if run not in runs:
+            runs.append(run)
+
+    def of(self, run: str) -> str:
+        return self._of.get(run, run)
+
+    def name(self, run: str) -> str:
+        """Of a run, or of a subject."""
+        subject = self.of(run)
+        return self._names.get(subject, subject)
+
+    def newest(self, subject: str) -> str:
+        """Its newest run."""
+        return self._runs.get(subject, [subject])[-1]
+
+    def has_earlier(self, run: str) -> bool:
+        """Whether another subject of its name came before."""
+        subject, name = self.of(run), self.name(run)
+        return any(other != subject and self._names[other] == name for other in self._names)
