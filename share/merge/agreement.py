@@ -1,10 +1,10 @@
 """Which agents agree on scale, calibration and how sure they are, and which must not move others.
 
-Every two agents are compared by the loops between them (`share.merge.consistency`), by all of them and by the
-newest, for who is right at first may be wrong later. What differs both significantly and by more than does no
-harm is a disagreement. Of several agents the one that disagrees with most is set apart, as in pairwise
-consistency (Mangelson et al., ICRA 2018), with agents for loops; of two, nobody can say which is wrong, and they
-keep a map each. An agent is a subject here, all runs of a name (`share.merge.subjects`).
+Every two agents are compared by the loops between them (`share.merge.consistency`), by all of them and by
+the newest, for who is right at first may be wrong later. What differs both significantly and by more than
+does no harm is a disagreement. Of several agents the one that disagrees with most is set apart, as in
+pairwise consistency (Mangelson et al., ICRA 2018), with agents for loops; of two, nobody can say which is
+wrong, and they keep a map each. An agent is a subject here, all runs of a name (`share.merge.subjects`).
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Standing:
 
 @dataclass(eq=False)
 class _Met:
-    """Loops of two stretches. ways, newest: as all of them say, and the newest. news: since it was compared."""
+    """Loops of two stretches. ways, newest: as all of them say, and the newest. news: since then."""
 
     loops: list[Witness] = field(default_factory=list)
     ways: Comparison | None = None
@@ -97,9 +97,9 @@ Names = tuple[str, str]
 
 
 class Agreement:
-    """Of all agents, which are told by their runs. tolerance: log scale that does no harm. apart: agents that
-    must not move others. disputed: pairs of which nobody can say who is wrong. scale: log of how much too long
-    the metres of each are, so far as that is sure; 0 where it is not there."""
+    """Of all agents, which are told by their runs. tolerance: log scale that does no harm. apart: agents
+    that must not move others. disputed: pairs of which nobody can say who is wrong. scale: log of how much
+    too long the metres of each are, so far as that is sure; 0 where it is not there."""
 
     def __init__(self, tolerance: float) -> None:
         self.apart: frozenset[str] = frozenset()
@@ -143,8 +143,8 @@ class Agreement:
         scale: Scale | None,
         tilt: tuple[float, float] | None,
     ) -> bool:
-        """A verified loop between two agents' runs, `edge` between its nodes; scale, tilt: see `Witness`. Returns
-        whether who is apart, or disputed, has changed."""
+        """A verified loop between two agents' runs, `edge` between its nodes; scale, tilt: see `Witness`.
+        Returns whether who is apart, or disputed, has changed."""
         one, other = (self.subjects.of(run) for run in agents)
         if self.subjects.name(one) == self.subjects.name(other):
             return False
@@ -178,8 +178,8 @@ class Agreement:
         return ""
 
     def yet_to_compare(self, ones: Collection[str], others: Collection[str]) -> str:
-        """Why these must not come into one map with those before one of them was compared; empty if nothing is
-        known against it."""
+        """Why these must not come into one map with those before one of them was compared; empty if they
+        may."""
         every = {self.subjects.of(run) for run in (*ones, *others)}
         unproven = self.subjects.unproven & every if len(every) > 1 else set[str]()
         return f"{min(unproven)} has to be compared first, {self._why(min(unproven))}" if unproven else ""
@@ -232,8 +232,8 @@ class Agreement:
             self._sureness.leave(pair.met)
         else:
             self._prove(pair, names)
-        worst = {turned: (text, turned) for _, text, turned in sorted(f for f in found if f[0] >= _CALM)}
-        pair.what, pair.turned = (", ".join(said) for said in zip(*worst.values(), strict=True)) if worst else ("", "")
+        said = sorted((f for f in found if f[0] >= _CALM), reverse=True)
+        pair.what, pair.turned = _worst([t for _, t, _ in said]), _worst([t for *_, t in said])
 
     def _compare_ways(self, met: _Met, names: Names, meeting: Meeting) -> None:
         """Absurd numbers leave no solution, and say nothing."""
@@ -282,13 +282,17 @@ class Agreement:
     # ------------------------------------------------------------ all agents
 
     def _decide(self) -> bool:
-        """Who is apart, from who disagrees with whom. Whether that has changed."""
+        """Who is apart, from who disagrees with whom; of those with whom as many disagree, who is of a name
+        that was set apart before. Whether that has changed."""
         left = {frozenset(names) for names, pair in self._pairs.items() if pair.disagrees}
         friends = self._votes(names for names, pair in self._pairs.items() if self._agrees(pair))
         apart = set[str]()
         while left:
             against = self._votes(tuple(names) for names in left)
-            rank = {name: (count, -friends[name]) for name, count in against.items()}
+            rank = {
+                name: (count, self.subjects.follows(name, self.apart), -friends[name])
+                for name, count in against.items()
+            }
             who = [name for name in rank if rank[name] == max(rank.values())]
             if len(who) > 1:
                 break
@@ -368,6 +372,12 @@ def _told(found: Estimate, harmless: float, text: str, words: Names) -> tuple[fl
     size = f"{100 * abs(np.expm1(found.value)):.1f} ± {100 * np.exp(found.value) * found.sigma:.1f}"
     more, less = (text.format(size, word) for word in words)
     return (_severity(found, harmless), *((more, less) if found.value > 0 else (less, more)))
+
+
+def _worst(said: list[str]) -> str:
+    """Of each kind of thing the first."""
+    kinds = {" ".join(text.split()[:2]): text for text in reversed(said)}
+    return ", ".join(text for text in said if text in kinds.values())
 
 
 def _reason(agent: str, bad: list[tuple[Names, _Pair]]) -> str:

@@ -129,8 +129,8 @@ class Chart:
         self.ties.moved(numbers)
 
     def rescale(self, agent: str, log: float, width: float) -> None:
-        """All odometry of this agent is to be shortened by log, and its variances multiplied by width; its maps
-        are due."""
+        """All odometry of this agent is to be shortened by log, and its variances multiplied by width; its
+        maps are due."""
         by, wider = log - self.scale.get(agent, 0.0), width / self.width.get(agent, 1.0)
         self.scale[agent], self.width[agent] = log, width
         for number, stretch in enumerate(self.trails.stretches):

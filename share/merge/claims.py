@@ -1,8 +1,8 @@
 """How sure agents say they are of their odometry, beside each other.
 
-Nothing shows in loops yet when two maps are joined, and who is surest bends the others. So until loops tell,
-nobody is believed to be much surer than the surest of the others: by variances of its steps over their size, in
-the median, for position and for turn.
+Nothing shows in loops yet when two maps are joined, and who is surest bends the others. So until loops
+tell, nobody is believed to be much surer than the surest of the others: by variances of its steps over their
+size, in the median, for position and for turn.
 """
 
 from __future__ import annotations

@@ -104,9 +104,9 @@ class Comparison:
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Of N loops between two stretches: xi (N, 6); J (N, 6, 10), how it moves with G, the path's log scale and
-    the camera's turn; and what adds up to its covariance, as claimed: either walk (N, 6, N, 6), each loop's own
-    noise (N, 6, 6)."""
+    """Of N loops between two stretches: xi (N, 6); J (N, 6, 10), how it moves with G, the path's log scale
+    and the camera's turn; and what adds up to its covariance, as claimed: either walk (N, 6, N, 6), each
+    loop's own noise (N, 6, 6)."""
 
     xi: F64
     J: F64
@@ -116,7 +116,7 @@ class Equations:
 
 
 def points_scale(scales: Sequence[Scale]) -> Estimate:
-    """Robust mean of log scales, at least one. sigma: as they are spread, where that is more than they say."""
+    """Robust mean of log scales, at least one. sigma: as they are spread, where that is more than said."""
     log, variance = np.array([s.log for s in scales]), np.array([s.sigma for s in scales]) ** 2
     variance = variance + _SCALE_FLOOR**2
     mean, weight = float(np.median(log)), np.ones(len(log))

@@ -1,5 +1,5 @@
-"""Agents that disagree with the others are kept out of their map, or taken out if the evidence is late; metres
-of an agent that are a little too long or too short are put right, and variances that are too small widened."""
+"""Agents that disagree with the others are kept out of their map, or taken out if the evidence is late;
+metres that are a little too long or too short are put right, and variances that are too small widened."""
 
 from __future__ import annotations
 

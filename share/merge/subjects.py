@@ -36,7 +36,7 @@ class Subjects:
             self.unproven.add(run)
 
     def doubt(self, runs: Collection[str]) -> None:
-        """Of an earlier life, of which nothing else is known: those of each name are a subject that is unproven."""
+        """Of an earlier life, of which nothing else is known: those of each name are a subject, unproven."""
         for run in runs:
             self.enter(run, run, ())
         firsts: dict[str, str] = {}
@@ -71,5 +71,9 @@ class Subjects:
 
     def has_earlier(self, run: str) -> bool:
         """Whether another subject of its name came before."""
+        return self.follows(run, self._names)
+
+    def follows(self, run: str, some: Iterable[str]) -> bool:
+        """Whether one of these is another subject of its name."""
         subject, name = self.of(run), self.name(run)
-        return any(other != subject and self._names[other] == name for other in self._names)
+        return any(other != subject and self._names.get(other) == name for other in some)

@@ -9,12 +9,12 @@ which is a model of variance components. With P the inverse covariance that leav
 
     q_k = y' P V_k P y,    F_kl = tr(P V_k P V_l),    E q = F (f_a, f_b, g)
 
-whatever factors P was made with, so what all pairs say simply adds up; at the solution it is restricted maximum
-likelihood. F is in units of degrees of freedom over f^2, so a prior of n degrees of freedom at 1 is n more
-of them: of few loops the factors are 1. Below 1 nobody is believed.
-The prior of an agent is not at 1 but higher where it claims to be much surer than any other (`Claims`).
-Source: C. R. Rao, *Estimation of variance and covariance components: MINQUE theory*, J. Multivariate Analysis 1,
-1971; Patterson and Thompson, *Biometrika* 58, 1971.
+whatever factors P was made with, so what all pairs say simply adds up; at the solution it is restricted
+maximum likelihood. F is in units of degrees of freedom over f^2, so a prior of n degrees of freedom at 1 is n
+more of them: of few loops the factors are 1. Below 1 nobody is believed. The prior of an agent that claims to
+be much surer than any other is above 1 (`Claims`).
+Source: C. R. Rao, *Estimation of variance and covariance components: MINQUE theory*, J. Multivariate Analysis
+1, 1971; Patterson and Thompson, *Biometrika* 58, 1971.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def _components(e: Equations, fits: I64, factors: F64) -> tuple[F64, F64]:
     n = len(fits)
     own = np.zeros((n, 6, n, 6))
     own[range(n), :, range(n)] = e.own[fits]
-    among = np.ix_(fits, range(6), fits, range(6))
+    among = np.ix_(fits, np.arange(6), fits, np.arange(6))
     parts = [V.reshape(6 * n, 6 * n) for V in (e.walk_a[among], e.walk_b[among], own)]
     J, y = e.J[fits][:, :, :6].reshape(6 * n, 6), e.xi[fits].ravel()
     inverse = np.linalg.inv(sum(f * V for f, V in zip(factors, parts, strict=True)))

@@ -90,7 +90,7 @@ def test_a_chart_is_shortened_and_what_is_kept_of_it_is_not():
         atlas.add_keyframe("ann", a)
         atlas.add_keyframe("eve", e)
     chart, agreement = atlas._chart, atlas._parting.agreement
-    agreement.scale["eve"], agreement._sureness.factor["eve"] = 0.01, 4.0
+    agreement.scale["eve"], agreement.widened = 0.01, lambda run: 4.0 if run == "eve" else 1.0
     atlas._parting._put_right()
     assert atlas.due() == ["eve/0"]
     atlas.add_keyframe("eve", eve.keyframes[30])

@@ -55,9 +55,9 @@ def played(tool, seed: int, lie):
 
 def test_a_lie_is_told_of_the_way_the_depths_the_sureness_and_the_camera(tool):
     agent = room(1).agents["eve"]
-    hello, honest = tool.told(agent, tool.Lie())
+    ((hello, honest),) = tool.told(agent, tool.Lie())
     assert (hello.name, hello.run_id) == (agent.hello.name, agent.hello.run_id)
-    turned, seen = tool.told(agent, tool.Lie(path=1.1, depth=0.9, sure=10.0, turn_deg=5.0))
+    ((turned, seen),) = tool.told(agent, tool.Lie(path=1.1, depth=0.9, sure=10.0, turn_deg=5.0))
     apart = se3.angle(se3.inverse(hello.rig.T_body_cam0) @ turned.rig.T_body_cam0)
     assert np.degrees(apart) == pytest.approx(5.0)
     for k, (one, other) in enumerate(zip(honest, seen, strict=True)):
