@@ -293,11 +293,11 @@ class Agreement:
                 name: (count, self.subjects.follows(name, self.apart), -friends[name])
                 for name, count in against.items()
             }
-            who = [name for name in rank if rank[name] == max(rank.values())]
-            if len(who) > 1:
+            who = {agent for agent in rank if rank[agent] == max(rank.values())}
+            if len({self.subjects.name(agent) for agent in who}) > 1:
                 break
-            apart.add(who[0])
-            left = {names for names in left if who[0] not in names}
+            apart |= who
+            left = {names for names in left if not names & who}
         was = self.apart, self.disputed
         self.apart, self.disputed = frozenset(apart), frozenset(left)
         self._sureness.forget(apart)

@@ -17,6 +17,7 @@ from share.geometry import se3
 from share.graph.change import Solution
 from share.merge.agreement import Standing
 from share.merge.chart import Chart
+from share.merge.floors import believed, plumb_line
 from share.merge.join import Key, Loop
 from share.merge.judge import Decision, Judge, that_waited
 from share.merge.parting import Parted, Parting
@@ -164,7 +165,8 @@ class Atlas:
 
         Raises ValueError for a keyframe known already or whose reference is unknown.
         """
-        cov, plumb = self._believed(keyframe.T_ref_body, keyframe.cov), self._plumb(keyframe)
+        c = self._config
+        cov, plumb = believed(c, keyframe.T_ref_body, keyframe.cov), plumb_line(c, keyframe)
         number = self._chart.add(agent, keyframe, cov, plumb, rank)
         self._parting.walked(number, keyframe.T_ref_body, cov)
         return number
@@ -187,10 +189,10 @@ class Atlas:
             at[chart.trails.stretches[stretch].name] = stretch
         numbers = []
         for found in keyframes:
-            cov = self._believed(found.T_ref_body, found.cov) if found.as_sent else found.cov
+            cov = believed(self._config, found.T_ref_body, found.cov) if found.as_sent else found.cov
             T_odom_body = found.keyframe.T_odom_body
             numbers.append(chart.trails.put(found.key, at[found.stretch], T_odom_body, found.ordinal))
-            chart.place(numbers[-1], found.T_ref_body, cov, self._plumb(found.keyframe))
+            chart.place(numbers[-1], found.T_ref_body, cov, plumb_line(self._config, found.keyframe))
             self._parting.walked(numbers[-1], found.T_ref_body, cov)
             chart.poses[numbers[-1]] = T_map_body.get(found.key, chart.poses[numbers[-1]])
         for loop in loops:
@@ -276,21 +278,6 @@ class Atlas:
     def review(self, number: int) -> Decision | None:
         """Whether what this keyframe saw speaks against a young join of its map: it is undone."""
         return self._judge.review(number)
-
-    def _believed(self, T_ref_body: F64, cov: F64) -> F64:
-        """Agents are surer of themselves than they should be; none is surer than the floor, which grows with
-        the step."""
-        c = self._config
-        turn, way = float(se3.angle(T_ref_body)), float(np.linalg.norm(T_ref_body[:3, 3]))
-        rad2 = np.radians(c.odometry_floor_deg) ** 2 + (c.odometry_floor_per_rad * turn) ** 2
-        m2 = c.odometry_floor_m**2 + (c.odometry_floor_per_m * way) ** 2
-        return c.odometry_scale**2 * cov + np.diag([rad2] * 3 + [m2] * 3)
-
-    def _plumb(self, keyframe: Keyframe) -> F64:
-        """See `share.graph.plumb`: no camera sits on its IMU better than it was calibrated."""
-        size = float(np.linalg.norm(keyframe.up))
-        sigma = np.hypot(keyframe.up_sigma, np.radians(self._config.gravity_floor_deg))
-        return keyframe.up / (size * sigma) if size else np.zeros(3)
 
     # ------------------------------------------------------------ the solver's side
 

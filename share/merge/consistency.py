@@ -32,6 +32,7 @@ _CAUCHY = 12.0  # squared width of the kernel, of 6 dof
 _ROUNDS = 6
 _MEDIAN = 5.35  # of chi-square with 6 dof
 _PRIOR = np.array([0.2, 0.1, 0.1, 0.1])  # log scale, rad: only so that two loops have a solution
+_MAD = 0.6745  # median of |x| of a standard normal distribution
 _OUTSIDE = 0.3  # weight of a loop below which it does not fit
 _SCALE_FLOOR = 0.004  # of the log scale of one loop's points, beside what it says: occlusions, pixels
 _ALIKE = 0.003  # of honest agents' log scales: no two are calibrated better
@@ -120,6 +121,8 @@ def points_scale(scales: Sequence[Scale]) -> Estimate:
     log, variance = np.array([s.log for s in scales]), np.array([s.sigma for s in scales]) ** 2
     variance = variance + _SCALE_FLOOR**2
     mean, weight = float(np.median(log)), np.ones(len(log))
+    usual = float(np.median(np.abs(log - mean)) / _MAD) ** 2  # variance
+    variance = variance * max(1.0, usual / float(np.median(variance)))
     for _ in range(_ROUNDS):
         weight = 1 / (1 + (log - mean) ** 2 / (4 * variance))
         mean = float((weight * log / variance).sum() / (weight / variance).sum())

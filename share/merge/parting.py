@@ -20,14 +20,17 @@ from share.place.scale import Scale
 from share.place.verify import Sight
 from share.types import F64
 
+_MOST_BACK = 2000  # loops that were taken back: the newest are kept in mind
+
 
 @dataclass(frozen=True, eq=False)
 class Parted:
     """Agents whose standing with the others has changed, and how it is now; dropped: loops that are taken
-    back because of it."""
+    back because of it; tied: loops that had been, and are believed again."""
 
     standing: dict[str, Standing] = field(default_factory=dict)
     dropped: tuple[Loop, ...] = ()
+    tied: tuple[Loop, ...] = ()
 
 
 class Parting:
@@ -36,6 +39,7 @@ class Parting:
     def __init__(self, tolerance: float, chart: Chart, judge: Judge, sights: Mapping[int, Sight]) -> None:
         self.agreement = Agreement(tolerance)
         self._chart, self._judge, self._sights = chart, judge, sights
+        self._taken_back: list[Loop] = []
 
     def enter(self, run: str, name: str) -> None:
         """A run of the agent of this name comes: what is known of the name holds for it."""
@@ -64,7 +68,10 @@ class Parting:
             return Parted()
         now = self.agreement.apart, self.agreement.disputed
         who = map(self.agreement.subjects.newest, (before[0] ^ now[0]).union(*(before[1] ^ now[1])))
-        return Parted({name: self.agreement.standing(name) for name in sorted(who)}, self._part())
+        standing = {name: self.agreement.standing(name) for name in sorted(who)}
+        dropped = self._part()
+        tied, undone = self._give_back()
+        return Parted(standing, (*dropped, *undone), tied)
 
     def kept_apart(self, agent: str) -> tuple[int, ...]:
         """Nodes of agents that must not come into one map with this one."""
@@ -115,15 +122,35 @@ class Parting:
         self.agreement.subjects.doubt(set[str]().union(*maps) - (most if len(most) > 1 else set()))
 
     def _part(self) -> tuple[Loop, ...]:
-        """Take back what ties agents that are kept apart, until no map has two of them."""
-        dropped: tuple[Loop, ...] = ()
-        stretches = self._chart.trails.stretches
+        """Take back what ties agents that are kept apart: first the loops between them, then the fewest
+        others, until no map has two of them."""
+        chart, stretches = self._chart, self._chart.trails.stretches
+        between = [n for n, loop in chart.ties.loops.items() if self._keeps_apart(loop.a.agent, loop.b.agent)]
+        dropped = chart.drop(between) if between else ()
         for a, b in itertools.combinations(range(len(stretches)), 2):
-            if self._chart.founder[a] != self._chart.founder[b]:
-                continue
-            if self.agreement.forbids([stretches[a].agent], [stretches[b].agent]):
+            if chart.founder[a] == chart.founder[b] and self._keeps_apart(
+                stretches[a].agent, stretches[b].agent
+            ):
                 dropped += self._judge.part(a, b)
+        self._taken_back = [*self._taken_back, *dropped][-_MOST_BACK:]
         return dropped
+
+    def _give_back(self) -> tuple[tuple[Loop, ...], tuple[Loop, ...]]:
+        """Loops that were taken back, of agents that are no longer kept apart, are judged anew: those that
+        are believed, and those that are not because of them."""
+        some = [x for x in self._taken_back if not self._keeps_apart(x.a.agent, x.b.agent)]
+        self._taken_back = [x for x in self._taken_back if x not in some]
+        decisions = [
+            self._judge.decide(loop)
+            for loop in some
+            if self._chart.trails.knows(loop.a)
+            and self._chart.trails.knows(loop.b)
+            and not self.forbids(loop)
+        ]
+        return tuple(x for d in decisions for x in d.tied), tuple(x for d in decisions for x in d.dropped)
+
+    def _keeps_apart(self, one: str, other: str) -> bool:
+        return bool(self.agreement.forbids([one], [other]))
 
     def _agents_of(self, founder: int) -> set[str]:
         return {self._chart.trails.stretches[s].agent for s in self._chart.stretches_of(founder)}

@@ -39,17 +39,14 @@ class Subjects:
         """Of an earlier life, of which nothing else is known: those of each name are a subject, unproven."""
         for run in runs:
             self.enter(run, run, ())
-        firsts: dict[str, str] = {}
-        for run in [known for known in self._of if known in set(runs)]:
-            name = self.name(run)
-            was_newest = self.newest(self._newest[name]) == run
-            self._runs[self.of(run)].remove(run)
-            first = firsts.setdefault(name, run)
-            self._names[first] = name
+        known = [(run, self.name(run)) for run in self._of]
+        self._of, self._names, self._runs, self._newest = {}, {}, {}, {}
+        firsts: dict[tuple[str, bool], str] = {}
+        for run, name in known:
+            first = firsts.setdefault((name, run in runs), run)
+            self._names[first], self._newest[name] = name, first
             self._add(run, first)
-            self.unproven.add(first)
-            if was_newest:
-                self._newest[name] = first
+        self.unproven = {first for (_, doubted), first in firsts.items() if doubted}
 
     def _add(self, run: str, subject: str) -> None:
         self._of[run] = subject

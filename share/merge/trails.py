@@ -78,6 +78,10 @@ class Trails:
         self.stretches[node.stretch].nodes.remove(number)
         del self._at[node.key]
 
+    def knows(self, key: Key) -> bool:
+        """Whether such a keyframe is there."""
+        return key in self._at
+
     def number(self, key: Key) -> int:
         """Raises ValueError if no such keyframe is there."""
         if key not in self._at:

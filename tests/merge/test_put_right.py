@@ -14,6 +14,7 @@ from share.geometry import se3
 from share.graph.posegraph import Edge
 from share.merge.agreement import Agreement
 from share.merge.atlas import Atlas, Placed
+from share.merge.floors import believed
 from share.merge.join import Key
 from share.place.refine import Noise, refine
 from share.place.scale import Scale, relative_scale
@@ -100,13 +101,14 @@ def test_a_chart_is_shortened_and_what_is_kept_of_it_is_not():
             T, told = chart.step(before, number).T_a_b, walker.keyframes[k].T_ref_body
             assert T[:3, 3] == pytest.approx(by * told[:3, 3])
             assert T[:3, :3] == pytest.approx(told[:3, :3])
-            cov, believed = chart.step(before, number).cov, atlas._believed(told, walker.keyframes[k].cov)
-            assert cov == pytest.approx((1.0 if walker is ann else 4.0) * believed)
+            width = 1.0 if walker is ann else 4.0
+            cov = width * believed(MergeConfig(), told, walker.keyframes[k].cov)
+            assert chart.step(before, number).cov == pytest.approx(cov)
     taken = atlas.take_out([chart.trails.number(Key("eve", 5))])[0]
     told = eve.keyframes[5].T_ref_body @ eve.keyframes[6].T_ref_body
     assert taken.link is not None
     assert taken.link.T_ref_body[:3, 3] == pytest.approx(told[:3, 3], abs=1e-4)
-    plain = atlas._believed(told, eve.keyframes[6].cov)
+    plain = believed(MergeConfig(), told, eve.keyframes[6].cov)
     assert np.trace(taken.link.cov) < 3 * np.trace(plain)  # of two steps
     agreement.scale["eve"] = 0.0
     atlas._parting._put_right()
