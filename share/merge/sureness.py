@@ -10,9 +10,9 @@ which is a model of variance components. With P the inverse covariance that leav
     q_k = y' P V_k P y,    F_kl = tr(P V_k P V_l),    E q = F (f_a, f_b, g)
 
 whatever factors P was made with, so what all pairs say simply adds up; at the solution it is restricted
-maximum likelihood. f^2 / (F^-1)_kk are degrees of freedom: a factor is their mean with a prior of a few of
-them at 1, or above where an agent claims to be much surer than any other (`Claims`), so of few loops it is
-the prior. Nobody is believed to be less sure than it says.
+maximum likelihood. F is in units of degrees of freedom over f^2, so a prior of n degrees of freedom is n more
+of them: of few loops the factors are as before any, 1, or above where an agent claims to be much surer than
+any other (`Claims`). Nobody is believed to be less sure than it says.
 Source: C. R. Rao, *Estimation of variance and covariance components: MINQUE theory*, J. Multivariate Analysis
 1, 1971; Patterson and Thompson, *Biometrika* 58, 1971.
 """
@@ -32,7 +32,6 @@ _FITS = 0.4  # weight that a loop must have: what is false says nothing of odome
 _MOST_FIT, _WIDE = 0.8, 100.0  # if fewer fit, they are asked by variances that are so much larger
 _ENOUGH = 8  # such loops
 _PRIOR_DOF = 4.0  # of an agent
-_DAMPING, _AT_ONCE = 0.1, 4.0  # dof at the factor before; how much it changes at most by one set of loops
 _LOOP_PRIOR, _LOOP_DOF = 1.7, 12.0  # honest loops are a little too sure, see `consistency`
 _LEAST, _MOST = 0.25, 1e4
 _TELLS, _CHANGES = 1.5, 1.25  # variance from which on it is taken into account; by what part it has to change
@@ -101,19 +100,14 @@ class Sureness:
             F[np.ix_(where, where)] += told.F
             made_with[where] = np.minimum(made_with[where], told.factors)
         least = np.array([self._claims.least(name) for name in agents])
-        now = np.array([self._now.get(name, first) for name, first in zip(agents, least, strict=True)])
-        towards = np.append(now, np.full(len(self._told), _LOOP_PRIOR))
-        dof = np.append(np.full(n, _DAMPING), np.full(len(self._told), _LOOP_DOF))
-        sure = dof / made_with**2
-        found = np.linalg.solve(F + np.diag(sure), q + sure * towards)
-        known = made_with[:n] ** 2 / np.linalg.inv(F + np.diag(1e-2 * sure)).diagonal()[:n]  # dof
-        self._loops = dict(zip(self._told, found[n:].clip(_LEAST, _MOST).tolist(), strict=True))
-        found = found[:n].clip(now / _AT_ONCE, now * _AT_ONCE).clip(_LEAST, _MOST)
-        for name, as_found, by, first in zip(
-            agents, *(x.tolist() for x in (found, known, least)), strict=True
-        ):
-            self._now[name] = as_found
-            self._tell(name, (_PRIOR_DOF * first + by * as_found) / (_PRIOR_DOF + by))
+        prior = np.append(least, np.full(len(self._told), _LOOP_PRIOR))
+        dof = np.append(np.full(n, _PRIOR_DOF), np.full(len(self._told), _LOOP_DOF))
+        sure = dof / np.where(made_with < _MOST, made_with, prior) ** 2
+        found = np.linalg.solve(F + np.diag(sure), q + sure * prior).clip(_LEAST, _MOST)
+        self._loops = dict(zip(self._told, found[n:].tolist(), strict=True))
+        self._now = dict(zip(agents, found[:n].tolist(), strict=True))
+        for name in agents:
+            self._tell(name, self._now[name])
 
     def _tell(self, name: str, now: float) -> None:
         was, now = self.factor.get(name, 1.0), now if now > _TELLS else 1.0
