@@ -4,7 +4,7 @@ metres that are a little too long or too short are put right, and variances that
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,6 +20,7 @@ from share.place.scale import Scale
 from share.place.verify import Sight
 from share.types import F64
 
+_WEAK = 12  # loops between two stretches: fewer may be there only because a map was bent
 _MOST_BACK = 2000  # loops that were taken back: the newest are kept in mind
 
 
@@ -125,6 +126,7 @@ class Parting:
         """Take back what ties agents that are kept apart: first the loops between them, then the fewest
         others, until no map has two of them."""
         chart, stretches = self._chart, self._chart.trails.stretches
+        before = list(chart.founder)
         between = [n for n, loop in chart.ties.loops.items() if self._keeps_apart(loop.a.agent, loop.b.agent)]
         dropped = chart.drop(between) if between else ()
         for a, b in itertools.combinations(range(len(stretches)), 2):
@@ -132,8 +134,21 @@ class Parting:
                 stretches[a].agent, stretches[b].agent
             ):
                 dropped += self._judge.part(a, b)
+        dropped += chart.drop(self._weak(before, {before[chart.stretch_of(x.a)] for x in dropped}))
         self._taken_back = [*self._taken_back, *dropped][-_MOST_BACK:]
         return dropped
+
+    def _weak(self, founder: Sequence[int], maps: Collection[int]) -> list[int]:
+        """Loops of other agents of the maps that were parted, by their edges' numbers, where they are few: what
+        fitted a bent map has to stand without it."""
+        chart, stretches = self._chart, self._chart.trails.stretches
+        out = []
+        for number in chart.ties.loops:
+            a, b = chart.bond(chart.ties.edges[number])
+            strange = stretches[a].agent != stretches[b].agent and founder[a] in maps
+            if strange and chart.bonds[(a, b)] < _WEAK:
+                out.append(number)
+        return out
 
     def _give_back(self) -> tuple[tuple[Loop, ...], tuple[Loop, ...]]:
         """Loops that were taken back, of agents that are no longer kept apart, are judged anew: those that

@@ -20,21 +20,20 @@ Source: C. R. Rao, *Estimation of variance and covariance components: MINQUE the
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from share.merge.claims import Claims
-from share.merge.consistency import Equations, solved
+from share.merge.consistency import Equations
 from share.types import F64, I64
 
 _FITS = 0.4  # weight that a loop must have: what is false says nothing of odometry
-_MOST_FIT, _WIDE = 0.8, 100.0  # if fewer fit, they are asked by variances that are so much larger
 _ENOUGH = 8  # such loops
 _PRIOR_DOF = 4.0  # of an agent
 _LOOP_PRIOR, _LOOP_DOF = 1.7, 12.0  # honest loops are a little too sure, see `consistency`
 _LEAST, _MOST = 0.25, 1e4
-_TELLS, _CHANGES = 1.5, 1.25  # variance from which on it is taken into account; by what part it has to change
+_TELLS, _CHANGES = 2.0, 1.25  # variance from which on it is taken into account; by what part it has to change
 
 Meeting = tuple[int, int]  # two stretches
 
@@ -68,8 +67,6 @@ class Sureness:
     def take(self, meeting: Meeting, agents: tuple[str, str], e: Equations, weight: F64) -> None:
         """What loops of two stretches say by now, of weight (N,) each; it takes the place of what they said
         before. Raises LinAlgError where absurd numbers leave no solution."""
-        if (weight > _FITS).mean() < _MOST_FIT:  # false loops, or odometry that is far too sure?
-            weight = solved(replace(e, walk_a=_WIDE * e.walk_a, walk_b=_WIDE * e.walk_b)).weight
         fits = np.flatnonzero(weight > _FITS)
         if len(fits) < _ENOUGH:
             self._told.pop(meeting, None)
