@@ -311,17 +311,19 @@ class Agreement:
     def _gauge(self) -> None:
         """What is sure of everybody's scale; nothing of those kept apart, for their maps are theirs."""
         kept_apart = self.apart.union(*self.disputed)
-        for agent, (log, sigma) in self._scales().items():
+        known = self._scales(kept_apart)
+        for agent in known.keys() | self.scale.keys():
+            log, sigma = known.get(agent, (0.0, 1.0))
             was = self.scale.get(agent, 0.0)
-            told = abs(log) > (_TELLS_STILL if was else _TELLS) * sigma and agent not in kept_apart
-            now = log if told else 0.0
+            now = log if abs(log) > (_TELLS_STILL if was else _TELLS) * sigma else 0.0
             if abs(now - was) > _SCALE_STEP:
                 self.scale[agent] = now
 
-    def _scales(self) -> Mapping[str, tuple[float, float]]:
+    def _scales(self, without: Collection[str] = ()) -> Mapping[str, tuple[float, float]]:
         """Log scale of every agent's depths against the median of those that are not apart, by least squares
-        over all pairs; and its sigma."""
-        known = [(names, pair.gauge) for names, pair in self._pairs.items() if pair.gauge is not None]
+        over all pairs but those with somebody who is left out; and its sigma."""
+        every = ((names, pair.gauge) for names, pair in self._pairs.items() if not {*names} & {*without})
+        known = [(names, gauge) for names, gauge in every if gauge is not None]
         agents = sorted({name for names, _ in known for name in names})
         if not agents:
             return {}

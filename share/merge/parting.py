@@ -139,8 +139,8 @@ class Parting:
         return dropped
 
     def _weak(self, founder: Sequence[int], maps: Collection[int]) -> list[int]:
-        """Loops of other agents of the maps that were parted, by their edges' numbers, where they are few: what
-        fitted a bent map has to stand without it."""
+        """Loops of other agents of the maps that were parted, by their edges' numbers, where they are few:
+        what fitted a bent map has to stand without it."""
         chart, stretches = self._chart, self._chart.trails.stretches
         out = []
         for number in chart.ties.loops:

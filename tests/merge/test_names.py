@@ -175,3 +175,15 @@ def test_loops_of_a_restarted_suspect_are_not_believed_before_it_is_compared():
     said = [atlas.propose(loop) for loop in near_loops(ann, second, rng)[:6]]
     assert not any(decision.accepted for decision in said)
     assert all("an earlier run of its name" in decision.reason for decision in said)
+
+
+def test_who_is_set_apart_is_no_measure_of_the_others_scale():
+    """Ann and bob have met only eve, whose depths became wrong: nothing says how theirs compare."""
+    town = Town()
+    for run in ("ann-1", "bob-1", "eve-1"):
+        town.enter(run)
+    town.meet("ann-1", "eve-1", 1.05, 30)
+    town.meet("bob-1", "eve-1", 1.0, 10)
+    town.meet("bob-1", "eve-1", 1.05, 30)
+    assert town.agreement.standing("eve-1").state == "set apart"
+    assert town.agreement.scale_of("ann-1") == town.agreement.scale_of("bob-1") == 0.0
