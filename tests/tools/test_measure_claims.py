@@ -69,6 +69,21 @@ def test_a_lie_is_told_of_the_way_the_depths_the_sureness_and_the_camera(tool):
             assert a.T_odom_body == pytest.approx(agent.T_odom_body[k], abs=1e-9)
 
 
+def test_who_lies_later_or_is_started_again(tool):
+    agent = room(1).agents["eve"]
+    ((_, later),) = tool.told(agent, tool.Lie(depth=1.1, after_s=6.0))
+    ratios = [
+        float(seen.candidate.view.points[0, 0] / keyframe.view.points[0, 0])
+        for seen, keyframe in zip(later, agent.keyframes, strict=True)
+    ]
+    assert ratios == pytest.approx([1.0] * 24 + [1.1] * 24, rel=1e-5)
+    runs = tool.told(agent, tool.Lie(depth=1.1, every_s=2.0))
+    assert len({hello.run_id for hello, _ in runs}) == len(runs) > 1
+    assert len({hello.name for hello, _ in runs}) == 1
+    for (_, before), (_, after) in zip(runs, runs[1:], strict=False):
+        assert after[0].at_ns - before[-1].at_ns > 3e9
+
+
 def test_a_lie_that_there_is_not_is_said(tool, capsys):
     words = ["--scene", "empty-hall", "--motion", "walk:", "--lies", "scale 7"]
     assert tool.main(words) == 2
