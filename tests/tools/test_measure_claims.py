@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -80,7 +81,7 @@ def test_who_lies_later_or_is_started_again(tool):
     runs = tool.told(agent, tool.Lie(depth=1.1, every_s=2.0))
     assert len({hello.run_id for hello, _ in runs}) == len(runs) > 1
     assert len({hello.name for hello, _ in runs}) == 1
-    for (_, before), (_, after) in zip(runs, runs[1:], strict=False):
+    for (_, before), (_, after) in itertools.pairwise(runs):
         assert after[0].at_ns - before[-1].at_ns > 3e9
 
 
