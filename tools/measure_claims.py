@@ -15,9 +15,10 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from share import process
 
@@ -39,18 +40,22 @@ from share.errors import ShareError, UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.align import umeyama  # noqa: E402
 from share.types import F64, Candidate, View  # noqa: E402
-from share.wire.messages import Hello  # noqa: E402
+from share.wire.messages import Hello, peer_id  # noqa: E402
 
 
 @dataclass(frozen=True)
 class Lie:
     """path, depth: by what its way, and the depths that it sees, are too long. sure: its sigmas are so many
-    times too small. turn_deg: its camera is turned on its body against what it says."""
+    times too small. turn_deg: its camera is turned on its body against what it says. after_s: until then it
+    says what is right, but for the camera. every_s: it is started anew, as another run of its name, so often;
+    0: never."""
 
     path: float = 1.0
     depth: float = 1.0
     sure: float = 1.0
     turn_deg: float = 0.0
+    after_s: float = 0.0
+    every_s: float = 0.0
 
 
 def _scale(factor: float, sure: float) -> Lie:
@@ -65,7 +70,19 @@ LIES = {
     },
     **{f"way 1.05 sure {sure:g}": Lie(path=1.05, sure=sure) for sure in (1.0, 10.0)},
     **{f"camera 5 deg sure {sure:g}": Lie(turn_deg=5.0, sure=sure) for sure in (1.0, 10.0)},
+    **{f"sure {sure:g}": Lie(sure=sure) for sure in (3.0, 10.0)},
+    **{
+        f"scale {factor} sure 10 after 12 s": replace(_scale(factor, 10.0), after_s=12.0)
+        for factor in (1.02, 1.05)
+    },
+    "way 1.05 sure 10 after 12 s": Lie(path=1.05, sure=10.0, after_s=12.0),
+    **{
+        f"scale {factor} sure 10 every {every:g} s": replace(_scale(factor, 10.0), every_s=every)
+        for factor in (1.02, 1.05)
+        for every in (4.0, 8.0)
+    },
 }
+_GAP_S = 3.5  # between two runs of a name: as long as a name is held, and a little more
 
 
 @dataclass
@@ -83,20 +100,44 @@ class Outcome:
     said: list[str] = field(default_factory=list)
 
 
-def told(agent: AgentKeyframes, lie: Lie) -> tuple[Hello, list[Seen]]:
-    """What it says of itself and sees; its frames are its keyframes."""
-    T_last = [k.T_ref_body for k in agent.keyframes]
-    scaled = [T_last[0], *(_longer(T, lie.path) for T in T_last[1:])]
-    T_odom, seen = np.eye(4), []
-    for n, (keyframe, T) in enumerate(zip(agent.keyframes, scaled, strict=True)):
-        T_odom = se3.orthonormal(T_odom @ T)
+def told(agent: AgentKeyframes, lie: Lie) -> list[tuple[Hello, list[Seen]]]:
+    """What each of its runs says of itself and sees; its frames are its keyframes."""
+    first_ns, runs = agent.keyframes[0].stamp_ns, list[list[Seen]]()
+    began_ns, T_odom = first_ns, np.eye(4)
+    for n, keyframe in enumerate(agent.keyframes):
+        since_s = (keyframe.stamp_ns - first_ns) * 1e-9
+        if lie.every_s and (keyframe.stamp_ns - began_ns) * 1e-9 >= lie.every_s + _GAP_S:
+            began_ns = keyframe.stamp_ns
+        elif lie.every_s and (keyframe.stamp_ns - began_ns) * 1e-9 > lie.every_s:
+            continue
+        begins = keyframe.stamp_ns == began_ns
+        if begins:
+            runs.append([])
+        now = lie if since_s >= lie.after_s else Lie()
+        T = _longer(keyframe.T_ref_body, 1.0 if begins else now.path)
+        T_odom = agent.T_odom_body[n] if begins else se3.orthonormal(T_odom @ T)
         view = keyframe.view
-        if lie.depth != 1:
-            view = View(view.uv, view.points * np.float32(lie.depth), view.descriptors)
-        cov = keyframe.cov / lie.sure**2
-        candidate = Candidate(T_odom, T, cov, keyframe.up, keyframe.up_sigma, view, n == 0)
-        seen.append(Seen(keyframe.stamp_ns, T_odom, candidate=candidate))
-    return _turned(agent.hello, lie.turn_deg), seen
+        if now.depth != 1:
+            view = View(view.uv, view.points * np.float32(now.depth), view.descriptors)
+        cov = keyframe.cov / now.sure**2
+        candidate = Candidate(T_odom, T, cov, keyframe.up, keyframe.up_sigma, view, begins)
+        runs[-1].append(Seen(keyframe.stamp_ns, T_odom, candidate=candidate))
+    hello = _turned(agent.hello, lie.turn_deg)
+    return [(replace(hello, run_id=(hello.run_id + n) % 2**64), seen) for n, seen in enumerate(runs)]
+
+
+class _Room(World):
+    """Who comes later, or goes earlier, is not heard before and after; it says nothing when it goes."""
+
+    def __init__(self, spans_ns: Mapping[bytes, tuple[int, int]], *args: Any, **kwargs: Any) -> None:
+        """spans_ns: from when to when each is there; one that is not named always is."""
+        self._spans_ns = spans_ns
+        super().__init__(*args, **kwargs)
+
+    def _to_agent(self, member: Any, event: Any) -> None:
+        begins_ns, ends_ns = self._spans_ns.get(member.peer, (0, self.now_ns))
+        if begins_ns <= self.now_ns <= ends_ns:
+            super()._to_agent(member, event)
 
 
 def _longer(T: F64, by: float) -> F64:
@@ -112,18 +153,23 @@ def _turned(hello: Hello, degrees: float) -> Hello:
 def played(made: KeyframeSet, lie: Lie | None, config: Config, seed: int = 0) -> Outcome:
     """The whole session; None: without the last agent."""
     *honest, liar = made.agents
-    agents = {name: told(made.agents[name], Lie()) for name in honest}
-    if lie is not None:
-        agents[liar] = told(made.agents[liar], lie)
-    began_ns = min(seen[0].at_ns for _, seen in agents.values())
-    ends_ns = max(seen[-1].at_ns for _, seen in agents.values())
+    agents = [run for name in honest for run in told(made.agents[name], Lie())]
+    lies = [] if lie is None else told(made.agents[liar], lie)
+    agents += lies
+    began_ns = min(seen[0].at_ns for _, seen in agents)
+    ends_ns = max(seen[-1].at_ns for _, seen in agents)
     records: list[dict[str, object]] = []
     mapper = RememberingMapper(config)
     members = [
         (hello, iter([replace(s, at_ns=s.at_ns - began_ns) for s in seen]), NETWORKS["wifi5"])
-        for hello, seen in agents.values()
+        for hello, seen in agents
     ]
-    room = World(config, members, Costs(), seed, mapper=mapper, record=records.append)
+    spans_ns = {
+        peer_id(hello.run_id): (seen[0].at_ns - began_ns, seen[-1].at_ns - began_ns + 200_000_000)
+        for hello, seen in lies
+        if len(lies) > 1
+    }
+    room = _Room(spans_ns, config, members, Costs(), seed, mapper=mapper, record=records.append)
     room.run((ends_ns - began_ns) * 1e-9 + 3.0)
     apart = [r for r in records if r["event"] in ("set apart", "disputed", "agrees again")]
     runs = mapper.runs

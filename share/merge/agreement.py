@@ -1,21 +1,34 @@
 """Which agents agree on scale, calibration and how sure they are, and which must not move others.
 
-Every two agents are compared by the loops between them (`share.merge.consistency`). What differs both
-significantly and by more than does no harm is a disagreement. Of several agents the one that disagrees with
-most is set apart, as in pairwise consistency (Mangelson et al., ICRA 2018), with agents for loops; of two,
-nobody can say which is wrong, and they keep a map each.
+Every two agents are compared by the loops between them (`share.merge.consistency`), by all of them and by
+the newest, for who is right at first may be wrong later. What differs both significantly and by more than
+does no harm is a disagreement. Of several agents the one that disagrees with most is set apart, as in
+pairwise consistency (Mangelson et al., ICRA 2018), with agents for loops; of two, nobody can say which is
+wrong, and they keep a map each. An agent is a subject here, all runs of a name (`share.merge.subjects`).
 """
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from share.graph.posegraph import Edge
-from share.merge.consistency import Comparison, Estimate, Walked, Witness, compare, points_scale
+from share.merge.claims import Claims
+from share.merge.consistency import (
+    Comparison,
+    Estimate,
+    Walked,
+    Witness,
+    compare,
+    equations,
+    points_scale,
+    solved,
+)
+from share.merge.subjects import Subjects
+from share.merge.sureness import Meeting, Sureness
 from share.place.scale import Scale
 from share.types import F64
 
@@ -25,6 +38,7 @@ _SIGMAS = 4.5  # that a difference must have: of thousands of comparisons none b
 _TURN, _TILT = np.radians(1.5), np.radians(1.0)  # rad, less does no harm
 _NIS = 3.0  # beyond what honest agents are too sure
 _ENOUGH_POINTS, _ENOUGH_PATH = 3, 8  # loops before a comparison by points, or by ways, says anything
+_NEW_POINTS, _NEW_PATH = 6, 12  # newest loops that are looked at on their own
 _INSIDE = 0.6  # of the loops must fit, or they are of more than one place
 _CALM = 0.6  # a disagreement ends below this part of what began it
 _TELLS, _TELLS_STILL = 2.5, 1.25  # sigmas from which on, and down to which, a scale is taken into account
@@ -35,7 +49,8 @@ _SCALE_STEP = 0.001  # log scale that it has to change by
 class Standing:
     """Of an agent, for people. state: `agrees`, `set apart`, `disputed` or `unknown`. log_scale, sigma: of
     its depths against the others'; put_right: what of it is taken out; nis: see `share.merge.consistency`;
-    None where not known. doubt: the most that is held against it and another; 1 begins a disagreement."""
+    None where not known. doubt: the most that is held against it and another; 1 begins a disagreement.
+    widened: by what the variances of its odometry are multiplied, for it is too sure of them."""
 
     state: str = "unknown"
     reason: str = ""
@@ -44,47 +59,76 @@ class Standing:
     put_right: float = 0.0
     nis: float | None = None
     doubt: float = 0.0
+    widened: float = 1.0
+
+
+@dataclass(eq=False)
+class _Met:
+    """Loops of two stretches. ways, newest: as all of them say, and the newest. news: since then."""
+
+    loops: list[Witness] = field(default_factory=list)
+    ways: Comparison | None = None
+    newest: Comparison | None = None
+    news: int = 0
 
 
 @dataclass(eq=False)
 class _Pair:
-    """Of two agents, the lesser first. loops: by stretches. scales: of more loops, by which what does no harm
-    is put right. news: loops since it was compared."""
+    """Of two agents, the lesser first. met: by stretches. scales: of more loops, by which what does no harm
+    is put right."""
 
-    loops: dict[tuple[int, int], list[Witness]] = field(default_factory=dict)
+    met: dict[Meeting, _Met] = field(default_factory=dict)
     scales: deque[Scale] = field(default_factory=lambda: deque(maxlen=_MOST_SCALES))
     points: Estimate | None = None
-    gauge: Estimate | None = None  # of `scales`
-    ways: Comparison | None = None
+    newest: Estimate | None = None  # of the newest of `scales`
+    gauge: Estimate | None = None  # of all of them
     doubt: float = 0.0  # 1 begins a disagreement
     disagrees: bool = False
     what: str = ""  # of the second, against the first
     turned: str = ""  # of the first, against the second
-    news: int = 0
+
+    @property
+    def nis(self) -> float | None:
+        """The most that loops of two stretches say; None where they are too few."""
+        return max((met.ways.nis for met in self.met.values() if met.ways is not None), default=None)
 
 
 Names = tuple[str, str]
 
 
 class Agreement:
-    """Of all agents. tolerance: log scale that does no harm. apart: agents that must not move others.
-    disputed: pairs of which nobody can say who is wrong. scale: log of how much too long the metres of each
-    are, so far as that is sure; 0 where it is not there. unproven: agents of an earlier life that may have
-    been set apart; they stay so until they have been compared."""
+    """Of all agents, which are told by their runs. tolerance: log scale that does no harm. apart: agents
+    that must not move others. disputed: pairs of which nobody can say who is wrong. scale: log of how much
+    too long the metres of each are, so far as that is sure; 0 where it is not there."""
 
     def __init__(self, tolerance: float) -> None:
         self.apart: frozenset[str] = frozenset()
         self.disputed: frozenset[frozenset[str]] = frozenset()
         self.scale: dict[str, float] = {}
-        self.unproven: set[str] = set()
+        self.subjects = Subjects()
+        self._sureness = Sureness(Claims())
         self._tolerance = tolerance
         self._walked: dict[int, Walked] = {}
         self._pairs: dict[Names, _Pair] = {}
 
-    def walk(self, number: int, before: int | None, T_ref_body: F64, cov: F64) -> None:
+    def enter(self, run: str, name: str) -> None:
+        """A run of the agent of this name comes; what is held against the name is held against the run."""
+        self.subjects.enter(run, name, self.apart.union(*self.disputed))
+
+    def walk(self, run: str, number: int, before: int | None, T_ref_body: F64, cov: F64) -> None:
         """A new node, by odometry from the one before; None: it begins a stretch."""
         last = None if before is None else self._walked.get(before)
         self._walked[number] = Walked.start() if last is None else last.on(T_ref_body, cov)
+        if before is not None:
+            self._sureness.claimed(self.subjects.of(run), T_ref_body, cov)
+
+    def scale_of(self, run: str) -> float:
+        """See `scale`."""
+        return self.scale.get(self.subjects.of(run), 0.0)
+
+    def widened(self, run: str) -> float:
+        """By what the variances of its odometry have to be multiplied to be believed."""
+        return self._sureness.factor.get(self.subjects.of(run), 1.0)
 
     def forget(self, numbers: Collection[int]) -> None:
         """Nodes that are taken out."""
@@ -99,42 +143,53 @@ class Agreement:
         scale: Scale | None,
         tilt: tuple[float, float] | None,
     ) -> bool:
-        """A verified loop between two agents, `edge` between its nodes; scale, tilt: see `Witness`. Returns
-        whether who is apart, or disputed, has changed."""
-        if agents[0] > agents[1]:
-            agents, stretches, edge = agents[::-1], stretches[::-1], edge.reverse()
+        """A verified loop between two agents' runs, `edge` between its nodes; scale, tilt: see `Witness`.
+        Returns whether who is apart, or disputed, has changed."""
+        one, other = (self.subjects.of(run) for run in agents)
+        if self.subjects.name(one) == self.subjects.name(other):
+            return False
+        if one > other:
+            one, other, stretches, edge = other, one, stretches[::-1], edge.reverse()
             scale = None if scale is None else scale.reverse()
-        pair = self._pairs.setdefault(agents, _Pair())
-        loops = pair.loops.setdefault(stretches, [])
+        pair = self._pairs.setdefault((one, other), _Pair())
+        met = pair.met.setdefault(stretches, _Met())
         a, b = self._walked[edge.a], self._walked[edge.b]
-        loops.append(Witness(a, b, edge.T_a_b, edge.cov, scale, tilt))
+        met.loops.append(Witness(a, b, edge.T_a_b, edge.cov, scale, tilt))
         if scale is not None:
             pair.scales.append(scale)
-        if len(loops) > _MOST:
-            del loops[_least_telling(loops)]
-        pair.news += 1
-        if pair.news * 6 < len(loops):
+        if len(met.loops) > _MOST:
+            del met.loops[_least_telling(met.loops)]
+        met.news += 1
+        if met.news * 6 < len(met.loops):
             return False
-        pair.news = 0
+        met.news = 0
         was = pair.disagrees
-        self._compare(pair, agents)
+        self._compare(pair, (one, other), stretches)
         changed = self._decide() if pair.disagrees or was else False
         self._gauge()
         return changed
 
     def forbids(self, ones: Collection[str], others: Collection[str]) -> str:
         """Why these must not come into one map with those; empty if nothing is known against it."""
-        for a in ones:
-            for b in others:
+        for a in map(self.subjects.of, ones):
+            for b in map(self.subjects.of, others):
                 if a != b and ({a, b} & self.apart or frozenset((a, b)) in self.disputed):
                     return f"{a} and {b} are kept apart"
         return ""
 
-    def standing(self, agent: str) -> Standing:
+    def yet_to_compare(self, ones: Collection[str], others: Collection[str]) -> str:
+        """Why these must not come into one map with those before one of them was compared; empty if they
+        may."""
+        every = {self.subjects.of(run) for run in (*ones, *others)}
+        unproven = self.subjects.unproven & every if len(every) > 1 else set[str]()
+        return f"{min(unproven)} has to be compared first, {self._why(min(unproven))}" if unproven else ""
+
+    def standing(self, run: str) -> Standing:
         """How it stands with the others."""
+        agent = self.subjects.of(run)
         pairs = {names: pair for names, pair in self._pairs.items() if agent in names}
         bad = [(names, pair) for names, pair in pairs.items() if pair.disagrees]
-        nis = max((pair.ways.nis for pair in pairs.values() if pair.ways), default=None)
+        nis = max((pair.nis for pair in pairs.values() if pair.nis is not None), default=None)
         log, sigma = self._scales().get(agent, (None, None))
         state = "agrees" if any(self._agrees(pair) for pair in pairs.values()) else "unknown"
         reason = ""
@@ -142,10 +197,17 @@ class Agreement:
             state, reason = "set apart", _reason(agent, bad) + ": check its calibration"
         elif any(frozenset(names) in self.disputed for names, _ in bad):
             state, reason = "disputed", f"{_reason(agent, bad)}; nobody can say which of the two is wrong"
-        elif agent in self.unproven:
-            state, reason = "unknown", "not compared with the others since the edge was started again"
+        elif agent in self.subjects.unproven:
+            state, reason = "unknown", f"not compared with the others {self._why(agent)}"
         doubt = max((pair.doubt for pair in pairs.values()), default=0.0)
-        return Standing(state, reason, log, sigma, self.scale.get(agent, 0.0), nis, doubt)
+        return Standing(
+            state, reason, log, sigma, self.scale.get(agent, 0.0), nis, doubt, self.widened(agent)
+        )
+
+    def _why(self, unproven: str) -> str:
+        if self.subjects.has_earlier(unproven):
+            return "since an earlier run of its name was kept apart"
+        return "since the edge was started again"
 
     def doubts(self) -> dict[Names, float]:
         """What is held against every two agents that met, the lesser first; 1 begins a disagreement."""
@@ -153,28 +215,56 @@ class Agreement:
 
     # ------------------------------------------------------------ two agents
 
-    def _compare(self, pair: _Pair, names: Names) -> None:
-        every = [w for loops in pair.loops.values() for w in loops]
-        most = max(pair.loops.values(), key=len)
+    def _compare(self, pair: _Pair, names: Names, meeting: Meeting) -> None:
+        met = pair.met[meeting]
+        every = [w for one in pair.met.values() for w in one.loops]
         scales = [w.scale for w in every if w.scale is not None]
-        pair.points = points_scale(scales) if len(scales) >= _ENOUGH_POINTS else None
-        pair.gauge = points_scale(pair.scales) if len(pair.scales) >= _ENOUGH_POINTS else None
-        pair.ways = _compared(most) if len(most) >= _ENOUGH_PATH else None
-        found = [*self._by_points(pair), *self._by_ways(pair), *_by_gravity(every)]
+        pair.points = _pooled(scales)
+        pair.newest = _pooled(list(pair.scales)[-_NEW_POINTS:]) if len(scales) > _NEW_POINTS else None
+        pair.gauge = _pooled(pair.scales)
+        self._compare_ways(met, names, meeting)
+        found = [*self._by_points(pair), *_by_gravity(every), *_by_gravity(met.loops[-_ENOUGH_PATH:])]
+        for one in pair.met.values():
+            found += [*self._by_ways(one.ways), *self._by_ways(one.newest)]
         pair.doubt = max((severity for severity, _, _ in found), default=0.0)
         pair.disagrees = pair.doubt >= (_CALM if pair.disagrees else 1.0)
-        if self._agrees(pair) or (len(most) >= _ENOUGH_PATH and not pair.disagrees):
-            self.unproven.difference_update(names)
-        said = [(text, turned) for severity, text, turned in found if severity >= _CALM]
-        pair.what, pair.turned = ", ".join(t for t, _ in said), ", ".join(t for _, t in said)
+        if pair.disagrees:
+            self._sureness.leave(pair.met)
+        else:
+            self._prove(pair, names)
+        said = sorted((f for f in found if f[0] >= _CALM), reverse=True)
+        pair.what, pair.turned = _worst([t for _, t, _ in said]), _worst([t for *_, t in said])
+
+    def _compare_ways(self, met: _Met, names: Names, meeting: Meeting) -> None:
+        """Absurd numbers leave no solution, and say nothing."""
+        met.ways = met.newest = None
+        if len(met.loops) < _ENOUGH_PATH:
+            return
+        try:
+            told = equations(met.loops)
+            met.ways = solved(told)
+            self._sureness.take(meeting, names, told, met.ways.weight)
+            if len(met.loops) > _NEW_PATH:
+                met.newest = compare(met.loops[-_NEW_PATH:])
+        except np.linalg.LinAlgError:
+            return
+
+    def _prove(self, pair: _Pair, names: Names) -> None:
+        """Who was to be compared has been, if the other is not under suspicion itself. What was wrong with a
+        name before may have been its way, so there depths are not enough."""
+        ways = any(met.ways is not None for met in pair.met.values())
+        for one, other in (names, names[::-1]):
+            earlier = self.subjects.has_earlier(one)
+            suspect = other in self.apart or (earlier and other in self.subjects.unproven)
+            if not suspect and (ways or (self._agrees(pair) and not earlier)):
+                self.subjects.unproven.discard(one)
 
     def _by_points(self, pair: _Pair) -> list[tuple[float, str, str]]:
-        if pair.points is None:
-            return []
-        return [_told(pair.points, self._tolerance, "its depths are {} % {}", ("larger", "smaller"))]
+        found = [points for points in (pair.points, pair.newest) if points is not None]
+        words = "its depths are {} % {}", ("larger", "smaller")
+        return [_told(points, self._tolerance, *words) for points in found]
 
-    def _by_ways(self, pair: _Pair) -> list[tuple[float, str, str]]:
-        ways = pair.ways
+    def _by_ways(self, ways: Comparison | None) -> list[tuple[float, str, str]]:
         if ways is None:
             return []
         out = []
@@ -192,36 +282,48 @@ class Agreement:
     # ------------------------------------------------------------ all agents
 
     def _decide(self) -> bool:
-        """Who is apart, from who disagrees with whom. Whether that has changed."""
+        """Who is apart, from who disagrees with whom; of those with whom as many disagree, who is of a name
+        that was set apart before. Whether that has changed."""
         left = {frozenset(names) for names, pair in self._pairs.items() if pair.disagrees}
-        friends = Counter(n for names, pair in self._pairs.items() if self._agrees(pair) for n in names)
+        friends = self._votes(names for names, pair in self._pairs.items() if self._agrees(pair))
         apart = set[str]()
         while left:
-            against = Counter(name for names in left for name in names)
-            rank = {name: (count, -friends[name]) for name, count in against.items()}
-            who = [name for name in rank if rank[name] == max(rank.values())]
-            if len(who) > 1:
+            against = self._votes(tuple(names) for names in left)
+            rank = {
+                name: (count, self.subjects.follows(name, self.apart), -friends[name])
+                for name, count in against.items()
+            }
+            who = {agent for agent in rank if rank[agent] == max(rank.values())}
+            if len({self.subjects.name(agent) for agent in who}) > 1:
                 break
-            apart.add(who[0])
-            left = {names for names in left if who[0] not in names}
+            apart |= who
+            left = {names for names in left if not names & who}
         was = self.apart, self.disputed
         self.apart, self.disputed = frozenset(apart), frozenset(left)
+        self._sureness.forget(apart)
         return was != (self.apart, self.disputed)
+
+    def _votes(self, pairs: Iterable[tuple[str, ...]]) -> Counter[str]:
+        """With how many others each is paired, of whom those of one name count once."""
+        others = {(one, self.subjects.name(b)) for a, b in pairs for one, b in ((a, b), (b, a))}
+        return Counter(one for one, _ in others)
 
     def _gauge(self) -> None:
         """What is sure of everybody's scale; nothing of those kept apart, for their maps are theirs."""
         kept_apart = self.apart.union(*self.disputed)
-        for agent, (log, sigma) in self._scales().items():
+        known = self._scales(kept_apart)
+        for agent in known.keys() | self.scale.keys():
+            log, sigma = known.get(agent, (0.0, 1.0))
             was = self.scale.get(agent, 0.0)
-            told = abs(log) > (_TELLS_STILL if was else _TELLS) * sigma and agent not in kept_apart
-            now = log if told else 0.0
+            now = log if abs(log) > (_TELLS_STILL if was else _TELLS) * sigma else 0.0
             if abs(now - was) > _SCALE_STEP:
                 self.scale[agent] = now
 
-    def _scales(self) -> Mapping[str, tuple[float, float]]:
+    def _scales(self, without: Collection[str] = ()) -> Mapping[str, tuple[float, float]]:
         """Log scale of every agent's depths against the median of those that are not apart, by least squares
-        over all pairs; and its sigma."""
-        known = [(names, pair.gauge) for names, pair in self._pairs.items() if pair.gauge is not None]
+        over all pairs but those with somebody who is left out; and its sigma."""
+        every = ((names, pair.gauge) for names, pair in self._pairs.items() if not {*names} & {*without})
+        known = [(names, gauge) for names, gauge in every if gauge is not None]
         agents = sorted({name for names, _ in known for name in names})
         if not agents:
             return {}
@@ -231,7 +333,8 @@ class Agreement:
             J[row, at[a]], J[row, at[b]] = -1 / points.sigma, 1 / points.sigma
             z[row] = points.value / points.sigma
         x = np.linalg.pinv(J) @ z
-        x -= np.median([x[at[name]] for name in agents if name not in self.apart] or x)
+        counts = {self.subjects.name(agent): x[at[agent]] for agent in agents if agent not in self.apart}
+        x -= np.median([*counts.values()] or x)  # a name counts once
         sigma = np.sqrt(np.diag(np.linalg.pinv(J.T @ J)))
         return {name: (float(x[i]), float(sigma[i])) for name, i in at.items()}
 
@@ -257,12 +360,8 @@ def _by_gravity(loops: list[Witness]) -> list[tuple[float, str, str]]:
     return [(min(angle / _TILT, sigmas / _SIGMAS), text, text)]
 
 
-def _compared(loops: list[Witness]) -> Comparison | None:
-    """None where absurd numbers leave no solution."""
-    try:
-        return compare(loops)
-    except np.linalg.LinAlgError:
-        return None
+def _pooled(scales: Collection[Scale]) -> Estimate | None:
+    return points_scale(list(scales)) if len(scales) >= _ENOUGH_POINTS else None
 
 
 def _severity(found: Estimate, harmless: float) -> float:
@@ -272,9 +371,15 @@ def _severity(found: Estimate, harmless: float) -> float:
 
 def _told(found: Estimate, harmless: float, text: str, words: Names) -> tuple[float, str, str]:
     """Severity, and the text for either side."""
-    size = f"{100 * abs(np.expm1(found.value)):.1f} ± {100 * found.sigma:.1f}"
+    size = f"{100 * abs(np.expm1(found.value)):.1f} ± {100 * np.exp(found.value) * found.sigma:.1f}"
     more, less = (text.format(size, word) for word in words)
     return (_severity(found, harmless), *((more, less) if found.value > 0 else (less, more)))
+
+
+def _worst(said: list[str]) -> str:
+    """Of each kind of thing the first."""
+    kinds = {" ".join(text.split()[:2]): text for text in reversed(said)}
+    return ", ".join(text for text in said if text in kinds.values())
 
 
 def _reason(agent: str, bad: list[tuple[Names, _Pair]]) -> str:

@@ -143,6 +143,7 @@ class Atlas:
     def enter(self, agent: str, name: str) -> None:
         """A run of the agent of this name comes."""
         self._owners.join(agent, name)
+        self._parting.enter(agent, name)
 
     def present(self, agent: str, here: bool) -> None:
         """Who is not heard need not be told where he is, and nobody waits for him. Once he is heard again, a
@@ -159,6 +160,7 @@ class Atlas:
     def forget(self, agent: str) -> None:
         """A run of which nothing is left will not come back."""
         self._owners.forget(agent)
+        self._parting.forget(agent)
         self._answers.pop(agent, None)
         self._chart.trails.forget(agent)
 
@@ -187,10 +189,10 @@ class Atlas:
 
         Raises ValueError for a keyframe known already or whose reference is unknown.
         """
-        cov = believed(self._config, keyframe.T_ref_body, keyframe.cov)
-        plumb = plumb_line(self._config, keyframe)
+        c = self._config
+        cov, plumb = believed(c, keyframe.T_ref_body, keyframe.cov), plumb_line(c, keyframe)
         number = self._chart.add(agent, keyframe, cov, plumb, rank)
-        self._parting.agreement.walk(number, self._chart.trails.before(number), keyframe.T_ref_body, cov)
+        self._parting.walked(number, keyframe.T_ref_body, cov)
         return number
 
     def restore(
@@ -215,7 +217,7 @@ class Atlas:
             T_odom_body = found.keyframe.T_odom_body
             numbers.append(chart.trails.put(found.key, at[found.stretch], T_odom_body, found.ordinal))
             chart.place(numbers[-1], found.T_ref_body, cov, plumb_line(self._config, found.keyframe))
-            self._parting.agreement.walk(numbers[-1], chart.trails.before(numbers[-1]), found.T_ref_body, cov)
+            self._parting.walked(numbers[-1], found.T_ref_body, cov)
             chart.poses[numbers[-1]] = T_map_body.get(found.key, chart.poses[numbers[-1]])
         for loop in loops:
             chart.tie(loop)

@@ -31,7 +31,7 @@ class Chart:
     """poses: T_map_body (4, 4) of every node, by its number. plumb: which way is up there, if it is known
     (`share.graph.plumb`). founder: of the map of each stretch. parted: stretches that were left in another
     map when loops were taken back, since somebody last asked. scale: log of what each agent's odometry is
-    shortened by; nothing where it is not there."""
+    shortened by; width: by what its variances are multiplied; nothing where it is not there."""
 
     def __init__(self) -> None:
         self.trails = Trails()
@@ -42,6 +42,7 @@ class Chart:
         self.parted: set[int] = set()
         self.bonds: Counter[tuple[int, int]] = Counter()  # loops by the two stretches that they tie
         self.scale: dict[str, float] = {}
+        self.width: dict[str, float] = {}
         self.unsolved: dict[int, None] = {}  # founders of maps with news, the oldest first
 
     def add(self, agent: str, keyframe: Keyframe, cov: F64, plumb: F64, rank: int = 0) -> int:
@@ -55,12 +56,13 @@ class Chart:
         """Give a new node its pose, by odometry as its agent told it, and tie it to the one before it, if
         there is one."""
         node, before = self.trails.nodes[number], self.trails.before(number)
-        T_ref_body = shortened(T_ref_body, self.scale.get(self.trails.stretches[node.stretch].agent, 0.0))
+        agent = self.trails.stretches[node.stretch].agent
+        T_ref_body = shortened(T_ref_body, self.scale.get(agent, 0.0))
         self.founder += range(len(self.founder), len(self.trails.stretches))
         if before is None:
             self.poses[number] = node.T_odom_body
         else:
-            self.ties.add(Edge(before, number, T_ref_body, cov))
+            self.ties.add(Edge(before, number, T_ref_body, cov * self.width.get(agent, 1.0)))
             self.poses[number] = se3.orthonormal(self.poses[before] @ T_ref_body)
         if plumb.any():
             self.plumb[number] = plumb
@@ -126,17 +128,18 @@ class Chart:
         self.poses.update(zip(numbers, moved, strict=True))
         self.ties.moved(numbers)
 
-    def rescale(self, agent: str, log: float) -> None:
-        """All odometry of this agent is to be shortened by this; its maps are due."""
-        by = log - self.scale.get(agent, 0.0)
-        self.scale[agent] = log
+    def rescale(self, agent: str, log: float, width: float) -> None:
+        """All odometry of this agent is to be shortened by log, and its variances multiplied by width; its
+        maps are due."""
+        by, wider = log - self.scale.get(agent, 0.0), width / self.width.get(agent, 1.0)
+        self.scale[agent], self.width[agent] = log, width
         for number, stretch in enumerate(self.trails.stretches):
             if stretch.agent != agent or not stretch.nodes:
                 continue
             for before, after in itertools.pairwise(stretch.nodes):
                 old, edge = self._step(before, after)
                 self.ties.remove(old)
-                self.ties.add(replace(edge, T_a_b=shortened(edge.T_a_b, by)))
+                self.ties.add(replace(edge, T_a_b=shortened(edge.T_a_b, by), cov=wider * edge.cov))
             self.unsolved.setdefault(self.founder[number])
 
     def follow(self, numbers: Iterable[int]) -> None:

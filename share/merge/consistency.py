@@ -32,6 +32,8 @@ _CAUCHY = 12.0  # squared width of the kernel, of 6 dof
 _ROUNDS = 6
 _MEDIAN = 5.35  # of chi-square with 6 dof
 _PRIOR = np.array([0.2, 0.1, 0.1, 0.1])  # log scale, rad: only so that two loops have a solution
+_MAD = 0.6745  # median of |x| of a standard normal distribution
+_OUTSIDE = 0.3  # weight of a loop below which it does not fit
 _SCALE_FLOOR = 0.004  # of the log scale of one loop's points, beside what it says: occlusions, pixels
 _ALIKE = 0.003  # of honest agents' log scales: no two are calibrated better
 
@@ -88,39 +90,66 @@ class Estimate:
 class Comparison:
     """Of b with a. points: log scale of b's depths; path: log of how much longer its way is. turn: of its
     camera on its body, rad. nis: of the loops' noise beyond all this, 1 if covariances are right.
-    inside: share of the loops that fit."""
+    weight (N,): of each loop under the kernel."""
 
     path: Estimate
     turn: Estimate
     nis: float
-    inside: float
+    weight: F64
+
+    @property
+    def inside(self) -> float:
+        """Share of the loops that fit."""
+        return float((self.weight > _OUTSIDE).mean())
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """Of N loops between two stretches: xi (N, 6); J (N, 6, 10), how it moves with G, the path's log scale
+    and the camera's turn; and what adds up to its covariance, as claimed: either walk (N, 6, N, 6), each
+    loop's own noise (N, 6, 6)."""
+
+    xi: F64
+    J: F64
+    walk_a: F64
+    walk_b: F64
+    own: F64
 
 
 def points_scale(scales: Sequence[Scale]) -> Estimate:
-    """Robust mean of log scales; at least one."""
+    """Robust mean of log scales, at least one. sigma: as they are spread, where that is more than said."""
     log, variance = np.array([s.log for s in scales]), np.array([s.sigma for s in scales]) ** 2
     variance = variance + _SCALE_FLOOR**2
     mean, weight = float(np.median(log)), np.ones(len(log))
+    usual = float(np.median(np.abs(log - mean)) / _MAD) ** 2  # variance
+    variance = variance * max(1.0, usual / float(np.median(variance)))
     for _ in range(_ROUNDS):
         weight = 1 / (1 + (log - mean) ** 2 / (4 * variance))
         mean = float((weight * log / variance).sum() / (weight / variance).sum())
-    return Estimate(mean, float(np.hypot((weight / variance).sum() ** -0.5, _ALIKE)), len(log))
+    told = weight / variance
+    spread = float((told**2 * (log - mean) ** 2).sum()) ** 0.5 / float(told.sum())  # Huber's sandwich
+    return Estimate(mean, float(np.hypot(max(told.sum() ** -0.5, spread), _ALIKE)), len(log))
 
 
 def compare(loops: Sequence[Witness]) -> Comparison:
     """Of at least three loops between the same two stretches."""
+    return solved(equations(loops))
+
+
+def equations(loops: Sequence[Witness]) -> Equations:
+    """Of loops between the same two stretches, about the middle of where they are."""
     T_a, T_b, T_a_b = (np.array(x) for x in zip(*((w.a.T, w.b.T, w.T_a_b) for w in loops), strict=True))
     middle = np.eye(4)
     middle[:3, 3] = -(T_a @ T_a_b)[:, :3, 3].mean(0)
     Ad = se3.adjoint(middle)
     T_a = middle @ T_a
     G = _start(T_a @ T_a_b @ se3.inverse(T_b))
-    walk = _walk([w.a for w in loops], Ad) + _walk([w.b for w in loops], se3.adjoint(G))
+    walk_a, walk_b = _walk([w.a for w in loops], Ad), _walk([w.b for w in loops], se3.adjoint(G))
     own = (
         se3.adjoint(T_a @ T_a_b) @ np.array([w.cov for w in loops]) @ se3.adjoint(T_a @ T_a_b).swapaxes(1, 2)
     )
     xi = se3.log(T_a @ T_a_b @ se3.inverse(T_b) @ se3.inverse(G))
-    return _solved(xi, _columns(T_a @ T_a_b), _SURER**2 * walk, _LOOP_SURER**2 * own)
+    return Equations(xi, _columns(T_a @ T_a_b), walk_a, walk_b, own)
 
 
 def _start(Z: F64) -> F64:
@@ -148,8 +177,10 @@ def _columns(T_b: F64) -> F64:
     return out
 
 
-def _solved(xi: F64, J: F64, walk: F64, own: F64) -> Comparison:
-    n = len(xi)
+def solved(e: Equations) -> Comparison:
+    """What the agents are wrong about. Raises LinAlgError where absurd numbers leave no solution."""
+    xi, J, n = e.xi, e.J, len(e.xi)
+    walk, own = _SURER**2 * (e.walk_a + e.walk_b), _LOOP_SURER**2 * e.own
     rows, prior = J.reshape(6 * n, 10), np.zeros((10, 10))
     prior[range(6, 10), range(6, 10)] = _PRIOR**-2
     information, weight = np.linalg.inv(own), np.ones(n)
@@ -165,7 +196,8 @@ def _solved(xi: F64, J: F64, walk: F64, own: F64) -> Comparison:
         chi2 = np.einsum("ni,nij,nj->n", noise, information, noise)
         weight = 1 / (1 + chi2 / _CAUCHY)
     nis = float(np.median(chi2)) / _MEDIAN
-    cov = np.linalg.inv(normal) * max(1.0, nis)
+    misfit = float(left @ inverse @ left) / max(1, 6 * n - 10)  # of loops and ways: a wrong model shows here
+    cov = np.linalg.inv(normal) * max(1.0, nis, misfit)
     turn = theta[7:]
     chi = max(1e-6, float(turn @ np.linalg.solve(cov[7:, 7:], turn))) ** 0.5
     size = float(np.linalg.norm(turn))
@@ -173,5 +205,5 @@ def _solved(xi: F64, J: F64, walk: F64, own: F64) -> Comparison:
         Estimate(float(theta[6]), float(np.sqrt(cov[6, 6])), n),
         Estimate(size, size / chi if size else 1.0, n),
         nis,
-        float((weight > 0.3).mean()),
+        weight,
     )

@@ -1,10 +1,10 @@
-"""Agents that disagree with the others are kept out of their map, or taken out if the evidence is late; whose
-metres are a little too long or too short, his are put right."""
+"""Agents that disagree with the others are kept out of their map, or taken out if the evidence is late;
+metres that are a little too long or too short are put right, and variances that are too small widened."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,15 +18,20 @@ from share.merge.judge import Judge
 from share.merge.thinning import TakenOut
 from share.place.scale import Scale
 from share.place.verify import Sight
+from share.types import F64
+
+_WEAK = 12  # loops between two stretches: fewer may be there only because a map was bent
+_MOST_BACK = 2000  # loops that were taken back: the newest are kept in mind
 
 
 @dataclass(frozen=True, eq=False)
 class Parted:
     """Agents whose standing with the others has changed, and how it is now; dropped: loops that are taken
-    back because of it."""
+    back because of it; tied: loops that had been, and are believed again."""
 
     standing: dict[str, Standing] = field(default_factory=dict)
     dropped: tuple[Loop, ...] = ()
+    tied: tuple[Loop, ...] = ()
 
 
 class Parting:
@@ -35,6 +40,24 @@ class Parting:
     def __init__(self, tolerance: float, chart: Chart, judge: Judge, sights: Mapping[int, Sight]) -> None:
         self.agreement = Agreement(tolerance)
         self._chart, self._judge, self._sights = chart, judge, sights
+        self._taken_back: list[Loop] = []
+
+    def enter(self, run: str, name: str) -> None:
+        """A run of the agent of this name comes: what is known of the name holds for it."""
+        self.agreement.enter(run, name)
+
+    def forget(self, run: str) -> None:
+        """Nothing is left of it, and it will not come back."""
+        self.agreement.subjects.forget(run)
+        self._chart.scale.pop(run, None)
+        self._chart.width.pop(run, None)
+
+    def walked(self, number: int, T_ref_body: F64, cov: F64) -> None:
+        """A new node, by odometry from the one before on its stretch."""
+        trails = self._chart.trails
+        agent = trails.nodes[number].key.agent
+        self.agreement.walk(agent, number, trails.before(number), T_ref_body, cov)
+        self._put_right()
 
     def witness(self, loop: Loop, scale: Scale | None) -> Parted:
         """A verified loop says how its agents agree; scale: of b's depths over a's. Those who do no longer
@@ -51,12 +74,16 @@ class Parting:
         if not changed:
             return Parted()
         now = self.agreement.apart, self.agreement.disputed
-        who = (before[0] ^ now[0]).union(*(before[1] ^ now[1]))
-        return Parted({name: self.agreement.standing(name) for name in sorted(who)}, self._part())
+        who = map(self.agreement.subjects.newest, (before[0] ^ now[0]).union(*(before[1] ^ now[1])))
+        standing = {name: self.agreement.standing(name) for name in sorted(who)}
+        dropped = self._part()
+        tied, undone = self._give_back()
+        return Parted(standing, (*dropped, *undone), tied)
 
     def kept_apart(self, agent: str) -> tuple[int, ...]:
         """Nodes of agents that must not come into one map with this one."""
-        stretches = self._chart.trails.stretches
+        trails = self._chart.trails
+        stretches = [trails.stretches[number] for number in sorted(trails.live)]
         apart = {s.agent for s in stretches if self.agreement.forbids([agent], [s.agent])}
         return tuple(n for s in stretches if s.agent in apart for n in s.nodes) if apart else ()
 
@@ -66,9 +93,7 @@ class Parting:
         if founders[0] == founders[1]:
             return ""
         ones, others = (self._agents_of(founder) for founder in founders)
-        if unproven := self.agreement.unproven & (ones | others):
-            return f"{min(unproven)} has to be compared first, since the edge was started again"
-        return self.agreement.forbids(ones, others)
+        return self.agreement.yet_to_compare(ones, others) or self.agreement.forbids(ones, others)
 
     def put_right(self, loop: Loop, scale: Scale | None) -> Loop:
         """As it is in true metres, so far as they are known. scale: of b's depths over a's, by which T_a_b
@@ -80,37 +105,72 @@ class Parting:
         return replace(loop, T_a_b=se3.orthonormal(T))
 
     def as_told(self, out: TakenOut) -> TakenOut:
-        """What is kept of an agent's odometry is in its own metres."""
+        """What is kept of an agent's odometry is in its own metres, and not widened."""
         link = out.link
         if link is None or link.reference is None:
             return out
         T = shortened(link.T_ref_body, -self._scale_of(out.key.agent))
-        return replace(out, link=replace(link, T_ref_body=T))
+        cov = link.cov / self._chart.width.get(out.key.agent, 1.0)
+        return replace(out, link=replace(link, T_ref_body=T, cov=cov))
 
     def _scale_of(self, agent: str) -> float:
         return self._chart.scale.get(agent, 0.0)
 
     def _put_right(self) -> None:
-        for agent, log in self.agreement.scale.items():
-            if log != self._scale_of(agent):
-                self._chart.rescale(agent, log)
+        agreement, chart = self.agreement, self._chart
+        for agent in {chart.trails.stretches[stretch].agent for stretch in chart.trails.live}:
+            told = agreement.scale_of(agent), agreement.widened(agent)
+            if told != (self._scale_of(agent), chart.width.get(agent, 1.0)):
+                chart.rescale(agent, *told)
 
     def restored(self) -> None:
         """An earlier life's map. Who was set apart is not known, but he was not in the map of most agents."""
         maps = [self._agents_of(founder) for founder in sorted(set(self._chart.founder))]
         most = max(maps, key=len, default=set[str]())
-        self.agreement.unproven |= set[str]().union(*maps) - (most if len(most) > 1 else set())
+        self.agreement.subjects.doubt(set[str]().union(*maps) - (most if len(most) > 1 else set()))
 
     def _part(self) -> tuple[Loop, ...]:
-        """Take back what ties agents that are kept apart, until no map has two of them."""
-        dropped: tuple[Loop, ...] = ()
-        stretches = self._chart.trails.stretches
-        for a, b in itertools.combinations(range(len(stretches)), 2):
-            if self._chart.founder[a] != self._chart.founder[b]:
-                continue
-            if self.agreement.forbids([stretches[a].agent], [stretches[b].agent]):
+        """Take back what ties agents that are kept apart: first the loops between them, then the fewest
+        others, until no map has two of them."""
+        chart, stretches = self._chart, self._chart.trails.stretches
+        before = list(chart.founder)
+        between = [n for n, loop in chart.ties.loops.items() if self._keeps_apart(loop.a.agent, loop.b.agent)]
+        dropped = chart.drop(between) if between else ()
+        for a, b in itertools.combinations(sorted(chart.trails.live), 2):
+            if chart.founder[a] == chart.founder[b] and self._keeps_apart(
+                stretches[a].agent, stretches[b].agent
+            ):
                 dropped += self._judge.part(a, b)
+        dropped += chart.drop(self._weak(before, {before[chart.stretch_of(x.a)] for x in dropped}))
+        self._taken_back = [*self._taken_back, *dropped][-_MOST_BACK:]
         return dropped
+
+    def _weak(self, founder: Sequence[int], maps: Collection[int]) -> list[int]:
+        """Loops of other agents of the maps that were parted, by their edges' numbers, where they are few:
+        what fitted a bent map has to stand without it."""
+        chart, stretches = self._chart, self._chart.trails.stretches
+        out = []
+        for number in chart.ties.loops:
+            a, b = chart.bond(chart.ties.edges[number])
+            strange = stretches[a].agent != stretches[b].agent and founder[a] in maps
+            if strange and chart.bonds[(a, b)] < _WEAK:
+                out.append(number)
+        return out
+
+    def _give_back(self) -> tuple[tuple[Loop, ...], tuple[Loop, ...]]:
+        """Loops that were taken back, of agents that are no longer kept apart, are judged anew: those that
+        are believed, and those that are not because of them."""
+        some = [x for x in self._taken_back if not self._keeps_apart(x.a.agent, x.b.agent)]
+        self._taken_back = [x for x in self._taken_back if x not in some]
+        decisions = [
+            self._judge.decide(loop)
+            for loop in some
+            if self._chart.trails.has(loop.a) and self._chart.trails.has(loop.b) and not self.forbids(loop)
+        ]
+        return tuple(x for d in decisions for x in d.tied), tuple(x for d in decisions for x in d.dropped)
+
+    def _keeps_apart(self, one: str, other: str) -> bool:
+        return bool(self.agreement.forbids([one], [other]))
 
     def _agents_of(self, founder: int) -> set[str]:
         return {self._chart.trails.stretches[s].agent for s in self._chart.stretches_of(founder)}

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 from hellos import hello_of
 from model_edge import MS, S
 
 from share.config import Config
 from share.core.edge import Edge
 from share.core.edge_events import Received, Tick
-from share.core.peer import Known
+from share.core.peer import Foot, Known
 from share.core.peer_status import PeerStatus
 from share.types import TrackState
 from share.wire import messages as wire
@@ -50,7 +51,7 @@ def test_before_it_has_said_anything_no_age_is_shown() -> None:
 
 def test_who_was_not_heard_in_this_life_has_no_age() -> None:
     """The clock of the machine began long before the edge."""
-    known = Known("ann-000b", hello_of("ann", 1), None, 0)
+    known = Known("ann-000b", hello_of("ann", 1), Foot(0, 0, np.eye(4)), 1)
     edge = Edge(Config(), session=5, known=[known])
     edge.handle(Tick(), 6600 * S)
     seen = shown(edge)

@@ -100,11 +100,11 @@ def town(scales: dict[str, float], pairs: list[tuple[str, str]]) -> tuple[Agreem
     """Agents whose depths are so much too large, who meet so."""
     agreement, rng, said = Agreement(0.015), np.random.default_rng(2), []
     nodes = {name: range(10 * i, 10 * i + 10) for i, name in enumerate(scales)}
-    for numbers in nodes.values():
+    for name, numbers in nodes.items():
         for number in numbers:
             before = number - 1 if number > numbers[0] else None
             step = se3.compose(np.eye(3), np.array([0.3, 0, 0]))
-            agreement.walk(number, before, step, STEP_COV)
+            agreement.walk(name, number, before, step, STEP_COV)
     for k in range(6):
         for a, b in pairs:
             edge = Edge(nodes[a][k], nodes[b][k], np.eye(4), LOOP_COV)

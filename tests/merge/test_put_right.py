@@ -14,6 +14,7 @@ from share.geometry import se3
 from share.graph.posegraph import Edge
 from share.merge.agreement import Agreement
 from share.merge.atlas import Atlas, Placed
+from share.merge.floors import believed
 from share.merge.join import Key
 from share.place.refine import Noise, refine
 from share.place.scale import Scale, relative_scale
@@ -55,9 +56,9 @@ def met(scales: dict[str, float], rounds: int = 40) -> Agreement:
     """Everybody walks, and meets everybody else so often."""
     agreement, rng, names = Agreement(0.015), np.random.default_rng(2), list(scales)
     nodes = {name: range(10 * i, 10 * i + 10) for i, name in enumerate(names)}
-    for numbers in nodes.values():
+    for name, numbers in nodes.items():
         for n in numbers:
-            agreement.walk(n, n - 1 if n % 10 else None, se3.exp(np.array([0, 0, 0, 0.3, 0, 0])), STEP)
+            agreement.walk(name, n, n - 1 if n % 10 else None, se3.exp(np.array([0, 0, 0, 0.3, 0, 0])), STEP)
     for k in range(rounds):
         for a, b in (("ann", "bob"), ("eve", "ann"), ("bob", "eve")):
             edge = Edge(nodes[a][k % 10], nodes[b][k % 10], np.eye(4), STEP)
@@ -89,8 +90,9 @@ def test_a_chart_is_shortened_and_what_is_kept_of_it_is_not():
     for a, e in zip(ann.keyframes[:30], eve.keyframes[:30], strict=True):
         atlas.add_keyframe("ann", a)
         atlas.add_keyframe("eve", e)
-    chart = atlas._chart
-    chart.rescale("eve", 0.01)
+    chart, agreement = atlas._chart, atlas._parting.agreement
+    agreement.scale["eve"], agreement.widened = 0.01, lambda run: 4.0 if run == "eve" else 1.0
+    atlas._parting._put_right()
     assert atlas.due() == ["eve/0"]
     atlas.add_keyframe("eve", eve.keyframes[30])
     for walker, by in ((ann, 1.0), (eve, np.exp(-0.01))):
@@ -99,11 +101,17 @@ def test_a_chart_is_shortened_and_what_is_kept_of_it_is_not():
             T, told = chart.step(before, number).T_a_b, walker.keyframes[k].T_ref_body
             assert T[:3, 3] == pytest.approx(by * told[:3, 3])
             assert T[:3, :3] == pytest.approx(told[:3, :3])
+            width = 1.0 if walker is ann else 4.0
+            cov = width * believed(MergeConfig(), told, walker.keyframes[k].cov)
+            assert chart.step(before, number).cov == pytest.approx(cov)
     taken = atlas.take_out([chart.trails.number(Key("eve", 5))])[0]
     told = eve.keyframes[5].T_ref_body @ eve.keyframes[6].T_ref_body
     assert taken.link is not None
     assert taken.link.T_ref_body[:3, 3] == pytest.approx(told[:3, 3], abs=1e-4)
-    chart.rescale("eve", 0.0)
+    plain = believed(MergeConfig(), told, eve.keyframes[6].cov)
+    assert np.trace(taken.link.cov) < 3 * np.trace(plain)  # of two steps
+    agreement.scale["eve"] = 0.0
+    atlas._parting._put_right()
     last = [chart.trails.number(Key("eve", k)) for k in (29, 30)]
     assert chart.step(*last).T_a_b[:3, 3] == pytest.approx(eve.keyframes[30].T_ref_body[:3, 3])
 

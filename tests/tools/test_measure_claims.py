@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -55,9 +56,9 @@ def played(tool, seed: int, lie):
 
 def test_a_lie_is_told_of_the_way_the_depths_the_sureness_and_the_camera(tool):
     agent = room(1).agents["eve"]
-    hello, honest = tool.told(agent, tool.Lie())
+    ((hello, honest),) = tool.told(agent, tool.Lie())
     assert (hello.name, hello.run_id) == (agent.hello.name, agent.hello.run_id)
-    turned, seen = tool.told(agent, tool.Lie(path=1.1, depth=0.9, sure=10.0, turn_deg=5.0))
+    ((turned, seen),) = tool.told(agent, tool.Lie(path=1.1, depth=0.9, sure=10.0, turn_deg=5.0))
     apart = se3.angle(se3.inverse(hello.rig.T_body_cam0) @ turned.rig.T_body_cam0)
     assert np.degrees(apart) == pytest.approx(5.0)
     for k, (one, other) in enumerate(zip(honest, seen, strict=True)):
@@ -67,6 +68,21 @@ def test_a_lie_is_told_of_the_way_the_depths_the_sureness_and_the_camera(tool):
         if k:
             assert b.T_last_body[:3, 3] == pytest.approx(1.1 * a.T_last_body[:3, 3])
             assert a.T_odom_body == pytest.approx(agent.T_odom_body[k], abs=1e-9)
+
+
+def test_who_lies_later_or_is_started_again(tool):
+    agent = room(1).agents["eve"]
+    ((_, later),) = tool.told(agent, tool.Lie(depth=1.1, after_s=6.0))
+    ratios = [
+        float(seen.candidate.view.points[0, 0] / keyframe.view.points[0, 0])
+        for seen, keyframe in zip(later, agent.keyframes, strict=True)
+    ]
+    assert ratios == pytest.approx([1.0] * 24 + [1.1] * 24, rel=1e-5)
+    runs = tool.told(agent, tool.Lie(depth=1.1, every_s=2.0))
+    assert len({hello.run_id for hello, _ in runs}) == len(runs) > 1
+    assert len({hello.name for hello, _ in runs}) == 1
+    for (_, before), (_, after) in itertools.pairwise(runs):
+        assert after[0].at_ns - before[-1].at_ns > 3e9
 
 
 def test_a_lie_that_there_is_not_is_said(tool, capsys):

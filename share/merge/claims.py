@@ -1,0 +1,60 @@
+"""How sure agents say they are of their odometry, beside each other.
+
+Nothing shows in loops yet when two maps are joined, and who is surest bends the others. So until loops
+tell, nobody is believed to be much surer than the surest of the others: by variances of its steps over their
+size, in the median, for position and for turn.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection
+
+import numpy as np
+
+from share.geometry import se3
+from share.types import F64
+
+_STEPS = 64  # of each agent: the newest
+_ENOUGH = 8
+_LEEWAY = 2.25  # variance: 1.5 sigma, as honest agents differ by how they move
+_LEVER = 1.0  # m: a turn of 1 rad is a step of this
+
+
+class Claims:
+    """Of agents, by what they say of their steps."""
+
+    def __init__(self) -> None:
+        self._of: dict[str, deque[tuple[float, float]]] = {}
+        self._middle: dict[str, F64] = {}
+        self._out: set[str] = set()
+
+    @property
+    def agents(self) -> set[str]:
+        """Of whom enough is known."""
+        return set(self._middle)
+
+    def add(self, agent: str, T_ref_body: F64, cov: F64) -> bool:
+        """A step (4, 4) and its covariance (6, 6). Whether what it claims is known anew."""
+        size = float(np.linalg.norm(T_ref_body[:3, 3]) + _LEVER * se3.angle(T_ref_body))
+        turn, way = float(np.trace(cov[:3, :3])), float(np.trace(cov[3:, 3:]))
+        if not min(size, turn, way) > 0:
+            return False
+        steps = self._of.setdefault(agent, deque(maxlen=_STEPS))
+        steps.append((np.log(turn / size), np.log(way / size)))
+        if len(steps) < _ENOUGH:
+            return False
+        self._middle[agent] = np.median(np.array(steps), axis=0)
+        return True
+
+    def leave_out(self, agents: Collection[str]) -> None:
+        """Nobody is measured by these, from now on."""
+        self._out = set(agents)
+
+    def least(self, agent: str) -> float:
+        """By what its variances have to be multiplied at least; 1 where it says nothing unusual."""
+        others = [m for name, m in self._middle.items() if name != agent and name not in self._out]
+        if agent not in self._middle or not others:
+            return 1.0
+        surest = np.min(others, axis=0)
+        return max(1.0, float(np.exp((surest - self._middle[agent]).max())) / _LEEWAY)

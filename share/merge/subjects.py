@@ -1,0 +1,83 @@
+"""Whose word a run's is: all runs of one name are one witness, as long as the name is not under suspicion.
+
+So a headset that is restarted before it is found out is found out all the same, with all its runs; a name
+counts once however often it came. A run that comes while its name is under suspicion is a subject of its own,
+for it may have been calibrated anew; it is kept apart until it has been compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+
+
+class Subjects:
+    """Of runs. A subject is called as its first run is; one that nobody announced is its own, of its own
+    name. unproven: subjects that are yet to be compared with others before they come into a map with them."""
+
+    def __init__(self) -> None:
+        self.unproven: set[str] = set()
+        self._of: dict[str, str] = {}
+        self._names: dict[str, str] = {}
+        self._runs: dict[str, list[str]] = {}
+        self._newest: dict[str, str] = {}  # of each name
+
+    def enter(self, run: str, name: str, suspects: Iterable[str]) -> None:
+        """A run of this name; suspects: subjects that are. What is known already changes nothing."""
+        if run in self._of:
+            return
+        before = self._newest.get(name)
+        if before is not None and before not in self.unproven.union(suspects):
+            self._add(run, before)
+            return
+        self._names[run] = name
+        self._newest[name] = run
+        self._add(run, run)
+        if before is not None:
+            self.unproven.add(run)
+
+    def doubt(self, runs: Collection[str]) -> None:
+        """Of an earlier life, of which nothing else is known: those of each name are a subject, unproven."""
+        for run in runs:
+            self.enter(run, run, ())
+        known = [(run, self.name(run)) for run in self._of]
+        self._of, self._names, self._runs, self._newest = {}, {}, {}, {}
+        firsts: dict[tuple[str, bool], str] = {}
+        for run, name in known:
+            first = firsts.setdefault((name, run in runs), run)
+            self._names[first], self._newest[name] = name, first
+            self._add(run, first)
+        self.unproven = {first for (_, doubted), first in firsts.items() if doubted}
+
+    def _add(self, run: str, subject: str) -> None:
+        self._of[run] = subject
+        runs = self._runs.setdefault(subject, [])
+        if run not in runs:
+            runs.append(run)
+
+    def forget(self, run: str) -> None:
+        """A run that will not come back. What is known of its name stays, with its newest run."""
+        runs = self._runs.get(self.of(run), [])
+        if len(runs) > 1 and run in runs:
+            runs.remove(run)
+            del self._of[run]
+
+    def of(self, run: str) -> str:
+        return self._of.get(run, run)
+
+    def name(self, run: str) -> str:
+        """Of a run, or of a subject."""
+        subject = self.of(run)
+        return self._names.get(subject, subject)
+
+    def newest(self, subject: str) -> str:
+        """Its newest run."""
+        return self._runs.get(subject, [subject])[-1]
+
+    def has_earlier(self, run: str) -> bool:
+        """Whether another subject of its name came before."""
+        return self.follows(run, self._names)
+
+    def follows(self, run: str, some: Iterable[str]) -> bool:
+        """Whether one of these is another subject of its name."""
+        subject, name = self.of(run), self.name(run)
+        return any(other != subject and self._names.get(other) == name for other in some)

@@ -1,0 +1,127 @@
+"""How much too sure agents are of their odometry, as the loops between them tell.
+
+With the loops' equations (`share.merge.consistency`) and f_a, f_b, g the factors by which the variances of
+either walk and of the loops are really larger than claimed,
+
+    cov(xi) = f_a W_a + f_b W_b + g S,    xi = J G + noise,
+
+which is a model of variance components. With P the inverse covariance that leaves no G, and y = xi,
+
+    q_k = y' P V_k P y,    F_kl = tr(P V_k P V_l),    E q = F (f_a, f_b, g)
+
+whatever factors P was made with, so what all pairs say simply adds up; at the solution it is restricted
+maximum likelihood. F is in units of degrees of freedom over f^2, so a prior of n degrees of freedom is n more
+of them: of few loops the factors are as before any, 1, or above where an agent claims to be much surer than
+any other (`Claims`). Nobody is believed to be less sure than it says.
+Source: C. R. Rao, *Estimation of variance and covariance components: MINQUE theory*, J. Multivariate Analysis
+1, 1971; Patterson and Thompson, *Biometrika* 58, 1971.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.merge.claims import Claims
+from share.merge.consistency import Equations
+from share.types import F64, I64
+
+_FITS = 0.4  # weight that a loop must have: what is false says nothing of odometry
+_ENOUGH = 8  # such loops
+_PRIOR_DOF = 4.0  # of an agent
+_LOOP_PRIOR, _LOOP_DOF = 1.7, 12.0  # honest loops are a little too sure, see `consistency`
+_LEAST, _MOST = 0.25, 1e4
+_TELLS, _CHANGES = 2.0, 1.25  # variance from which on it is taken into account; by what part it has to change
+
+Meeting = tuple[int, int]  # two stretches
+
+
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """By loops of two stretches, of agents a and b: q (3,), F (3, 3), of either walk and of the loops, made
+    with these factors (3,)."""
+
+    agents: tuple[str, str]
+    q: F64
+    F: F64
+    factors: F64
+
+
+class Sureness:
+    """factor: of each agent's variances of odometry; 1 where it is not there."""
+
+    def __init__(self, claims: Claims) -> None:
+        self.factor: dict[str, float] = {}
+        self._claims = claims
+        self._now: dict[str, float] = {}  # as estimated
+        self._loops: dict[Meeting, float] = {}
+        self._told: dict[Meeting, _Told] = {}
+
+    def claimed(self, agent: str, T_ref_body: F64, cov: F64) -> None:
+        """A step (4, 4) of its odometry, with its covariance (6, 6)."""
+        if self._claims.add(agent, T_ref_body, cov):
+            self._settle()
+
+    def take(self, meeting: Meeting, agents: tuple[str, str], e: Equations, weight: F64) -> None:
+        """What loops of two stretches say by now, of weight (N,) each; it takes the place of what they said
+        before. Raises LinAlgError where absurd numbers leave no solution."""
+        fits = np.flatnonzero(weight > _FITS)
+        if len(fits) < _ENOUGH:
+            self._told.pop(meeting, None)
+            return
+        now = [self._now.get(agent, self._claims.least(agent)) for agent in agents]
+        factors = np.array([*now, self._loops.get(meeting, _LOOP_PRIOR)])
+        self._told[meeting] = _Told(agents, *_components(e, fits, factors), factors)
+        self._settle()
+
+    def leave(self, meetings: Iterable[Meeting]) -> None:
+        """What these loops say is of two worlds."""
+        for meeting in meetings:
+            self._told.pop(meeting, None)
+
+    def forget(self, agents: Collection[str]) -> None:
+        """What these and others say of each other is of two worlds; nobody is measured by what they claim."""
+        self.leave([meeting for meeting, told in self._told.items() if set(told.agents) & set(agents)])
+        self._claims.leave_out(agents)
+
+    def _settle(self) -> None:
+        agents = sorted({name for told in self._told.values() for name in told.agents} | self._claims.agents)
+        at, n = {name: i for i, name in enumerate(agents)}, len(agents)
+        size = n + len(self._told)
+        q, F, made_with = np.zeros(size), np.zeros((size, size)), np.full(size, _MOST)
+        for row, told in enumerate(self._told.values(), start=n):
+            where = [at[name] for name in told.agents] + [row]
+            q[where] += told.q
+            F[np.ix_(where, where)] += told.F
+            made_with[where] = np.minimum(made_with[where], told.factors)
+        least = np.array([self._claims.least(name) for name in agents])
+        prior = np.append(least, np.full(len(self._told), _LOOP_PRIOR))
+        dof = np.append(np.full(n, _PRIOR_DOF), np.full(len(self._told), _LOOP_DOF))
+        sure = dof / np.where(made_with < _MOST, made_with, prior) ** 2
+        found = np.linalg.solve(F + np.diag(sure), q + sure * prior).clip(_LEAST, _MOST)
+        self._loops = dict(zip(self._told, found[n:].tolist(), strict=True))
+        self._now = dict(zip(agents, found[:n].tolist(), strict=True))
+        for name in agents:
+            self._tell(name, self._now[name])
+
+    def _tell(self, name: str, now: float) -> None:
+        was, now = self.factor.get(name, 1.0), now if now > _TELLS else 1.0
+        if max(now / was, was / now) > _CHANGES:
+            self.factor[name] = now
+
+
+def _components(e: Equations, fits: I64, factors: F64) -> tuple[F64, F64]:
+    n = len(fits)
+    own = np.zeros((n, 6, n, 6))
+    own[range(n), :, range(n)] = e.own[fits]
+    among = np.ix_(fits, np.arange(6), fits, np.arange(6))
+    parts = [V.reshape(6 * n, 6 * n) for V in (e.walk_a[among], e.walk_b[among], own)]
+    J, y = e.J[fits][:, :, :6].reshape(6 * n, 6), e.xi[fits].ravel()
+    inverse = np.linalg.inv(sum(f * V for f, V in zip(factors, parts, strict=True)))
+    IJ = inverse @ J
+    P = inverse - IJ @ np.linalg.solve(J.T @ IJ, IJ.T)
+    Py, PV = P @ y, [P @ V for V in parts]
+    q = np.array([float(Py @ V @ Py) for V in parts])
+    return q, np.array([[float((A * B.T).sum()) for B in PV] for A in PV])

@@ -1,0 +1,200 @@
+"""What is known of a name holds for all its runs, and a name counts once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from atlas_sim import Walker, near_loops
+
+from share.config import MergeConfig
+from share.geometry import se3
+from share.graph.posegraph import Edge
+from share.merge.agreement import Agreement
+from share.merge.atlas import Atlas
+from share.merge.subjects import Subjects
+from share.place.scale import Scale
+
+STEP = np.diag([2e-4**2] * 3 + [2e-3**2] * 3)
+LOOP = np.diag([4e-3**2] * 3 + [0.02**2] * 3)
+SIGMA = 0.004
+
+
+class Town:
+    """Runs that meet at one spot, one after the other."""
+
+    def __init__(self) -> None:
+        self.agreement, self.rng = Agreement(0.015), np.random.default_rng(3)
+        self.numbers: dict[str, int] = {}
+
+    def enter(self, run: str) -> None:
+        """`eve-1` is a run of eve."""
+        self.agreement.enter(run, run.partition("-")[0])
+        self.numbers[run] = first = 1000 * len(self.numbers)
+        step = se3.exp(np.array([0, 0, 0, 0.3, 0, 0]))
+        for k in range(12):
+            self.agreement.walk(run, first + k, first + k - 1 if k else None, step, STEP)
+
+    def meet(self, a: str, b: str, scale: float, times: int = 1) -> None:
+        """b's depths over a's."""
+        for _ in range(times):
+            k = int(self.rng.integers(12))
+            ends = self.numbers[a], self.numbers[b]
+            log = np.log(scale) + SIGMA * self.rng.standard_normal()
+            edge = Edge(ends[0] + k, ends[1] + k, np.eye(4), LOOP)
+            self.agreement.witness((a, b), ends, edge, Scale(log, SIGMA), None)
+
+
+def test_who_is_restarted_before_it_is_found_out_is_found_out_by_all_its_runs():
+    """Two loops with each of two others in each run: never enough of one run."""
+    town = Town()
+    for run in ("ann-1", "bob-1"):
+        town.enter(run)
+    town.meet("ann-1", "bob-1", 1.0, 6)
+    for n in range(1, 4):
+        town.enter(f"eve-{n}")
+        for _ in range(2):
+            for other in ("ann-1", "bob-1"):
+                town.meet(other, f"eve-{n}", 1.05)
+    for n in range(1, 4):
+        assert town.agreement.forbids(["ann-1"], [f"eve-{n}"]) or town.agreement.yet_to_compare(
+            ["ann-1"], [f"eve-{n}"]
+        )
+    assert town.agreement.standing("eve-1").state == "set apart"
+    assert not town.agreement.forbids(["ann-1"], ["bob-1"])
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.05])
+def test_a_run_of_a_name_that_was_set_apart_is_compared_before_it_comes_in(scale):
+    town = Town()
+    for run in ("ann-1", "bob-1", "eve-1"):
+        town.enter(run)
+    town.meet("ann-1", "bob-1", 1.0, 6)
+    for other in ("ann-1", "bob-1"):
+        town.meet(other, "eve-1", 1.05, 4)
+    assert town.agreement.standing("eve-1").state == "set apart"
+    town.enter("eve-2")
+    assert "earlier run" in town.agreement.standing("eve-2").reason
+    assert "earlier run" in town.agreement.yet_to_compare(["ann-1"], ["eve-2"])
+    assert not town.agreement.yet_to_compare(["eve-2"], ["eve-2"])  # its own stretches
+    for _ in range(10):
+        for other in ("ann-1", "bob-1"):
+            town.meet(other, "eve-2", scale)
+    standing, honest = town.agreement.standing("eve-2"), town.agreement.standing("bob-1")
+    assert honest.state == "agrees"
+    assert town.agreement.standing("eve-1").state == "set apart"
+    if scale == 1.0:
+        assert standing.state == "agrees"
+        assert not town.agreement.yet_to_compare(["ann-1"], ["eve-2"])
+        assert not town.agreement.forbids(["ann-1"], ["eve-2"])
+    else:
+        assert standing.state == "set apart"
+        assert town.agreement.forbids(["ann-1"], ["eve-2"])
+
+
+def test_who_was_set_apart_before_is_wrong_again_where_only_one_can_say_so():
+    town = Town()
+    for run in ("ann-1", "bob-1", "eve-1"):
+        town.enter(run)
+    town.meet("ann-1", "bob-1", 1.0, 6)
+    for other in ("ann-1", "bob-1"):
+        town.meet(other, "eve-1", 1.05, 4)
+    town.enter("eve-2")
+    town.meet("bob-1", "eve-2", 1.05, 5)
+    assert town.agreement.standing("eve-2").state == "set apart"
+    assert town.agreement.standing("bob-1").state == "agrees"
+
+
+def test_many_runs_of_one_name_are_one_voice():
+    town = Town()
+    town.enter("ann-1")
+    for n in range(1, 5):
+        town.enter(f"eve-{n}")
+        town.meet("ann-1", f"eve-{n}", 1.05, 8)
+    assert town.agreement.standing("ann-1").state == "disputed"
+    assert not town.agreement.apart
+
+
+def test_what_is_known_of_a_names_scale_holds_for_its_next_run():
+    town = Town()
+    for run in ("ann-1", "bob-1", "eve-1"):
+        town.enter(run)
+    for _ in range(12):
+        for a, b, scale in (("ann-1", "bob-1", 1.0), ("bob-1", "eve-1", 0.99), ("ann-1", "eve-1", 0.99)):
+            town.meet(a, b, scale)
+    town.enter("eve-2")
+    assert town.agreement.scale_of("eve-2") == town.agreement.scale_of("eve-1")
+    assert town.agreement.scale_of("eve-2") == pytest.approx(np.log(0.99), abs=0.004)
+
+
+def test_who_turns_bad_is_found_out_by_its_newest_loops():
+    """After thirty with each other that were good; it took as many bad ones."""
+    town = Town()
+    for run in ("ann-1", "bob-1", "eve-1"):
+        town.enter(run)
+    for _ in range(30):
+        for a, b in (("ann-1", "bob-1"), ("ann-1", "eve-1"), ("bob-1", "eve-1")):
+            town.meet(a, b, 1.0)
+    assert town.agreement.standing("eve-1").state == "agrees"
+    loops = 0
+    while town.agreement.standing("eve-1").state != "set apart" and loops < 40:
+        loops += 1
+        for other in ("ann-1", "bob-1"):
+            town.meet(other, "eve-1", 1.05)
+    assert loops <= 12
+    assert not town.agreement.forbids(["ann-1"], ["bob-1"])
+
+
+def test_runs_of_an_earlier_life_that_were_outside_are_a_subject_of_their_own():
+    subjects = Subjects()
+    for run, name in (("eve-1", "eve"), ("eve-2", "eve"), ("ann-1", "ann"), ("eve-3", "eve")):
+        subjects.enter(run, name, ())
+    subjects.doubt({"eve-1", "eve-3"})
+    assert subjects.of("eve-3") == subjects.of("eve-1") != subjects.of("eve-2")
+    assert subjects.unproven == {subjects.of("eve-1")}
+    assert subjects.name("eve-2") == subjects.name("eve-3") == "eve"
+    subjects.enter("eve-4", "eve", ())
+    assert "eve-4" in subjects.unproven
+
+
+def test_loops_of_a_restarted_suspect_are_not_believed_before_it_is_compared():
+    """Through the atlas: what the newest run of a name that was set apart says moves nobody."""
+    ann, bob = Walker("ann", 1), Walker("bob", 2, phase=0.3)
+    first, second = Walker("eve-1", 3, phase=0.7), Walker("eve-2", 4, phase=0.7)
+    atlas, rng = Atlas(MergeConfig()), np.random.default_rng(0)
+    for walker in (ann, bob, first):
+        atlas.enter(walker.name, walker.name.partition("-")[0])
+        for keyframe in walker.keyframes:
+            atlas.add_keyframe(walker.name, keyframe)
+    for a, b, log in ((ann, bob, 0.0), (ann, first, 0.05), (bob, first, 0.05)):
+        for loop in near_loops(a, b, rng):
+            atlas.witness(loop, Scale(log, 0.005))
+    assert atlas.standing("eve-1").state == "set apart"
+    atlas.enter("eve-2", "eve")
+    for keyframe in second.keyframes:
+        atlas.add_keyframe("eve-2", keyframe)
+    said = [atlas.propose(loop) for loop in near_loops(ann, second, rng)[:6]]
+    assert not any(decision.accepted for decision in said)
+    assert all("an earlier run of its name" in decision.reason for decision in said)
+
+
+def test_who_is_set_apart_is_no_measure_of_the_others_scale():
+    """Ann and bob have met only eve, whose depths became wrong: nothing says how theirs compare."""
+    town = Town()
+    for run in ("ann-1", "bob-1", "eve-1"):
+        town.enter(run)
+    town.meet("ann-1", "eve-1", 1.05, 30)
+    town.meet("bob-1", "eve-1", 1.0, 10)
+    town.meet("bob-1", "eve-1", 1.05, 30)
+    assert town.agreement.standing("eve-1").state == "set apart"
+    assert town.agreement.scale_of("ann-1") == town.agreement.scale_of("bob-1") == 0.0
+
+
+def test_a_run_that_is_forgotten_takes_nothing_of_its_name_with_it():
+    subjects = Subjects()
+    for number in range(1, 4):
+        subjects.enter(f"eve-{number}", "eve", ())
+    for number in (1, 2, 3):
+        subjects.forget(f"eve-{number}")
+    subjects.enter("eve-4", "eve", ())
+    assert subjects.of("eve-4") == "eve-1"
+    assert (subjects.name("eve-1"), subjects.newest("eve-1")) == ("eve", "eve-4")

@@ -1,0 +1,97 @@
+"""How much too sure an agent is shows in the loops; honest agents stay as they are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_agent_consistency import FRAMES, LOOP_COV, STEP_COV, chain, ring, steps_of
+
+from share.geometry import se3
+from share.merge.claims import Claims
+from share.merge.consistency import Witness, equations, points_scale, solved
+from share.merge.sureness import Sureness
+from share.place.scale import Scale
+
+MOVED = se3.exp(np.array([0, 0, 0.05, 0.3, 0, 0]))
+WALKERS = {"ann": 0.0, "bob": 0.7, "eve": 1.4}
+DRIFT = 4.0  # by what all odometry is worse than STEP_COV, so that it shows beside the loops' noise
+
+
+def factors(seed: int, sure: float, rounds: int = 8) -> dict[str, float]:
+    """Of three agents that have gone round a room, of whom eve's sigmas are so many times too small."""
+    rng, paths, walked = np.random.default_rng(seed), {}, {}
+    for name, phase in WALKERS.items():
+        paths[name] = ring(phase)
+        told = DRIFT**2 / (sure**2 if name == "eve" else 1.0)
+        walked[name] = chain(steps_of(paths[name], rng, drift=DRIFT), told)
+    claims = claimed({name: 1 / sure if name == "eve" else 1.0 for name in WALKERS})
+    sureness, met = Sureness(claims), {}
+    for n, (a, b) in enumerate((("ann", "bob"), ("ann", "eve"), ("bob", "eve"))):
+        loops = []
+        for j in range(4, FRAMES, 2):
+            i = min(FRAMES - 1, j + 7)
+            noise = se3.exp(np.sqrt(np.diag(LOOP_COV)) * rng.standard_normal(6))
+            T = se3.orthonormal(se3.inverse(paths[a][i]) @ paths[b][j] @ noise)
+            loops.append(Witness(walked[a][i], walked[b][j], T, LOOP_COV))
+        met[(n, n + 1)] = (a, b), equations(loops)
+    for _ in range(rounds):
+        for meeting, (agents, told) in met.items():
+            sureness.take(meeting, agents, told, solved(told).weight)
+    return {name: sureness.factor.get(name, 1.0) for name in WALKERS}
+
+
+@pytest.mark.parametrize("sure", [3.0, 10.0])
+def test_who_is_too_sure_is_widened_and_nobody_else(sure):
+    found = np.array([list(factors(seed, sure).values()) for seed in range(2)])
+    assert found[:, 2] == pytest.approx(sure**2, rel=0.6)
+    assert found[:, :2].max() < 2.5
+
+
+def test_honest_agents_are_not_widened():
+    found = [factors(seed, 1.0, rounds=3) for seed in range(3)]
+    assert max(max(one.values()) for one in found) < 1.6
+
+
+def test_few_loops_say_nothing():
+    sureness = Sureness(Claims())
+    rng = np.random.default_rng(0)
+    x, y = ring(0.0), ring(0.7)
+    a, b = chain(steps_of(x, rng, drift=10.0)), chain(steps_of(y, rng, drift=10.0))
+    loops = [Witness(a[j + 7], b[j], se3.inverse(x[j + 7]) @ y[j], LOOP_COV) for j in range(7)]
+    told = equations(loops)
+    sureness.take((0, 1), ("ann", "bob"), told, solved(told).weight)
+    assert sureness.factor == {}
+
+
+def claimed(sigmas: dict[str, float]) -> Claims:
+    claims = Claims()
+    for name, sigma in sigmas.items():
+        for _ in range(10):
+            claims.add(name, MOVED, sigma**2 * STEP_COV)
+    return claims
+
+
+def test_until_loops_tell_nobody_is_much_surer_than_the_surest_of_the_others():
+    claims = claimed({"ann": 1.0, "bob": 3.0, "eve": 0.1})
+    assert claims.least("ann") == claims.least("bob") == 1.0
+    assert claims.least("eve") == pytest.approx(100 / 2.25)
+    claims.leave_out(["ann"])
+    assert claims.least("eve") == pytest.approx(900 / 2.25)
+
+
+def test_honest_agents_may_differ():
+    claims = claimed({"ann": 1.0, "bob": 1.4, "eve": 0.7})
+    assert all(claims.least(name) == 1.0 for name in ("ann", "bob", "eve"))
+
+
+def test_who_is_alone_is_measured_by_nobody():
+    assert claimed({"eve": 0.01}).least("eve") == 1.0
+
+
+def test_depths_that_are_spread_say_so():
+    """Each loop says 0.5 %, and they differ by 10: the mean is not known to 0.5."""
+    rng = np.random.default_rng(4)
+    logs = 0.4 + 0.1 * rng.standard_normal((200, 12))
+    found = [points_scale([Scale(log, 0.005) for log in one]) for one in logs]
+    off = np.array([(one.value - 0.4) / one.sigma for one in found])
+    assert 0.6 < np.sqrt((off**2).mean()) < 1.7
