@@ -305,8 +305,8 @@ class Mapper:
 
     def _parted(self, parted: Parted) -> list[Finding]:
         """Who disagrees with the others since now, or no longer."""
-        self._changes += [DropLoop(loop.a, loop.b) for loop in parted.dropped]
-        self._changes += [KeepLoop(loop) for loop in parted.tied]
+        gone = (DropLoop(loop.a, loop.b) for loop in parted.dropped)
+        self._changes += [*gone, *map(KeepLoop, parted.tied)]
         return [
             Finding(who, now.state, now.reason)
             if now.state in ("set apart", "disputed")

@@ -7,6 +7,7 @@ new, `apply` takes the solution in.
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -94,10 +95,9 @@ class Atlas:
 
     def sizes(self) -> dict[str, int]:
         """How many keyframes each map has."""
-        out: dict[str, int] = {}
+        out = Counter[str]()
         for stretch in sorted(self._chart.trails.live):
-            name = self._chart.name(stretch)
-            out[name] = out.get(name, 0) + len(self._chart.trails.stretches[stretch].nodes)
+            out[self._chart.name(stretch)] += len(self._chart.trails.stretches[stretch].nodes)
         return out
 
     def T_map_odom(self, agent: str) -> F64 | None:
