@@ -15,16 +15,27 @@ _HZ, _BURST = 10.0 * _KEYFRAME, 700.0 * _KEYFRAME
 _SAID = f"keyframes come with more than {_HZ / _KEYFRAME * 500:.0f} keypoints a second: the rest waits"
 
 
-class Allowance:
-    """Of each name."""
+_SLACK, _AT_ONCE = 1.2, 10.0  # rates arrive a little uneven
 
-    def __init__(self) -> None:
+
+class Allowance:
+    """Of each name. most_hz: keyframes a second that an agent may send; None: any number."""
+
+    def __init__(self, most_hz: float | None) -> None:
+        self._most_hz = None if most_hz is None else _SLACK * most_hz
         self._of_name: dict[str, TokenBucket] = {}
+        self._asked: dict[str, TokenBucket] = {}
 
     def objection(self, name: str, keyframe: Keyframe, now_ns: int) -> str | None:
         """Why this keyframe is not taken in now; None: it is, and counts."""
         if name not in self._of_name:
             self._of_name = {who: kept for who, kept in self._of_name.items() if not kept.is_full(now_ns)}
             self._of_name[name] = TokenBucket(_BURST, _HZ)
+            self._asked = {who: self._asked[who] for who in self._of_name if who in self._asked}
         cost = len(keyframe.view.uv) + _BARE
         return None if self._of_name[name].take(now_ns, cost=cost) else _SAID
+
+    def is_extra(self, name: str, now_ns: int) -> bool:
+        """Whether this keyframe, which is taken in, is more than its agent was ever asked for."""
+        asked = self._asked.setdefault(name, TokenBucket(_AT_ONCE, self._most_hz))
+        return not asked.take(now_ns)

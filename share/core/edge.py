@@ -56,7 +56,7 @@ class Edge:
         self._strangers: Counter[str] = Counter()
         self._strangers_refused = Refusals()
         self._admission = Admission(config.edge, self.tracks)
-        self._allowance = Allowance()
+        self._allowance = Allowance(self._schedule.most_hz)
         self._records, self._versions = Records(began_ns), OtherVersions()
         self._internal_errors = 0
         self._safekeeping = Safekeeping(keeps)
@@ -296,7 +296,8 @@ class Edge:
         assert peer.foot is not None
         run = (KeepRun(peer.key, peer.hello),) if begins else ()  # no run without a keyframe is kept
         self._keep(*run, KeepKeyframe(peer.key, keyframe))
-        self._effects.append(ed.Add(peer.key, keyframe))
+        extra = self._allowance.is_extra(peer.hello.name, now_ns)
+        self._effects.append(ed.Add(peer.key, keyframe, extra))
 
     def _keep(self, *changes: Change) -> None:
         if (keep := self._safekeeping.keep(changes)) is not None:

@@ -100,10 +100,12 @@ class Join:
 
 @dataclass(frozen=True)
 class Add:
-    """To the mapper: the next keyframe of a run, each once and in order."""
+    """To the mapper: the next keyframe of a run, each once and in order. is_extra: more than its agent may
+    send; it is looked up only when nothing else waits, and maps may be joined by it."""
 
     key: str
     keyframe: Keyframe
+    is_extra: bool = False
 
 
 @dataclass(frozen=True)

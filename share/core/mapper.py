@@ -107,14 +107,14 @@ class Mapper:
         self._closed.loops_tried += closed.loops_tried
         self._closed.merges += closed.merges
 
-    def add(self, agent: str, keyframe: Keyframe) -> list[Finding]:
-        """A keyframe, in order, each once."""
+    def add(self, agent: str, keyframe: Keyframe, is_extra: bool = False) -> list[Finding]:
+        """A keyframe, in order, each once. is_extra: see `Add`."""
         self._accounts[agent].newest = keyframe.id
         keyframe, link = self._atlas.tied(agent, keyframe)
         self._changes += [] if link is None else [kept_link(link)]
         number = self._atlas.add_keyframe(agent, keyframe, rank=self._rank(agent))
         self._see(number, agent, keyframe)
-        self._lookups.add(agent, served_as(self._config, self._hellos[agent]), number)
+        self._lookups.add(agent, served_as(self._config, self._hellos[agent]), number, is_extra)
         findings = [] if keyframe.reference >= 0 else [self._founding(agent, keyframe)]
         self._thin()
         return findings
