@@ -12,6 +12,7 @@ from share.types import Keyframe
 _BARE = 250
 _KEYFRAME = 500 + _BARE
 _HZ, _BURST = 10.0 * _KEYFRAME, 700.0 * _KEYFRAME
+_FOUNDING = 20  # times: what begins a stretch of odometry stays in the mapper for as long as it runs
 _SAID = f"keyframes come with more than {_HZ / _KEYFRAME * 500:.0f} keypoints a second: the rest waits"
 
 
@@ -32,7 +33,7 @@ class Allowance:
             self._of_name = {who: kept for who, kept in self._of_name.items() if not kept.is_full(now_ns)}
             self._of_name[name] = TokenBucket(_BURST, _HZ)
             self._asked = {who: self._asked[who] for who in self._of_name if who in self._asked}
-        cost = len(keyframe.view.uv) + _BARE
+        cost = (len(keyframe.view.uv) + _BARE) * (1 if keyframe.reference >= 0 else _FOUNDING)
         return None if self._of_name[name].take(now_ns, cost=cost) else _SAID
 
     def is_extra(self, name: str, now_ns: int) -> bool:

@@ -185,6 +185,7 @@ class Edge:
     def _come_back(self, peer: Peer, now_ns: int) -> None:
         self._supersede(peer.hello.name, now_ns)
         peer.gone = False
+        self._runs.came_back(peer)
         self._effects.append(ed.Present(peer.key, True))
         self._record_seldom(now_ns, "back", peer, "is heard again")
 
@@ -201,6 +202,7 @@ class Edge:
 
     def _gone(self, peer: Peer, what: str, reason: str, now_ns: int) -> None:
         peer.gone = True
+        peer.inorder.drop_waiting()
         self._effects.append(ed.Present(peer.key, False))
         self._record_seldom(now_ns, what, peer, reason)
 
@@ -270,7 +272,7 @@ class Edge:
 
     def _in_order(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> list[Keyframe]:
         """What can be applied now; nothing of an agent that sends more than is taken in."""
-        if keyframe.id >= peer.inorder.next_keyframe:  # else it costs nothing
+        if peer.inorder.is_new(keyframe.id):  # else it costs nothing
             name = peer.hello.name
             reason = peer.too_many() or self._allowance.objection(name, keyframe, now_ns)
             if reason is not None:

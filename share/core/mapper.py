@@ -133,6 +133,10 @@ class Mapper:
         placed = [placed_again(found, kept.links) for found in kept.keyframes]
         numbers = self._atlas.restore(stretches, placed, kept.loops, poses)
         self._unseen = list(zip(numbers, kept.keyframes, strict=True))
+        for found in kept.keyframes:
+            account = self._accounts.get(found.key)  # a damaged file may have lost its run
+            if account is not None:
+                account.newest = max(account.newest, found.keyframe.id)
 
     def _see_restored(self) -> None:
         for number, found in self._unseen:

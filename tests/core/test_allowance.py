@@ -31,14 +31,14 @@ def keyframe(id: int, points: int) -> Keyframe:
 
 def taken_in(allowance: Allowance, points: int, hz: float, seconds: float, name: str = "eve") -> int:
     times = (round(k * S / hz) for k in range(int(seconds * hz)))
-    one = keyframe(0, points)
+    one = keyframe(1, points)
     return sum(allowance.objection(name, one, at_ns) is None for at_ns in times)
 
 
 def test_an_honest_agent_is_never_held_back() -> None:
     """Its whole ledger at once, and from then on as many as control.rate_max_hz allows."""
     config = Config()
-    allowance, one = Allowance(5.0), keyframe(0, config.tracker.view_features)
+    allowance, one = Allowance(5.0), keyframe(1, config.tracker.view_features)
     burst = [allowance.objection("ann", one, 0) for _ in range(config.agent.keep_keyframes)]
     assert not any(burst)
     hz = config.control.rate_max_hz
@@ -136,3 +136,12 @@ def test_the_edge_says_which_keyframes_are_extra(policy: str, some: bool) -> Non
     extra = [effect.is_extra for effect in effects if isinstance(effect, Add)]
     assert len(extra) == 100
     assert (sum(extra) > 60) is some
+
+
+def test_a_copy_of_a_keyframe_that_waits_costs_nothing() -> None:
+    edge = Edge(Config(), 8)
+    edge.handle(Received(m.peer_id(1), encode(hello_of("eve", 1))), 0)
+    for _ in range(1000):  # keyframe 0 has not come yet; each would cost 2,250
+        edge.handle(Received(m.peer_id(1), encode(keyframe(1, 2000))), 0)
+    effects = edge.handle(Received(m.peer_id(1), encode(keyframe(0, 2000))), 0)
+    assert [effect.keyframe.id for effect in effects if isinstance(effect, Add)] == [0, 1]

@@ -212,3 +212,59 @@ def test_runs_that_never_sent_a_keyframe_leave_the_mapper_too(tmp_path: Path) ->
         for k in range(300):
             life.run(f"n{k}", 1000 + k, 0)
         assert len(life.mapper.report()["agents"]) <= 258
+
+
+def test_a_restored_run_that_is_emptied_is_forgotten_in_this_life(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = Life(store)
+        life.run("ann", 1, 30, stays=True)
+        life.run("eve", 100, 5)
+        life.run("eve", 101, 3)
+        life = Life(store, session=8)
+        for k in range(12):
+            life.run("eve", 300 + k, 8)
+        report = life.edge.report(life.mapper.report())
+        held = {key.agent for key in life.mapper.poses().keys}
+        kept = store.load()
+    assert {run.key for run in kept.runs} == {agent["run"] for agent in report["agents"].values()}
+    assert {run.key for run in kept.runs} - held <= {f"ann-{m.public_tag(1)[:4]}"}
+
+
+def emptied(life: Life, run_id: int) -> None:
+    """All keyframes of a run of eve are taken out."""
+    atlas, run = life.mapper._atlas, f"eve-{m.public_tag(run_id)[:4]}"
+    life.mapper._leaving = [n for n in atlas._chart.poses if atlas.key(n).agent == run]
+    while life.mapper._leaving:
+        life.mapper._thin()
+    for _ in range(2):
+        life.handle(ed.Tick())
+
+
+def test_a_run_that_came_back_is_its_names_present_one_and_stays_so(tmp_path: Path) -> None:
+    """When the later run of the name is forgotten: the edge ended (KeyError)."""
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = Life(store)
+        life.run("ann", 1, 30, stays=True)
+        life.run("eve", 100, 5)
+        life.run("eve", 101, 3)
+        life.tell(100, hello_of("eve", 100))
+        emptied(life, 101)
+        report = life.edge.report(life.mapper.report())
+    assert report["agents"]["eve"]["run"] == f"eve-{m.public_tag(100)[:4]}"
+    assert report["forgotten_runs"] == 1
+
+
+def test_of_a_name_whose_newest_run_is_forgotten_the_one_before_it_is_shown(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = Life(store)
+        life.run("ann", 1, 30, stays=True)
+        life.run("eve", 100, 5)
+        life.tell(101, hello_of("eve", 101))
+        for k in range(256):  # which have no keyframe either, so the oldest of all is forgotten
+            life.tell(1000 + k, hello_of(f"n{k}", 1000 + k))
+            life.tell(1000 + k, m.Bye())
+            life.now_ns += 10 * S
+            life.tell(1, m.Ping(0, 0))
+            life.handle(ed.Tick())
+        report = life.edge.report(life.mapper.report())
+    assert report["agents"]["eve"]["run"] == f"eve-{m.public_tag(100)[:4]}"

@@ -193,7 +193,18 @@ def test_where_there_is_no_other_way_the_newest_of_those_who_are_away_go_too() -
         walk(atlas, f"n{k}-1", f"n{k}", 12)
         atlas.present(f"n{k}-1", False)
     thin(atlas, 47)
-    assert held(atlas) == Counter({"ann-1": 11} | {f"n{k}-1": 4 for k in range(9)})
+    assert held(atlas) == Counter({"ann-1": 12, "n0-1": 3} | {f"n{k}-1": 4 for k in range(1, 9)})
+
+
+def test_any_number_of_names_that_come_and_go_leaves_its_share_to_one_that_is_heard() -> None:
+    atlas = Atlas(CONFIG)
+    walk(atlas, "ann-1", "ann", 100)
+    for k in range(100):
+        walk(atlas, f"n{k}-1", f"n{k}", 12)
+        atlas.present(f"n{k}-1", False)
+        thin(atlas, 120)
+        assert len(atlas) <= 120
+    assert held(atlas)["ann-1"] == 60
 
 
 def test_a_stretch_that_holds_two_others_together_is_not_forgotten() -> None:
