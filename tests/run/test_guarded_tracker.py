@@ -67,7 +67,7 @@ def test_one_that_fails_twice_begins_anew(walk: rig_fuzzer.Walk) -> None:
     tracker = GuardedTracker(RIG, Config(), guard)
 
     class Broken:
-        doubted = 0
+        doubted = 7
 
         def track(self, frame: object) -> TrackResult:
             raise FloatingPointError
@@ -80,6 +80,7 @@ def test_one_that_fails_twice_begins_anew(walk: rig_fuzzer.Walk) -> None:
     results = [tracker.track(frame) for frame in walk.frames[:4]]
     assert [result.state for result in results[:1]] == [TrackState.LOST]
     assert results[-1].state is TrackState.OK and guard.failed == 2
+    assert tracker.doubted == 7  # by the first
 
 
 def test_a_keyframe_that_fails_is_none(walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch) -> None:
