@@ -155,7 +155,7 @@ class Atlas:
 
     def is_forgotten(self, agent: str) -> bool:
         """Whether it is not heard, and nothing of it is left."""
-        return self._owners.is_absent(agent) and self._chart.trails.newest(agent) is None
+        return self._owners.is_absent(agent) and not self._chart.trails.has_any(agent)
 
     def forget(self, agent: str) -> None:
         """A run of which nothing is left will not come back."""
