@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,6 +20,7 @@ from share.graph.posegraph import Edge
 from share.merge.claims import Claims
 from share.merge.consistency import (
     Comparison,
+    Equations,
     Estimate,
     Walked,
     Witness,
@@ -27,6 +29,7 @@ from share.merge.consistency import (
     points_scale,
     solved,
 )
+from share.merge.held import by_gravity, severity_of, told, worst
 from share.merge.subjects import Subjects
 from share.merge.sureness import Meeting, Sureness
 from share.place.scale import Scale
@@ -34,8 +37,7 @@ from share.types import F64
 
 _MOST = 32  # loops kept of two stretches
 _MOST_SCALES = 160
-_SIGMAS = 4.5  # that a difference must have: of thousands of comparisons none by chance
-_TURN, _TILT = np.radians(1.5), np.radians(1.0)  # rad, less does no harm
+_TURN = np.radians(1.5)  # rad, less does no harm
 _NIS = 3.0  # beyond what honest agents are too sure
 _ENOUGH_POINTS, _ENOUGH_PATH = 3, 8  # loops before a comparison by points, or by ways, says anything
 _NEW_POINTS, _NEW_PATH = 6, 12  # newest loops that are looked at on their own
@@ -222,8 +224,8 @@ class Agreement:
         pair.points = _pooled(scales)
         pair.newest = _pooled(list(pair.scales)[-_NEW_POINTS:]) if len(scales) > _NEW_POINTS else None
         pair.gauge = _pooled(pair.scales)
-        self._compare_ways(met, names, meeting)
-        found = [*self._by_points(pair), *_by_gravity(every), *_by_gravity(met.loops[-_ENOUGH_PATH:])]
+        ways = _compared_ways(met)
+        found = [*self._by_points(pair), *by_gravity(every), *by_gravity(met.loops[-_ENOUGH_PATH:])]
         for one in pair.met.values():
             found += [*self._by_ways(one.ways), *self._by_ways(one.newest)]
         pair.doubt = max((severity for severity, _, _ in found), default=0.0)
@@ -232,22 +234,11 @@ class Agreement:
             self._sureness.leave(pair.met)
         else:
             self._prove(pair, names)
+            if ways is not None and met.ways is not None and not self.apart & {*names}:
+                with suppress(np.linalg.LinAlgError):  # of absurd numbers, which say nothing
+                    self._sureness.take(meeting, names, ways, met.ways.weight)
         said = sorted((f for f in found if f[0] >= _CALM), reverse=True)
-        pair.what, pair.turned = _worst([t for _, t, _ in said]), _worst([t for *_, t in said])
-
-    def _compare_ways(self, met: _Met, names: Names, meeting: Meeting) -> None:
-        """Absurd numbers leave no solution, and say nothing."""
-        met.ways = met.newest = None
-        if len(met.loops) < _ENOUGH_PATH:
-            return
-        try:
-            told = equations(met.loops)
-            met.ways = solved(told)
-            self._sureness.take(meeting, names, told, met.ways.weight)
-            if len(met.loops) > _NEW_PATH:
-                met.newest = compare(met.loops[-_NEW_PATH:])
-        except np.linalg.LinAlgError:
-            return
+        pair.what, pair.turned = worst([t for _, t, _ in said]), worst([t for *_, t in said])
 
     def _prove(self, pair: _Pair, names: Names) -> None:
         """Who was to be compared has been, if the other is not under suspicion itself. What was wrong with a
@@ -262,16 +253,16 @@ class Agreement:
     def _by_points(self, pair: _Pair) -> list[tuple[float, str, str]]:
         found = [points for points in (pair.points, pair.newest) if points is not None]
         words = "its depths are {} % {}", ("larger", "smaller")
-        return [_told(points, self._tolerance, *words) for points in found]
+        return [told(points, self._tolerance, *words) for points in found]
 
     def _by_ways(self, ways: Comparison | None) -> list[tuple[float, str, str]]:
         if ways is None:
             return []
         out = []
         if ways.inside >= _INSIDE:
-            out.append(_told(ways.path, self._tolerance, "its way is {} % {}", ("longer", "shorter")))
+            out.append(told(ways.path, self._tolerance, "its way is {} % {}", ("longer", "shorter")))
             turn = f"its camera is turned by {np.degrees(ways.turn.value):.1f} degrees against what it says"
-            out.append((_severity(ways.turn, _TURN), turn, turn))
+            out.append((severity_of(ways.turn, _TURN), turn, turn))
         sure = f"loops are off by {ways.nis:.1f} times the variance that it claims"
         out.append((ways.nis / _NIS, sure, sure))
         return out
@@ -339,47 +330,22 @@ class Agreement:
         return {name: (float(x[i]), float(sigma[i])) for name, i in at.items()}
 
 
-def tilt_between(
-    up_a: F64, sigma_a: float, up_b: F64, sigma_b: float, edge: Edge
-) -> tuple[float, float] | None:
-    """Angle between two ups (3,) across a loop, and its sigma, rad; None if one is not known."""
-    if not up_a.any() or not up_b.any():
+def _compared_ways(met: _Met) -> Equations | None:
+    """Of all of its loops; None where they are too few, or absurd numbers leave no solution."""
+    met.ways = met.newest = None
+    if len(met.loops) < _ENOUGH_PATH:
         return None
-    there = edge.T_a_b[:3, :3] @ up_b
-    cross = np.linalg.norm(np.cross(up_a, there)) / np.linalg.norm(up_a) / np.linalg.norm(up_b)
-    sigma = np.sqrt(sigma_a**2 + sigma_b**2 + np.trace(edge.cov[:3, :3]) / 3)
-    return float(np.arcsin(min(1.0, float(cross)))), float(sigma)
-
-
-def _by_gravity(loops: list[Witness]) -> list[tuple[float, str, str]]:
-    known = np.array([w.tilt for w in loops if w.tilt is not None]).reshape(-1, 2)
-    if len(known) < _ENOUGH_PATH:
-        return []
-    angle, sigmas = float(np.median(known[:, 0])), float(np.median(known[:, 0] / known[:, 1]))
-    text = f"its up is {np.degrees(angle):.1f} degrees off"
-    return [(min(angle / _TILT, sigmas / _SIGMAS), text, text)]
+    with suppress(np.linalg.LinAlgError):
+        tell = equations(met.loops)
+        met.ways = solved(tell)
+        if len(met.loops) > _NEW_PATH:
+            met.newest = compare(met.loops[-_NEW_PATH:])
+        return tell
+    return None
 
 
 def _pooled(scales: Collection[Scale]) -> Estimate | None:
     return points_scale(list(scales)) if len(scales) >= _ENOUGH_POINTS else None
-
-
-def _severity(found: Estimate, harmless: float) -> float:
-    """1 where it is as large as may be, or as sure as must be, whichever comes later."""
-    return min(abs(found.value) / harmless, found.significance / _SIGMAS)
-
-
-def _told(found: Estimate, harmless: float, text: str, words: Names) -> tuple[float, str, str]:
-    """Severity, and the text for either side."""
-    size = f"{100 * abs(np.expm1(found.value)):.1f} ± {100 * np.exp(found.value) * found.sigma:.1f}"
-    more, less = (text.format(size, word) for word in words)
-    return (_severity(found, harmless), *((more, less) if found.value > 0 else (less, more)))
-
-
-def _worst(said: list[str]) -> str:
-    """Of each kind of thing the first."""
-    kinds = {" ".join(text.split()[:2]): text for text in reversed(said)}
-    return ", ".join(text for text in said if text in kinds.values())
 
 
 def _reason(agent: str, bad: list[tuple[Names, _Pair]]) -> str:

@@ -47,9 +47,10 @@ class Claims:
         self._middle[agent] = np.median(np.array(steps), axis=0)
         return True
 
-    def leave_out(self, agents: Collection[str]) -> None:
-        """Nobody is measured by these, from now on."""
-        self._out = set(agents)
+    def leave_out(self, agents: Collection[str]) -> bool:
+        """Nobody is measured by these, from now on. Whether that is news."""
+        was, self._out = self._out, set(agents)
+        return was != self._out
 
     def least(self, agent: str) -> float:
         """By what its variances have to be multiplied at least; 1 where it says nothing unusual."""

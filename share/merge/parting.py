@@ -11,8 +11,9 @@ import numpy as np
 
 from share.geometry import se3
 from share.graph.posegraph import Edge
-from share.merge.agreement import Agreement, Standing, tilt_between
+from share.merge.agreement import Agreement, Standing
 from share.merge.chart import Chart, shortened
+from share.merge.held import tilt_between
 from share.merge.join import Loop
 from share.merge.judge import Judge
 from share.merge.thinning import TakenOut
