@@ -33,7 +33,8 @@ _ENOUGH = 8  # such loops
 _PRIOR_DOF = 4.0  # of an agent
 _LOOP_PRIOR, _LOOP_DOF = 1.7, 12.0  # honest loops are a little too sure, see `consistency`
 _LEAST, _MOST = 0.25, 1e4
-_TELLS, _CHANGES = 2.0, 1.25  # variance from which on it is taken into account; by what part it has to change
+_TELLS, _TELLS_STILL = 2.0, 1.5  # variance from which on, and down to which, it is taken into account
+_CHANGES = 1.25  # by what part it has to change
 
 Meeting = tuple[int, int]  # two stretches
 
@@ -109,7 +110,8 @@ class Sureness:
             self._tell(name, self._now.get(name, 1.0))
 
     def _tell(self, name: str, now: float) -> None:
-        was, now = self.factor.get(name, 1.0), now if now > _TELLS else 1.0
+        was = self.factor.get(name, 1.0)
+        now = now if now > (_TELLS_STILL if was > 1 else _TELLS) else 1.0
         if max(now / was, was / now) > _CHANGES:
             self.factor[name] = now
 

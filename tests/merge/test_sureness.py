@@ -129,3 +129,15 @@ def test_loops_between_agents_that_disagree_widen_nobody():
         widths.append((agreement.widened("ann"), agreement.widened("bob")))
     assert agreement.disputed
     assert set(widths) == {(1.0, 1.0)}
+
+
+def test_who_is_just_sure_enough_to_be_widened_is_not_told_so_again_and_again():
+    """Its variances are 4.5 times below another's, twice the leeway; steps differ in size."""
+    rng, sureness, told = np.random.default_rng(0), Sureness(Claims()), list[float]()
+    for _ in range(300):
+        for name, part in (("ann", 1.0), ("bob", 1 / 4.5)):
+            step = se3.exp(np.r_[rng.normal(0, 0.05, 3), rng.normal(0, 0.15, 3)])
+            sureness.claimed(name, step, part * STEP_COV)
+            if (now := sureness.factor.get("bob", 1.0)) != (told or [1.0])[-1]:
+                told.append(now)
+    assert 1 <= len(told) <= 4
