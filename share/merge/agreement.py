@@ -10,7 +10,7 @@ wrong, and they keep a map each. An agent is a subject here, all runs of a name 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Container, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -45,6 +45,7 @@ _INSIDE = 0.6  # of the loops must fit, or they are of more than one place
 _CALM = 0.6  # a disagreement ends below this part of what began it
 _TELLS, _TELLS_STILL = 2.5, 1.25  # sigmas from which on, and down to which, a scale is taken into account
 _SCALE_STEP = 0.001  # log scale that it has to change by
+_PAST: Meeting = (-1, -1)  # newest loops of stretches that are gone
 
 
 @dataclass(frozen=True)
@@ -76,8 +77,8 @@ class _Met:
 
 @dataclass(eq=False)
 class _Pair:
-    """Of two agents, the lesser first. met: by stretches. scales: of more loops, by which what does no harm
-    is put right."""
+    """Of two agents, the lesser first. met: by stretches, those that are gone as one. scales: of more loops,
+    by which what does no harm is put right."""
 
     met: dict[Meeting, _Met] = field(default_factory=dict)
     scales: deque[Scale] = field(default_factory=lambda: deque(maxlen=_MOST_SCALES))
@@ -132,10 +133,20 @@ class Agreement:
         """By what the variances of its odometry have to be multiplied to be believed."""
         return self._sureness.factor.get(self.subjects.of(run), 1.0)
 
-    def forget(self, numbers: Collection[int]) -> None:
-        """Nodes that are taken out."""
+    def forget(self, numbers: Collection[int], live: Container[int]) -> None:
+        """Nodes that are taken out. live: stretches that have others. What loops of those that have not said
+        stays only so far as it decides who agrees: a disagreement does not end because its loops went."""
         for number in numbers:
             self._walked.pop(number, None)
+        over = set[Meeting]()
+        for pair in self._pairs.values():
+            if ended := {m for m in pair.met if m != _PAST and not (m[0] in live and m[1] in live)}:
+                over |= ended
+                past = [pair.met.get(_PAST, _Met()), *(pair.met.pop(meeting) for meeting in sorted(ended))]
+                loops = [w for met in past for w in met.loops][-_MOST:]
+                worst = max(past, key=self._severity_of) if pair.disagrees else _Met()
+                pair.met[_PAST] = _Met(loops, worst.ways, worst.newest)
+        self._sureness.leave(sorted(over))
 
     def witness(
         self,
@@ -233,6 +244,8 @@ class Agreement:
         if pair.disagrees:
             self._sureness.leave(pair.met)
         else:
+            if _PAST in pair.met:
+                pair.met[_PAST].ways = pair.met[_PAST].newest = None
             self._prove(pair, names)
             if ways is not None and met.ways is not None and not self.apart & {*names}:
                 with suppress(np.linalg.LinAlgError):  # of absurd numbers, which say nothing
@@ -266,6 +279,10 @@ class Agreement:
         sure = f"loops are off by {ways.nis:.1f} times the variance that it claims"
         out.append((ways.nis / _NIS, sure, sure))
         return out
+
+    def _severity_of(self, met: _Met) -> float:
+        """By its ways."""
+        return max((s for s, _, _ in (*self._by_ways(met.ways), *self._by_ways(met.newest))), default=0.0)
 
     def _agrees(self, pair: _Pair) -> bool:
         return not pair.disagrees and pair.points is not None and pair.points.sigma < self._tolerance / 2

@@ -245,7 +245,7 @@ class Atlas:
         live = {chart.founder[stretch] for stretch in chart.trails.live}
         chart.unsolved = dict.fromkeys(founder for founder in chart.unsolved if founder in live)
         self._judge.forget({out.key for out in taken})
-        self._parting.agreement.forget([out.number for out in taken])
+        self._parting.agreement.forget([out.number for out in taken], chart.trails.live)
         return taken
 
     def propose(self, loop: Loop) -> Decision:

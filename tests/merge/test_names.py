@@ -198,3 +198,40 @@ def test_a_run_that_is_forgotten_takes_nothing_of_its_name_with_it():
     subjects.enter("eve-4", "eve", ())
     assert subjects.of("eve-4") == "eve-1"
     assert (subjects.name("eve-1"), subjects.newest("eve-1")) == ("eve", "eve-4")
+
+
+def test_a_disagreement_outlives_the_keyframes_that_showed_it():
+    """Two loops with each of many runs of bob, whose stretches go one after the other."""
+    town = Town()
+    town.enter("ann-1")
+    for n in range(1, 30):
+        town.enter(f"bob-{n}")
+    for n in range(1, 30):
+        town.meet("ann-1", f"bob-{n}", 1.05, 2)
+        first = town.numbers[f"bob-{n}"]
+        town.agreement.forget(range(first, first + 12), {town.numbers["ann-1"]})
+        assert bool(town.agreement.disputed) == (n > 1)
+    (pair,) = town.agreement._pairs.values()
+    assert len(pair.met) == 1
+    assert sum(len(met.loops) for met in pair.met.values()) <= 32
+
+
+def test_what_loops_said_of_a_stretch_goes_with_it():
+    ann, bob = Walker("ann", 1), Walker("bob-1", 2, phase=0.3)
+    atlas, rng = Atlas(MergeConfig()), np.random.default_rng(0)
+    for walker in (ann, bob):
+        atlas.enter(walker.name, walker.name.partition("-")[0])
+        for keyframe in walker.keyframes:
+            atlas.add_keyframe(walker.name, keyframe)
+    for loop in near_loops(ann, bob, rng, every=2):
+        atlas.witness(loop, Scale(0.0, 0.005))
+    agreement = atlas._parting.agreement
+    (pair,) = agreement._pairs.values()
+    assert agreement._sureness._told.keys() == pair.met.keys() == {(0, 1)}
+    atlas.present("bob-1", False)
+    atlas.enter("bob-2", "bob")
+    gone = [n for n in range(len(atlas)) if atlas.key(n).agent == "bob-1"]
+    assert len(atlas.take_out(gone)) == len(gone)
+    assert not agreement._sureness._told
+    assert (0, 1) not in pair.met
+    assert atlas.standing("ann").state == "agrees"
