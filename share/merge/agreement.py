@@ -148,6 +148,18 @@ class Agreement:
                 pair.met[_PAST] = _Met(loops, worst.ways, worst.newest)
         self._sureness.leave(sorted(over))
 
+    def leave(self, run: str) -> None:
+        """A run of which nothing is left, and that will not come back. With the last of an agent's goes all
+        that is known of it, but for what is held against its name."""
+        gone = self.subjects.forget(run, self.apart, frozenset[str]().union(*self.disputed))
+        if gone is None:
+            return
+        self._pairs = {names: pair for names, pair in self._pairs.items() if gone not in names}
+        self.apart -= {gone}
+        self.disputed = frozenset(names for names in self.disputed if gone not in names)
+        self.scale.pop(gone, None)
+        self._sureness.remove(gone)
+
     def witness(
         self,
         agents: Names,
@@ -298,7 +310,7 @@ class Agreement:
         while left:
             against = self._votes(tuple(names) for names in left)
             rank = {
-                name: (count, self.subjects.follows(name, self.apart), -friends[name])
+                name: (count, self.subjects.follows_one_apart(name, self.apart), -friends[name])
                 for name, count in against.items()
             }
             who = {agent for agent in rank if rank[agent] == max(rank.values())}

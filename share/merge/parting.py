@@ -49,7 +49,7 @@ class Parting:
 
     def forget(self, run: str) -> None:
         """Nothing is left of it, and it will not come back."""
-        self.agreement.subjects.forget(run)
+        self.agreement.leave(run)
         self._chart.scale.pop(run, None)
         self._chart.width.pop(run, None)
 

@@ -89,6 +89,13 @@ class Sureness:
             self._settle()
         self.leave([meeting for meeting, told in self._told.items() if set(told.agents) & set(agents)])
 
+    def remove(self, agent: str) -> None:
+        """Nothing is left of it."""
+        self._told = {meeting: told for meeting, told in self._told.items() if agent not in told.agents}
+        self._claims.remove(agent)
+        self._settle()
+        self.factor.pop(agent, None)
+
     def _settle(self) -> None:
         agents = sorted({name for told in self._told.values() for name in told.agents} | self._claims.agents)
         at, n = {name: i for i, name in enumerate(agents)}, len(agents)

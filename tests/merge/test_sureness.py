@@ -85,6 +85,12 @@ def test_until_loops_tell_nobody_is_much_surer_than_the_surest_of_the_others():
     assert claims.least("eve") == pytest.approx(100 / 2.25)
     claims.leave_out(["ann"])
     assert claims.least("eve") == pytest.approx(900 / 2.25)
+    claims.leave_out(["eve"])
+    assert claims.least("ann") == pytest.approx(9 / 2.25)
+    assert claims.least("eve") == pytest.approx(100 / 2.25)
+    claims.remove("ann")
+    assert claims.least("eve") == pytest.approx(900 / 2.25)
+    assert claims.agents == {"bob", "eve"}
 
 
 def test_honest_agents_may_differ():
