@@ -28,6 +28,7 @@ class Claims:
         self._of: dict[str, deque[tuple[float, float]]] = {}
         self._middle: dict[str, F64] = {}
         self._out: set[str] = set()
+        self._surest: F64 | None = None  # (2, 2) the least and the second, of those who measure; once known
 
     @property
     def agents(self) -> set[str]:
@@ -44,17 +45,32 @@ class Claims:
         steps.append((np.log(turn / size), np.log(way / size)))
         if len(steps) < _ENOUGH:
             return False
-        self._middle[agent] = np.median(np.array(steps), axis=0)
+        self._middle[agent], self._surest = np.median(np.array(steps), axis=0), None
         return True
 
-    def leave_out(self, agents: Collection[str]) -> None:
-        """Nobody is measured by these, from now on."""
-        self._out = set(agents)
+    def remove(self, agent: str) -> None:
+        """Nothing is left of it."""
+        self._of.pop(agent, None)
+        self._middle.pop(agent, None)
+        self._out.discard(agent)
+        self._surest = None
+
+    def leave_out(self, agents: Collection[str]) -> bool:
+        """Nobody is measured by these, from now on. Whether that is news."""
+        was, self._out, self._surest = self._out, set(agents), None
+        return was != self._out
 
     def least(self, agent: str) -> float:
         """By what its variances have to be multiplied at least; 1 where it says nothing unusual."""
-        others = [m for name, m in self._middle.items() if name != agent and name not in self._out]
-        if agent not in self._middle or not others:
+        if agent not in self._middle:
             return 1.0
-        surest = np.min(others, axis=0)
-        return max(1.0, float(np.exp((surest - self._middle[agent]).max())) / _LEEWAY)
+        own, (first, second) = self._middle[agent], self._least_two()
+        measures = agent not in self._out
+        surest = np.where(measures & (own == first), second, first)  # of the others
+        return max(1.0, float(np.exp((surest - own).max())) / _LEEWAY) if np.isfinite(surest).all() else 1.0
+
+    def _least_two(self) -> F64:
+        if self._surest is None:
+            every = [middle for name, middle in self._middle.items() if name not in self._out]
+            self._surest = np.sort([*every, *np.full((2, 2), np.inf)], axis=0)[:2]
+        return self._surest

@@ -11,8 +11,9 @@ import numpy as np
 
 from share.geometry import se3
 from share.graph.posegraph import Edge
-from share.merge.agreement import Agreement, Standing, tilt_between
+from share.merge.agreement import Agreement, Standing
 from share.merge.chart import Chart, shortened
+from share.merge.held import tilt_between
 from share.merge.join import Loop
 from share.merge.judge import Judge
 from share.merge.thinning import TakenOut
@@ -48,7 +49,7 @@ class Parting:
 
     def forget(self, run: str) -> None:
         """Nothing is left of it, and it will not come back."""
-        self.agreement.subjects.forget(run)
+        self.agreement.leave(run)
         self._chart.scale.pop(run, None)
         self._chart.width.pop(run, None)
 

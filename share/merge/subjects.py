@@ -20,6 +20,7 @@ class Subjects:
         self._names: dict[str, str] = {}
         self._runs: dict[str, list[str]] = {}
         self._newest: dict[str, str] = {}  # of each name
+        self._held: dict[str, bool] = {}  # names of suspects that are gone, and whether one was set apart
 
     def enter(self, run: str, name: str, suspects: Iterable[str]) -> None:
         """A run of this name; suspects: subjects that are. What is known already changes nothing."""
@@ -32,7 +33,7 @@ class Subjects:
         self._names[run] = name
         self._newest[name] = run
         self._add(run, run)
-        if before is not None:
+        if before is not None or name in self._held:
             self.unproven.add(run)
 
     def doubt(self, runs: Collection[str]) -> None:
@@ -54,12 +55,27 @@ class Subjects:
         if run not in runs:
             runs.append(run)
 
-    def forget(self, run: str) -> None:
-        """A run that will not come back. What is known of its name stays, with its newest run."""
-        runs = self._runs.get(self.of(run), [])
-        if len(runs) > 1 and run in runs:
+    def forget(self, run: str, apart: Collection[str], disputed: Collection[str]) -> str | None:
+        """A run that will not come back; apart, disputed: subjects that are. Returns its subject if that was
+        its last run. What is held against that is held against the next run of its name."""
+        subject = self.of(run)
+        runs = self._runs.get(subject, [run])
+        if run in runs:
             runs.remove(run)
-            del self._of[run]
+            self._of.pop(run, None)
+        if runs:
+            return None
+        name, newest = self.name(subject), self._newest.get(self.name(subject)) == subject
+        if subject in self.unproven.union(apart, disputed):
+            self._held[name] = self._held.get(name, False) or subject in apart
+        elif newest:
+            self._held.pop(name, None)
+        if newest:
+            del self._newest[name]
+        self.unproven.discard(subject)
+        self._runs.pop(subject, None)
+        self._names.pop(subject, None)
+        return subject
 
     def of(self, run: str) -> str:
         return self._of.get(run, run)
@@ -75,7 +91,11 @@ class Subjects:
 
     def has_earlier(self, run: str) -> bool:
         """Whether another subject of its name came before."""
-        return self.follows(run, self._names)
+        return self.follows(run, self._names) or self.name(run) in self._held
+
+    def follows_one_apart(self, run: str, apart: Iterable[str]) -> bool:
+        """Whether another subject of its name was set apart; apart: those that are still there."""
+        return self.follows(run, apart) or self._held.get(self.name(run), False)
 
     def follows(self, run: str, some: Iterable[str]) -> bool:
         """Whether one of these is another subject of its name."""

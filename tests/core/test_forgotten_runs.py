@@ -268,3 +268,32 @@ def test_of_a_name_whose_newest_run_is_forgotten_the_one_before_it_is_shown(tmp_
             life.handle(ed.Tick())
         report = life.edge.report(life.mapper.report())
     assert report["agents"]["eve"]["run"] == f"eve-{m.public_tag(100)[:4]}"
+
+
+def test_a_run_is_forgotten_only_with_the_last_of_its_stretches(tmp_path: Path) -> None:
+    """Two stretches, of 9 and 3 keyframes, of which the newer goes first."""
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = Life(store)
+        life.run("ann", 1, 2, stays=True)
+        life.tell(100, hello_of("eve", 100))
+        for k in range(12):
+            before, T = (-1, at(k)) if k in (0, 9) else (k - 1, at(1.0))
+            own = Keyframe(k, before, k * S, T, 1e-6 * np.eye(6), at(k), np.zeros(3), 0.0, EMPTY, k - 1)
+            life.tell(100, own)
+        life.tell(100, m.Bye())
+        life.run("eve", 101, 2)
+        gone = next(key.agent for key in life.mapper.poses().keys if key.id == 11)
+
+        def leave(ids: range) -> None:
+            keys, atlas = {(gone, k) for k in ids}, life.mapper._atlas
+            life.mapper._leaving = [n for n in life.mapper._sights if atlas.key(n) in keys]
+            while life.mapper._leaving:
+                life.mapper._thin()
+            life.handle(ed.Tick())
+            life.handle(ed.Tick())
+
+        leave(range(9, 12))
+        assert {k.at.id for k in store.load().keyframes if k.key == gone} == set(range(9))
+        assert gone in life.mapper.report()["agents"]
+        leave(range(9))
+        assert gone not in {run.key for run in store.load().runs} | life.mapper.report()["agents"].keys()

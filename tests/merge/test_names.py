@@ -193,8 +193,93 @@ def test_a_run_that_is_forgotten_takes_nothing_of_its_name_with_it():
     subjects = Subjects()
     for number in range(1, 4):
         subjects.enter(f"eve-{number}", "eve", ())
-    for number in (1, 2, 3):
-        subjects.forget(f"eve-{number}")
+    assert [subjects.forget(f"eve-{number}", (), ()) for number in (1, 2)] == [None, None]
     subjects.enter("eve-4", "eve", ())
     assert subjects.of("eve-4") == "eve-1"
     assert (subjects.name("eve-1"), subjects.newest("eve-1")) == ("eve", "eve-4")
+    assert [subjects.forget(f"eve-{number}", (), ()) for number in (3, 4)] == [None, "eve-1"]
+    subjects.enter("eve-5", "eve", ())
+    assert (subjects.of("eve-5"), subjects.unproven) == ("eve-5", set())
+
+
+def test_what_is_held_against_a_name_outlives_its_runs():
+    subjects = Subjects()
+    subjects.enter("eve-1", "eve", ())
+    assert subjects.forget("eve-1", {"eve-1"}, ()) == "eve-1"
+    for number in range(2, 5):
+        subjects.enter(f"eve-{number}", "eve", ())
+        assert subjects.unproven == {f"eve-{number}"}
+        assert subjects.has_earlier(f"eve-{number}")
+        assert subjects.follows_one_apart(f"eve-{number}", ())
+        subjects.forget(f"eve-{number}", (), ())
+    assert not subjects.unproven
+    subjects.enter("eve-9", "eve", ())
+    subjects.unproven.clear()  # it was compared, and agrees
+    subjects.forget("eve-9", (), ())
+    subjects.enter("eve-10", "eve", ())
+    assert not subjects.unproven
+
+
+def test_runs_of_a_suspect_without_end_leave_nothing_but_the_suspicion():
+    """Eve met ann in each of her runs, and disagreed; each is forgotten with its keyframes."""
+    ann, atlas, rng = Walker("ann", 1, n=20), Atlas(MergeConfig()), np.random.default_rng(0)
+    atlas.enter("ann", "ann")
+    for keyframe in ann.keyframes:
+        atlas.add_keyframe("ann", keyframe)
+    agreement = atlas._parting.agreement
+    for n in range(1, 6):
+        eve = Walker(f"eve-{n}", n, n=20, phase=0.1)
+        atlas.enter(eve.name, "eve")
+        assert agreement.subjects.unproven == ({eve.name} if n > 1 else set())
+        numbers = [atlas.add_keyframe(eve.name, keyframe) for keyframe in eve.keyframes]
+        for loop in near_loops(ann, eve, rng):
+            atlas.witness(loop, Scale(0.05, 0.005))
+        assert atlas.standing("ann").state == "disputed"
+        atlas.present(eve.name, False)
+        atlas.enter("eve-next", "eve")
+        atlas.take_out(numbers)
+        assert atlas.is_forgotten(eve.name)
+        atlas.forget(eve.name)
+        atlas.present("eve-next", False)
+        atlas.forget("eve-next")
+        assert not agreement._pairs
+        assert not agreement.disputed
+        assert agreement._sureness._claims.agents == {"ann"}
+        assert atlas.standing("ann").state == "unknown"
+
+
+def test_a_disagreement_outlives_the_keyframes_that_showed_it():
+    """Two loops with each of many runs of bob, whose stretches go one after the other."""
+    town = Town()
+    town.enter("ann-1")
+    for n in range(1, 30):
+        town.enter(f"bob-{n}")
+    for n in range(1, 30):
+        town.meet("ann-1", f"bob-{n}", 1.05, 2)
+        first = town.numbers[f"bob-{n}"]
+        town.agreement.forget(range(first, first + 12), {town.numbers["ann-1"]})
+        assert bool(town.agreement.disputed) == (n > 1)
+    (pair,) = town.agreement._pairs.values()
+    assert len(pair.met) == 1
+    assert sum(len(met.loops) for met in pair.met.values()) <= 32
+
+
+def test_what_loops_said_of_a_stretch_goes_with_it():
+    ann, bob = Walker("ann", 1), Walker("bob-1", 2, phase=0.3)
+    atlas, rng = Atlas(MergeConfig()), np.random.default_rng(0)
+    for walker in (ann, bob):
+        atlas.enter(walker.name, walker.name.partition("-")[0])
+        for keyframe in walker.keyframes:
+            atlas.add_keyframe(walker.name, keyframe)
+    for loop in near_loops(ann, bob, rng, every=2):
+        atlas.witness(loop, Scale(0.0, 0.005))
+    agreement = atlas._parting.agreement
+    (pair,) = agreement._pairs.values()
+    assert agreement._sureness._told.keys() == pair.met.keys() == {(0, 1)}
+    atlas.present("bob-1", False)
+    atlas.enter("bob-2", "bob")
+    gone = [n for n in range(len(atlas)) if atlas.key(n).agent == "bob-1"]
+    assert len(atlas.take_out(gone)) == len(gone)
+    assert not agreement._sureness._told
+    assert (0, 1) not in pair.met
+    assert atlas.standing("ann").state == "agrees"
