@@ -219,7 +219,7 @@ class Edge:
                 self._forget(*idle)
             self._admission.came(hello, now_ns)
             self._supersede(hello.name, now_ns)
-            self._enter(peer_id, Peer(hello, new_key(hello, self._runs.by_key), now_ns))
+            self._enter(peer_id, Peer(hello, new_key(hello, self._runs.by_key), now_ns), event.voice)
             self._schedule.begin(hello.name)
             joined = f"{hello.kind} '{hello.name}'"
             self._record_seldom(now_ns, "joined the edge", self._runs[peer_id], joined)
@@ -242,9 +242,9 @@ class Edge:
         if peer.newest is not None:
             self._correct(peer_id, peer, peer.newest, now_ns, again=True)
 
-    def _enter(self, peer_id: bytes, peer: Peer) -> None:
+    def _enter(self, peer_id: bytes, peer: Peer, voice: str) -> None:
         self._runs.add(peer_id, peer)
-        self._effects.append(ed.Join(peer.key, peer.hello))
+        self._effects.append(ed.Join(peer.key, peer.hello, voice))
 
     def _forget_emptied(self, now_ns: int) -> None:
         for peer in self._runs.forgettable():

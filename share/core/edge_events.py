@@ -31,6 +31,11 @@ class Received:
     def speaks_for(self, name: str) -> bool:
         return self.names is None or name in self.names
 
+    @property
+    def voice(self) -> str:
+        """See `Join`."""
+        return min(self.names, default="") if self.names else ""
+
 
 @dataclass(frozen=True)
 class Found:
@@ -92,10 +97,12 @@ class Send:
 
 @dataclass(frozen=True)
 class Join:
-    """To the mapper: a run of an agent, before its first keyframe."""
+    """To the mapper: a run of an agent, before its first keyframe. voice: the same for all names that one key
+    speaks for, where agents vote; empty: the name's own."""
 
     key: str
     hello: wire.Hello
+    voice: str = ""
 
 
 @dataclass(frozen=True)

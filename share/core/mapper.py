@@ -82,11 +82,11 @@ class Mapper:
         self._ms = {kind: deque[float](maxlen=_TIMES) for kind in ("place", "verify", "solve")}
         self._counts: Counter[str] = Counter()
 
-    def join(self, agent: str, hello: Hello) -> None:
-        """A run of an agent, before its first keyframe."""
+    def join(self, agent: str, hello: Hello, voice: str = "") -> None:
+        """A run of an agent, before its first keyframe. voice: see `Join`."""
         self._hellos[agent] = hello
         self._accounts[agent] = _Account()
-        self._atlas.enter(agent, hello.name)
+        self._atlas.enter(agent, hello.name, voice)
 
     def name(self, agent: str) -> str:
         """Of the agent whose run it is."""

@@ -114,9 +114,10 @@ class Agreement:
         self._walked: dict[int, Walked] = {}
         self._pairs: dict[Names, _Pair] = {}
 
-    def enter(self, run: str, name: str) -> None:
-        """A run of the agent of this name comes; what is held against the name is held against the run."""
-        self.subjects.enter(run, name, self.apart.union(*self.disputed))
+    def enter(self, run: str, name: str, voice: str = "") -> None:
+        """A run of the agent of this name comes; what is held against the name is held against the run.
+        voice: whose names count once; "": the name's own."""
+        self.subjects.enter(run, name, self.apart.union(*self.disputed), voice)
 
     def walk(self, run: str, number: int, before: int | None, T_ref_body: F64, cov: F64) -> None:
         """A new node, by odometry from the one before; None: it begins a stretch."""
@@ -177,6 +178,7 @@ class Agreement:
             one, other, stretches, edge = other, one, stretches[::-1], edge.reverse()
             scale = None if scale is None else scale.reverse()
         pair = self._pairs.setdefault((one, other), _Pair())
+        self._sureness.met(one, other)
         met = pair.met.setdefault(stretches, _Met())
         a, b = self._walked[edge.a], self._walked[edge.b]
         met.loops.append(Witness(a, b, edge.T_a_b, edge.cov, scale, tilt))
@@ -230,7 +232,7 @@ class Agreement:
         )
 
     def _why(self, unproven: str) -> str:
-        if self.subjects.has_earlier(unproven):
+        if unproven in self.subjects.suspected:
             return "since an earlier run of its name was kept apart"
         return "since the edge was started again"
 
@@ -270,10 +272,10 @@ class Agreement:
         name before may have been its way, so there depths are not enough."""
         ways = any(met.ways is not None for met in pair.met.values())
         for one, other in (names, names[::-1]):
-            earlier = self.subjects.has_earlier(one)
+            earlier = one in self.subjects.suspected
             suspect = other in self.apart or (earlier and other in self.subjects.unproven)
             if not suspect and (ways or (self._agrees(pair) and not earlier)):
-                self.subjects.unproven.discard(one)
+                self.subjects.prove(one)
 
     def _by_points(self, pair: _Pair) -> list[tuple[float, str, str]]:
         found = [points for points in (pair.points, pair.newest) if points is not None]
@@ -314,7 +316,7 @@ class Agreement:
                 for name, count in against.items()
             }
             who = {agent for agent in rank if rank[agent] == max(rank.values())}
-            if len({self.subjects.name(agent) for agent in who}) > 1:
+            if len({self.subjects.voice(agent) for agent in who}) > 1:
                 break
             apart |= who
             left = {names for names in left if not names & who}
@@ -324,8 +326,9 @@ class Agreement:
         return was != (self.apart, self.disputed)
 
     def _votes(self, pairs: Iterable[tuple[str, ...]]) -> Counter[str]:
-        """With how many others each is paired, of whom those of one name count once."""
-        others = {(one, self.subjects.name(b)) for a, b in pairs for one, b in ((a, b), (b, a))}
+        """With how many others each is paired: voices, but for its own."""
+        voice = self.subjects.voice
+        others = {(a, voice(b)) for pair in pairs for a, b in (pair, pair[::-1]) if voice(a) != voice(b)}
         return Counter(one for one, _ in others)
 
     def _gauge(self) -> None:
@@ -353,8 +356,8 @@ class Agreement:
             J[row, at[a]], J[row, at[b]] = -1 / points.sigma, 1 / points.sigma
             z[row] = points.value / points.sigma
         x = np.linalg.pinv(J) @ z
-        counts = {self.subjects.name(agent): x[at[agent]] for agent in agents if agent not in self.apart}
-        x -= np.median([*counts.values()] or x)  # a name counts once
+        counts = {self.subjects.voice(agent): x[at[agent]] for agent in agents if agent not in self.apart}
+        x -= np.median([*counts.values()] or x)  # a voice counts once
         sigma = np.sqrt(np.diag(np.linalg.pinv(J.T @ J)))
         return {name: (float(x[i]), float(sigma[i])) for name, i in at.items()}
 

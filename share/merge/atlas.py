@@ -140,10 +140,10 @@ class Atlas:
 
     # ------------------------------------------------------------ what arrives
 
-    def enter(self, agent: str, name: str) -> None:
-        """A run of the agent of this name comes."""
+    def enter(self, agent: str, name: str, voice: str = "") -> None:
+        """A run of the agent of this name comes. voice: of names that count once; "": the name's own."""
         self._owners.join(agent, name)
-        self._parting.enter(agent, name)
+        self._parting.enter(agent, name, voice)
 
     def present(self, agent: str, here: bool) -> None:
         """Who is not heard need not be told where he is, and nobody waits for him. Once he is heard again, a

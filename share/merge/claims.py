@@ -18,6 +18,7 @@ from share.types import F64
 _STEPS = 64  # of each agent: the newest
 _ENOUGH = 8
 _LEEWAY = 2.25  # variance: 1.5 sigma, as honest agents differ by how they move
+_MOST = 100.0  # variance: words alone say no more
 _LEVER = 1.0  # m: a turn of 1 rad is a step of this
 
 
@@ -28,7 +29,7 @@ class Claims:
         self._of: dict[str, deque[tuple[float, float]]] = {}
         self._middle: dict[str, F64] = {}
         self._out: set[str] = set()
-        self._surest: F64 | None = None  # (2, 2) the least and the second, of those who measure; once known
+        self._met: dict[str, set[str]] = {}
 
     @property
     def agents(self) -> set[str]:
@@ -45,32 +46,33 @@ class Claims:
         steps.append((np.log(turn / size), np.log(way / size)))
         if len(steps) < _ENOUGH:
             return False
-        self._middle[agent], self._surest = np.median(np.array(steps), axis=0), None
+        self._middle[agent] = np.median(np.array(steps), axis=0)
         return True
+
+    def met(self, one: str, other: str) -> None:
+        """There is a loop between them: from now on they are measured by each other."""
+        self._met.setdefault(one, set()).add(other)
+        self._met.setdefault(other, set()).add(one)
 
     def remove(self, agent: str) -> None:
         """Nothing is left of it."""
         self._of.pop(agent, None)
         self._middle.pop(agent, None)
         self._out.discard(agent)
-        self._surest = None
+        for other in self._met.pop(agent, set()):
+            self._met[other].discard(agent)
 
     def leave_out(self, agents: Collection[str]) -> bool:
         """Nobody is measured by these, from now on. Whether that is news."""
-        was, self._out, self._surest = self._out, set(agents), None
+        was, self._out = self._out, set(agents)
         return was != self._out
 
     def least(self, agent: str) -> float:
         """By what its variances have to be multiplied at least; 1 where it says nothing unusual."""
-        if agent not in self._middle:
+        whom = self._met.get(agent, set()) - self._out
+        others = [self._middle[name] for name in whom if name in self._middle]
+        if agent not in self._middle or not others:
             return 1.0
-        own, (first, second) = self._middle[agent], self._least_two()
-        measures = agent not in self._out
-        surest = np.where(measures & (own == first), second, first)  # of the others
-        return max(1.0, float(np.exp((surest - own).max())) / _LEEWAY) if np.isfinite(surest).all() else 1.0
-
-    def _least_two(self) -> F64:
-        if self._surest is None:
-            every = [middle for name, middle in self._middle.items() if name not in self._out]
-            self._surest = np.sort([*every, *np.full((2, 2), np.inf)], axis=0)[:2]
-        return self._surest
+        surest = np.min(others, axis=0)
+        surer = float(np.exp((surest - self._middle[agent]).max()))
+        return min(max(1.0, surer / _LEEWAY), _MOST)

@@ -43,9 +43,9 @@ class Parting:
         self._chart, self._judge, self._sights = chart, judge, sights
         self._taken_back: list[Loop] = []
 
-    def enter(self, run: str, name: str) -> None:
+    def enter(self, run: str, name: str, voice: str = "") -> None:
         """A run of the agent of this name comes: what is known of the name holds for it."""
-        self.agreement.enter(run, name)
+        self.agreement.enter(run, name, voice)
 
     def forget(self, run: str) -> None:
         """Nothing is left of it, and it will not come back."""
@@ -119,16 +119,19 @@ class Parting:
 
     def _put_right(self) -> None:
         agreement, chart = self.agreement, self._chart
-        for agent in {chart.trails.stretches[stretch].agent for stretch in chart.trails.live}:
+        for agent in sorted({chart.trails.stretches[stretch].agent for stretch in chart.trails.live}):
             told = agreement.scale_of(agent), agreement.widened(agent)
             if told != (self._scale_of(agent), chart.width.get(agent, 1.0)):
                 chart.rescale(agent, *told)
 
     def restored(self) -> None:
         """An earlier life's map. Who was set apart is not known, but he was not in the map of most agents."""
+        subjects = self.agreement.subjects
         maps = [self._agents_of(founder) for founder in sorted(set(self._chart.founder))]
-        most = max(maps, key=len, default=set[str]())
-        self.agreement.subjects.doubt(set[str]().union(*maps) - (most if len(most) > 1 else set()))
+        names = [set(map(subjects.name, agents)) for agents in maps]
+        most = max(range(len(maps)), key=lambda i: len(names[i]), default=0)
+        trusted = maps[most] if maps and len(names[most]) > 1 else set[str]()
+        subjects.doubt(set[str]().union(*maps) - trusted)
 
     def _part(self) -> tuple[Loop, ...]:
         """Take back what ties agents that are kept apart: first the loops between them, then the fewest

@@ -65,9 +65,14 @@ class Sureness:
         if self._claims.add(agent, T_ref_body, cov):
             self._settle()
 
+    def met(self, one: str, other: str) -> None:
+        """There is a loop between these agents."""
+        self._claims.met(one, other)
+
     def take(self, meeting: Meeting, agents: tuple[str, str], e: Equations, weight: F64) -> None:
         """What loops of two stretches say by now, of weight (N,) each; it takes the place of what they said
         before. Raises LinAlgError where absurd numbers leave no solution."""
+        self.met(*agents)
         fits = np.flatnonzero(weight > _FITS)
         if len(fits) < _ENOUGH:
             self.leave([meeting])
@@ -97,7 +102,7 @@ class Sureness:
         self.factor.pop(agent, None)
 
     def _settle(self) -> None:
-        agents = sorted({name for told in self._told.values() for name in told.agents} | self._claims.agents)
+        agents = sorted({name for told in self._told.values() for name in told.agents})
         at, n = {name: i for i, name in enumerate(agents)}, len(agents)
         size = n + len(self._told)
         q, F, made_with = np.zeros(size), np.zeros((size, size)), np.full(size, _MOST)
@@ -113,8 +118,8 @@ class Sureness:
         found = np.linalg.solve(F + np.diag(sure), q + sure * prior).clip(_LEAST, _MOST)
         self._loops = dict(zip(self._told, found[n:].tolist(), strict=True))
         self._now = dict(zip(agents, found[:n].tolist(), strict=True))
-        for name in sorted({*agents, *self.factor}):
-            self._tell(name, self._now.get(name, 1.0))
+        for name in sorted({*agents, *self.factor, *self._claims.agents}):
+            self._tell(name, self._now.get(name, self._claims.least(name)))
 
     def _tell(self, name: str, now: float) -> None:
         was = self.factor.get(name, 1.0)

@@ -128,7 +128,7 @@ class _Mapping:
                 self._mapper.restore(message.kept)
                 self._is_restoring = True
             case Join():
-                self._mapper.join(message.key, message.hello)
+                self._mapper.join(message.key, message.hello, message.voice)
             case Present():
                 self._mapper.present(message.key, message.here)
             case Forget():

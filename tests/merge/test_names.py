@@ -153,7 +153,7 @@ def test_runs_of_an_earlier_life_that_were_outside_are_a_subject_of_their_own():
     assert subjects.unproven == {subjects.of("eve-1")}
     assert subjects.name("eve-2") == subjects.name("eve-3") == "eve"
     subjects.enter("eve-4", "eve", ())
-    assert "eve-4" in subjects.unproven
+    assert subjects.of("eve-4") in subjects.unproven
 
 
 def test_loops_of_a_restarted_suspect_are_not_believed_before_it_is_compared():
@@ -209,12 +209,12 @@ def test_what_is_held_against_a_name_outlives_its_runs():
     for number in range(2, 5):
         subjects.enter(f"eve-{number}", "eve", ())
         assert subjects.unproven == {f"eve-{number}"}
-        assert subjects.has_earlier(f"eve-{number}")
+        assert f"eve-{number}" in subjects.suspected
         assert subjects.follows_one_apart(f"eve-{number}", ())
         subjects.forget(f"eve-{number}", (), ())
     assert not subjects.unproven
     subjects.enter("eve-9", "eve", ())
-    subjects.unproven.clear()  # it was compared, and agrees
+    subjects.prove("eve-9")  # it was compared, and agrees
     subjects.forget("eve-9", (), ())
     subjects.enter("eve-10", "eve", ())
     assert not subjects.unproven
@@ -283,3 +283,33 @@ def test_what_loops_said_of_a_stretch_goes_with_it():
     assert not agreement._sureness._told
     assert (0, 1) not in pair.met
     assert atlas.standing("ann").state == "agrees"
+
+
+def test_who_is_doubted_since_the_edge_was_started_again_is_proven_by_another_who_is():
+    """Both were alone in their maps, and now meet: there is nobody else to compare them with."""
+    town = Town()
+    for run in ("ann-1", "bob-1"):
+        town.enter(run)
+    town.agreement.subjects.doubt({"ann-1", "bob-1"})
+    for run in ("ann-2", "bob-2"):
+        town.enter(run)
+    assert "started again" in town.agreement.yet_to_compare(["ann-2"], ["bob-2"])
+    town.meet("ann-2", "bob-2", 1.0, 10)
+    assert not town.agreement.yet_to_compare(["ann-2"], ["bob-2"])
+
+
+def test_names_of_one_key_have_one_voice():
+    """Eve speaks for three, whose metres are too long; ann and bob agree."""
+    for voice, apart in (("eve", {"e1-1", "e2-1", "e3-1"}), ("", None)):
+        town = Town()
+        for run in ("ann-1", "bob-1"):
+            town.enter(run)
+        for run in ("e1-1", "e2-1", "e3-1"):
+            town.agreement.enter(run, run[:2], voice)
+            town.enter(run)
+        town.meet("ann-1", "bob-1", 1.0, 12)
+        for run in ("e1-1", "e2-1", "e3-1"):
+            for honest in ("ann-1", "bob-1"):
+                town.meet(honest, run, 1.05, 12)
+        assert apart is None or town.agreement.apart == apart
+        assert not apart or not town.agreement.forbids(["ann-1"], ["bob-1"])

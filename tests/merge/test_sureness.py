@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from test_agent_consistency import FRAMES, LOOP_COV, STEP_COV, chain, ring, steps_of
@@ -76,7 +78,19 @@ def claimed(sigmas: dict[str, float]) -> Claims:
     for name, sigma in sigmas.items():
         for _ in range(10):
             claims.add(name, MOVED, sigma**2 * STEP_COV)
+    for one, other in itertools.combinations(sigmas, 2):
+        claims.met(one, other)
     return claims
+
+
+def test_who_was_never_met_measures_nobody():
+    """Its variances may be anything."""
+    claims = claimed({"ann": 1.0})
+    for _ in range(10):
+        claims.add("eve", MOVED, 1e6 * STEP_COV)
+    assert claims.least("ann") == 1.0
+    claims.met("ann", "eve")
+    assert claims.least("ann") == 100.0
 
 
 def test_until_loops_tell_nobody_is_much_surer_than_the_surest_of_the_others():
@@ -84,12 +98,12 @@ def test_until_loops_tell_nobody_is_much_surer_than_the_surest_of_the_others():
     assert claims.least("ann") == claims.least("bob") == 1.0
     assert claims.least("eve") == pytest.approx(100 / 2.25)
     claims.leave_out(["ann"])
-    assert claims.least("eve") == pytest.approx(900 / 2.25)
+    assert claims.least("eve") == 100.0  # of 400
     claims.leave_out(["eve"])
     assert claims.least("ann") == pytest.approx(9 / 2.25)
     assert claims.least("eve") == pytest.approx(100 / 2.25)
     claims.remove("ann")
-    assert claims.least("eve") == pytest.approx(900 / 2.25)
+    assert claims.least("eve") == 100.0  # of 400
     assert claims.agents == {"bob", "eve"}
 
 
@@ -140,6 +154,7 @@ def test_loops_between_agents_that_disagree_widen_nobody():
 def test_who_is_just_sure_enough_to_be_widened_is_not_told_so_again_and_again():
     """Its variances are 4.5 times below another's, twice the leeway; steps differ in size."""
     rng, sureness, told = np.random.default_rng(0), Sureness(Claims()), list[float]()
+    sureness.met("ann", "bob")
     for _ in range(300):
         for name, part in (("ann", 1.0), ("bob", 1 / 4.5)):
             step = se3.exp(np.r_[rng.normal(0, 0.05, 3), rng.normal(0, 0.15, 3)])
