@@ -362,7 +362,7 @@ class Mapper:
         self._counts["taken_out"] += len(taken)
         self._changes += changes_of(taken)
         empty = {out.key.agent for out in taken if self._atlas.is_forgotten(out.key.agent)}
-        self._emptied += [Key(agent, self._accounts[agent].newest) for agent in empty]
+        self._emptied += [Key(agent, self._accounts[agent].newest) for agent in sorted(empty)]
 
     # ------------------------------------------------------------------ report
 

@@ -15,7 +15,7 @@ from share.merge.agreement import Agreement, Standing
 from share.merge.chart import Chart, shortened
 from share.merge.held import tilt_between
 from share.merge.join import Loop
-from share.merge.judge import Judge
+from share.merge.judge import Decision, Judge
 from share.merge.thinning import TakenOut
 from share.place.scale import Scale
 from share.place.verify import Sight
@@ -119,7 +119,7 @@ class Parting:
 
     def _put_right(self) -> None:
         agreement, chart = self.agreement, self._chart
-        for agent in {chart.trails.stretches[stretch].agent for stretch in chart.trails.live}:
+        for agent in sorted({chart.trails.stretches[stretch].agent for stretch in chart.trails.live}):
             told = agreement.scale_of(agent), agreement.widened(agent)
             if told != (self._scale_of(agent), chart.width.get(agent, 1.0)):
                 chart.rescale(agent, *told)
@@ -159,16 +159,20 @@ class Parting:
         return out
 
     def _give_back(self) -> tuple[tuple[Loop, ...], tuple[Loop, ...]]:
-        """Loops that were taken back, of agents that are no longer kept apart, are judged anew: those that
-        are believed, and those that are not because of them."""
-        some = [x for x in self._taken_back if not self._keeps_apart(x.a.agent, x.b.agent)]
-        self._taken_back = [x for x in self._taken_back if x not in some]
-        decisions = [
-            self._judge.decide(loop)
-            for loop in some
-            if self._chart.trails.has(loop.a) and self._chart.trails.has(loop.b) and not self.forbids(loop)
-        ]
-        return tuple(x for d in decisions for x in d.tied), tuple(x for d in decisions for x in d.dropped)
+        """Loops that were taken back and that nothing forbids any more are judged anew: those that are
+        believed, and those that are not because of them. The others wait on, as long as their keyframes are
+        there."""
+        trails, decisions, left = self._chart.trails, list[Decision](), list[Loop]()
+        for loop in self._taken_back:
+            if not (trails.has(loop.a) and trails.has(loop.b)):
+                continue
+            if self._keeps_apart(loop.a.agent, loop.b.agent) or self.forbids(loop):
+                left.append(loop)
+            else:
+                decisions.append(self._judge.decide(loop))
+        self._taken_back = left
+        undone = tuple(x for d in decisions for x in d.dropped)
+        return tuple(x for d in decisions for x in d.tied if x not in undone), undone
 
     def _keeps_apart(self, one: str, other: str) -> bool:
         return bool(self.agreement.forbids([one], [other]))
