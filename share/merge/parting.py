@@ -69,10 +69,11 @@ class Parting:
         a, b = self._chart.ends(loop)
         edge = Edge(a, b, loop.T_a_b, loop.cov)
         stretches = self._chart.stretch_of(loop.a), self._chart.stretch_of(loop.b)
-        before = self.agreement.apart, self.agreement.disputed
+        before, unproven = (self.agreement.apart, self.agreement.disputed), self.agreement.subjects.unproven
+        to_compare = len(unproven)
         changed = self.agreement.witness(agents, stretches, edge, scale, self._tilt(edge))
         self._put_right()
-        if not changed:
+        if not changed and len(unproven) == to_compare:
             return Parted()
         now = self.agreement.apart, self.agreement.disputed
         who = map(self.agreement.subjects.newest, (before[0] ^ now[0]).union(*(before[1] ^ now[1])))

@@ -317,6 +317,15 @@ def test_loops_that_were_taken_back_wait_while_anything_forbids_them():
     assert not parting._taken_back
 
 
+def test_loops_that_were_taken_back_are_judged_once_who_was_to_be_compared_is():
+    atlas, loops = pair_that_met()
+    atlas._parting.agreement.subjects.unproven.add("bob")
+    said = [atlas.witness(loop, Scale(0.0, 0.005)) for loop in loops]
+    assert "bob" not in atlas._parting.agreement.subjects.unproven
+    assert sum(len(parted.tied) for parted in said) > len(loops) / 2
+    assert not any(parted.standing for parted in said)
+
+
 def test_a_loop_that_is_believed_again_and_undone_at_once_is_not_said_to_be_tied():
     def decide(loop: Loop) -> Decision:
         return Decision(True, "", None, (loop,), (loops[0],) if loop is loops[1] else ())
