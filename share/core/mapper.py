@@ -15,14 +15,7 @@ from share.config import Config
 from share.core.concern import Concern
 from share.core.finding import Finding, in_map
 from share.core.gating import Gating
-from share.core.keeping import (
-    Change,
-    DropLoop,
-    KeepLoop,
-    KeepPoses,
-    Kept,
-    KeptKeyframe,
-)
+from share.core.keeping import Change, DropLoop, KeepLoop, KeepPoses, Kept, KeptKeyframe
 from share.core.lookups import Lookups, form_of, served_as
 from share.core.map_news import changes_of, kept_link, placed_again
 from share.core.search import Effort, Search
@@ -115,7 +108,8 @@ class Mapper:
         number = self._atlas.add_keyframe(agent, keyframe, rank=self._rank(agent))
         self._see(number, agent, keyframe)
         self._lookups.add(agent, served_as(self._config, self._hellos[agent]), number, is_extra)
-        findings = [] if keyframe.reference >= 0 else [self._founding(agent, keyframe)]
+        founds = keyframe.reference < 0 or (link is not None and link.reference is None)
+        findings = [self._founding(agent, keyframe)] if founds else []
         self._thin()
         return findings
 
@@ -352,9 +346,8 @@ class Mapper:
         most = self._config.edge.max_keyframes
         if not self._leaving and len(self._atlas) > max(most * _SLACK, self._crowded):
             self._leaving = self._atlas.redundant(len(self._atlas) - most)
-            self._crowded = (
-                0.0 if self._leaving else len(self._atlas) * _SLACK
-            )  # nothing may go: not each time
+            # Where nothing may go, it is not asked each time.
+            self._crowded = 0.0 if self._leaving else len(self._atlas) * _SLACK
         if not self._leaving:
             return
         self._see_restored()
@@ -366,7 +359,7 @@ class Mapper:
         self._counts["taken_out"] += len(taken)
         self._changes += changes_of(taken)
         empty = {out.key.agent for out in taken if self._atlas.is_forgotten(out.key.agent)}
-        self._emptied += [Key(agent, self._accounts[agent].newest) for agent in empty]
+        self._emptied += [Key(agent, self._accounts[agent].newest) for agent in sorted(empty)]
 
     # ------------------------------------------------------------------ report
 

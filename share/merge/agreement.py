@@ -335,7 +335,7 @@ class Agreement:
         """What is sure of everybody's scale; nothing of those kept apart, for their maps are theirs."""
         kept_apart = self.apart.union(*self.disputed)
         known = self._scales(kept_apart)
-        for agent in known.keys() | self.scale.keys():
+        for agent in sorted(known.keys() | self.scale.keys()):
             log, sigma = known.get(agent, (0.0, 1.0))
             was = self.scale.get(agent, 0.0)
             now = log if abs(log) > (_TELLS_STILL if was else _TELLS) * sigma else 0.0

@@ -1,8 +1,9 @@
-"""How sure agents say they are of their odometry, beside each other.
+"""How sure agents are of their odometry, beside each other, by what they say and as far as it is believed.
 
 Nothing shows in loops yet when two maps are joined, and who is surest bends the others. So until loops
 tell, nobody is believed to be much surer than the surest of the others: by variances of its steps over their
-size, in the median, for position and for turn.
+size, in the median, for position and for turn. The covariances come here as they are believed, with their
+floors (`share.merge.floors`): a claim far below a floor counts as the floor, and is widened from there.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from share.merge.agreement import Agreement, Standing
 from share.merge.chart import Chart, shortened
 from share.merge.held import tilt_between
 from share.merge.join import Loop
-from share.merge.judge import Judge
+from share.merge.judge import Decision, Judge
 from share.merge.thinning import TakenOut
 from share.place.scale import Scale
 from share.place.verify import Sight
@@ -69,10 +69,11 @@ class Parting:
         a, b = self._chart.ends(loop)
         edge = Edge(a, b, loop.T_a_b, loop.cov)
         stretches = self._chart.stretch_of(loop.a), self._chart.stretch_of(loop.b)
-        before = self.agreement.apart, self.agreement.disputed
+        before, unproven = (self.agreement.apart, self.agreement.disputed), self.agreement.subjects.unproven
+        to_compare = len(unproven)
         changed = self.agreement.witness(agents, stretches, edge, scale, self._tilt(edge))
         self._put_right()
-        if not changed:
+        if not changed and len(unproven) == to_compare:
             return Parted()
         now = self.agreement.apart, self.agreement.disputed
         who = map(self.agreement.subjects.newest, (before[0] ^ now[0]).union(*(before[1] ^ now[1])))
@@ -162,16 +163,20 @@ class Parting:
         return out
 
     def _give_back(self) -> tuple[tuple[Loop, ...], tuple[Loop, ...]]:
-        """Loops that were taken back, of agents that are no longer kept apart, are judged anew: those that
-        are believed, and those that are not because of them."""
-        some = [x for x in self._taken_back if not self._keeps_apart(x.a.agent, x.b.agent)]
-        self._taken_back = [x for x in self._taken_back if x not in some]
-        decisions = [
-            self._judge.decide(loop)
-            for loop in some
-            if self._chart.trails.has(loop.a) and self._chart.trails.has(loop.b) and not self.forbids(loop)
-        ]
-        return tuple(x for d in decisions for x in d.tied), tuple(x for d in decisions for x in d.dropped)
+        """Loops that were taken back and that nothing forbids any more are judged anew: those that are
+        believed, and those that are not because of them. The others wait on, as long as their keyframes are
+        there."""
+        trails, decisions, left = self._chart.trails, list[Decision](), list[Loop]()
+        for loop in self._taken_back:
+            if not (trails.has(loop.a) and trails.has(loop.b)):
+                continue
+            if self._keeps_apart(loop.a.agent, loop.b.agent) or self.forbids(loop):
+                left.append(loop)
+            else:
+                decisions.append(self._judge.decide(loop))
+        self._taken_back = left
+        undone = tuple(x for d in decisions for x in d.dropped)
+        return tuple(x for d in decisions for x in d.tied if x not in undone), undone
 
     def _keeps_apart(self, one: str, other: str) -> bool:
         return bool(self.agreement.forbids([one], [other]))

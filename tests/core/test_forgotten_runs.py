@@ -17,6 +17,7 @@ from share.core.mapper import Mapper
 from share.core.peer import known_runs
 from share.geometry import se3
 from share.io.map_store import MapStore
+from share.merge.join import Key, Loop
 from share.types import F64, Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -297,3 +298,24 @@ def test_a_run_is_forgotten_only_with_the_last_of_its_stretches(tmp_path: Path) 
         assert gone in life.mapper.report()["agents"]
         leave(range(9))
         assert gone not in {run.key for run in store.load().runs} | life.mapper.report()["agents"].keys()
+
+
+def test_a_run_that_comes_back_to_nothing_hears_that_it_is_in_a_map_of_its_own(tmp_path: Path) -> None:
+    """It was in ann's; all its keyframes were taken out while it was away."""
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = Life(store)
+        life.run("ann", 1, 20, stays=True)
+        life.run("eve", 100, 5)
+        atlas, mapper = life.mapper._atlas, life.mapper
+        ann, eve = sorted({key.agent for key in mapper.poses().keys})
+        atlas._chart.tie(Loop(Key(ann, 3), Key(eve, 3), np.eye(4), 1e-4 * np.eye(6), 50))
+        assert atlas.current_map(eve) == f"{ann}/0"
+        atlas.take_out([n for n in range(len(atlas)) if atlas.key(n).agent == eve])
+        mapper.present(eve, True)
+        own = Keyframe(5, 4, 5 * S, at(1.0), 1e-6 * np.eye(6), at(5), np.zeros(3), 0.0, EMPTY, 4)
+        (finding,) = mapper.add(eve, own)
+        assert finding.correction is not None
+        assert (finding.agent, finding.correction.map_id) == (eve, f"{eve}/0")
+        assert np.allclose(finding.correction.T_map_odom, np.eye(4))
+        step = Keyframe(6, 5, 6 * S, at(1.0), 1e-6 * np.eye(6), at(6), np.zeros(3), 0.0, EMPTY, 5)
+        assert mapper.add(eve, step) == []

@@ -11,6 +11,8 @@ from share.geometry import se3
 from share.graph.posegraph import Edge
 from share.merge.agreement import Agreement
 from share.merge.atlas import Atlas
+from share.merge.join import Key, Loop
+from share.merge.judge import Decision
 from share.merge.subjects import Subjects
 from share.place.scale import Scale
 
@@ -313,3 +315,64 @@ def test_names_of_one_key_have_one_voice():
                 town.meet(honest, run, 1.05, 12)
         assert apart is None or town.agreement.apart == apart
         assert not apart or not town.agreement.forbids(["ann-1"], ["bob-1"])
+
+
+def pair_that_met(decide=None) -> tuple[Atlas, list[Loop]]:
+    """An atlas of ann and bob, and loops between them that were taken back; decide: in the judge's place."""
+    ann, bob = Walker("ann", 1), Walker("bob", 2, phase=0.3)
+    atlas = Atlas(MergeConfig())
+    for walker in (ann, bob):
+        atlas.enter(walker.name, walker.name)
+        for keyframe in walker.keyframes:
+            atlas.add_keyframe(walker.name, keyframe)
+    loops = near_loops(ann, bob, np.random.default_rng(0))
+    atlas._parting._taken_back = list(loops)
+    if decide is not None:
+        atlas._judge.decide = decide
+    return atlas, loops
+
+
+def test_loops_that_were_taken_back_wait_while_anything_forbids_them():
+    """Bob is not kept apart any more, but has to be compared first."""
+    atlas, loops = pair_that_met()
+    parting, unproven = atlas._parting, atlas._parting.agreement.subjects.unproven
+    unproven.add("bob")
+    assert parting._give_back() == ((), ())
+    unproven.clear()
+    gone = Loop(Key("ann", 99), loops[0].b, loops[0].T_a_b, loops[0].cov, 9)
+    parting._taken_back.append(gone)
+    tied, undone = parting._give_back()
+    assert len(tied) > len(loops) / 2
+    assert not undone
+    assert not parting._taken_back
+
+
+def test_loops_that_were_taken_back_are_judged_once_who_was_to_be_compared_is():
+    atlas, loops = pair_that_met()
+    atlas._parting.agreement.subjects.unproven.add("bob")
+    said = [atlas.witness(loop, Scale(0.0, 0.005)) for loop in loops]
+    assert "bob" not in atlas._parting.agreement.subjects.unproven
+    assert sum(len(parted.tied) for parted in said) > len(loops) / 2
+    assert not any(parted.standing for parted in said)
+
+
+def test_a_loop_that_is_believed_again_and_undone_at_once_is_not_said_to_be_tied():
+    def decide(loop: Loop) -> Decision:
+        return Decision(True, "", None, (loop,), (loops[0],) if loop is loops[1] else ())
+
+    atlas, loops = pair_that_met(decide)
+    tied, undone = atlas._parting._give_back()
+    assert tied == tuple(loops[1:])
+    assert undone == (loops[0],)
+
+
+def test_what_is_put_right_is_so_in_one_order():
+    """Whatever the hashes of their names are."""
+    atlas, done = Atlas(MergeConfig()), list[str]()
+    names = [f"agent{k}" for k in range(10)]
+    for name in names:
+        atlas.add_keyframe(name, Walker(name, 1, n=1).keyframes[0])
+    atlas._parting.agreement.scale = dict.fromkeys(names, 0.01)
+    atlas._chart.rescale = lambda agent, log, width: done.append(agent)
+    atlas._parting._put_right()
+    assert done == names
