@@ -145,3 +145,23 @@ def test_a_copy_of_a_keyframe_that_waits_costs_nothing() -> None:
         edge.handle(Received(m.peer_id(1), encode(keyframe(1, 2000))), 0)
     effects = edge.handle(Received(m.peer_id(1), encode(keyframe(0, 2000))), 0)
     assert [effect.keyframe.id for effect in effects if isinstance(effect, Add)] == [0, 1]
+
+
+def test_what_begins_a_stretch_counts_as_twenty() -> None:
+    allowance, first = Allowance(5.0), keyframe(0, 0)
+    taken = sum(allowance.objection("eve", first, k * S // 50) is None for k in range(50 * 600))
+    assert 60 < taken < 1100
+    assert taken_in(Allowance(5.0), 0, 50, 600) > 10 * taken
+
+
+def test_what_waits_of_a_run_goes_when_it_leaves_and_is_asked_for_again() -> None:
+    edge = Edge(Config(), 8)
+
+    def tell(message: m.Up) -> list[Any]:
+        effects = edge.handle(Received(m.peer_id(1), encode(message)), S)
+        return [decode([bytes(f) for f in e.frames]) for e in effects if isinstance(e, Send)]
+
+    tell(hello_of("eve", 1))
+    assert m.Ack(0, (1,)) in tell(keyframe(1, 2000))
+    tell(m.Bye())
+    assert m.Ack(0, (2,)) in [*tell(hello_of("eve", 1)), *tell(keyframe(2, 0))]

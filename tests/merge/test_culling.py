@@ -71,6 +71,11 @@ def test_a_run_is_over_when_another_of_its_name_has_come_and_it_is_away() -> Non
     assert (owners.is_ended("ann-1"), owners.is_ended("ann-2")) == (False, True)
     owners.forget("ann-2")
     assert owners.name("ann-2") == "ann-2"
+    owners.present("ann-1", False)
+    assert not owners.is_ended("ann-1")  # no run of its name has come after it any more
+    owners.join("ann-3", "ann")
+    owners.forget("ann-3")
+    assert not owners.is_ended("ann-1")
 
 
 @pytest.mark.parametrize(
