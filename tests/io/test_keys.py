@@ -322,7 +322,14 @@ def test_a_list_that_was_damaged_meanwhile_is_said(house: House) -> None:
     path = house.folder / "authorized"
     path.write_text(text(path) + "bob\n")
     said = house.refusals(house.agent(1, house.ann))
-    assert set(said) == {f"nobody is let in: {path}, line 2: is not `share-public-key NAME KEY`"}
+    why = f"nobody is let in: {path}, line 2: is not `share-public-key NAME KEY`"
+    assert set(said) == {why}
+    assert house.edge.trouble() == why
+    keys_before = text(path).removesuffix("bob\n")
+    path.write_text(keys_before)
+    time.sleep(0.12)
+    assert house.edge.receive(0) is None
+    assert house.edge.trouble() is None
 
 
 def test_the_key_of_another_edge(house: House) -> None:
