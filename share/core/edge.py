@@ -18,7 +18,7 @@ from share.core import edge_events as ed
 from share.core.admission import Admission, new_key, other_name
 from share.core.allowance import Allowance
 from share.core.finding import Finding
-from share.core.keeping import Change, ForgetRun, KeepKeyframe, KeepRun
+from share.core.keeping import Change, ForgetRun, KeepKeyframe, KeepRun, KeepVoice
 from share.core.peer import Known, Peer, Refusals, refused_lines
 from share.core.rate import seconds
 from share.core.records import Records
@@ -119,6 +119,8 @@ class Edge:
             return
         if peer is not None and not self._heard(event.peer, peer, message, now_ns):
             return
+        if peer is not None and peer.voice != event.voice:
+            self._spoken_for(peer, event.voice)
         match message:
             case wire.Hello():
                 self._greet(event, message, now_ns)
@@ -227,7 +229,8 @@ class Edge:
                 self._forget(*idle)
             self._admission.came(event, hello, now_ns)
             self._supersede(hello.name, now_ns)
-            self._enter(peer_id, Peer(hello, new_key(hello, self._runs.by_key), now_ns), event.voice)
+            key = new_key(hello, self._runs.by_key)
+            self._enter(peer_id, Peer(hello, key, now_ns, voice=event.voice))
             self._schedule.begin(hello.name)
             joined = f"{hello.kind} '{hello.name}'"
             self._record_seldom(now_ns, "joined the edge", self._runs[peer_id], joined)
@@ -250,9 +253,16 @@ class Edge:
         if peer.newest is not None:
             self._correct(peer_id, peer, peer.newest, now_ns, again=True)
 
-    def _enter(self, peer_id: bytes, peer: Peer, voice: str) -> None:
+    def _enter(self, peer_id: bytes, peer: Peer) -> None:
         self._runs.add(peer_id, peer)
-        self._effects.append(ed.Join(peer.key, peer.hello, voice))
+        self._effects.append(ed.Join(peer.key, peer.hello, peer.voice or ""))
+
+    def _spoken_for(self, peer: Peer, voice: str) -> None:
+        """By another key than before, or by one that was not known."""
+        peer.voice = voice
+        self._effects.append(ed.Speaks(peer.key, voice))
+        if peer.foot is not None:
+            self._keep(KeepVoice(peer.key, voice))
 
     def _forget_emptied(self, now_ns: int) -> None:
         for peer in self._runs.forgettable():
@@ -304,7 +314,9 @@ class Edge:
             peer.refusals.add(complaint, now_ns)
             self._record_seldom(now_ns, "odometry doubted", peer, complaint)
         assert peer.foot is not None
-        run = (KeepRun(peer.key, peer.hello),) if begins else ()  # no run without a keyframe is kept
+        run = (
+            (KeepRun(peer.key, peer.hello, peer.voice),) if begins else ()
+        )  # no run without a keyframe is kept
         self._keep(*run, KeepKeyframe(peer.key, keyframe))
         extra = self._allowance.is_extra(peer.hello.name, now_ns)
         self._effects.append(ed.Add(peer.key, keyframe, extra))

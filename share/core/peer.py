@@ -62,13 +62,15 @@ class Foot:
 @dataclass(frozen=True, eq=False)
 class Known:
     """A run that an earlier life of the edge kept. foot: its last keyframe, None without any.
-    next_keyframe: the number that is asked for. finding: where it is in the map, to be told at once."""
+    next_keyframe: the number that is asked for. finding: where it is in the map, to be told at once. voice: as
+    of `KeepRun`."""
 
     key: str
     hello: Hello
     foot: Foot | None
     next_keyframe: int
     finding: Finding | None = None
+    voice: str | None = ""
 
 
 @dataclass
@@ -109,7 +111,7 @@ class HeldBack:
 @dataclass
 class Peer:
     """safe: all its keyframes below this number will be there after a crash, and so are acknowledged.
-    unsafe: how many are applied and not safe yet."""
+    unsafe: how many are applied and not safe yet. voice: as of `KeepRun`."""
 
     hello: Hello
     key: str  # names this run: the name, and some of the run id
@@ -127,6 +129,7 @@ class Peer:
     greeted: bool = True  # in this life of the edge
     was_heard: bool = True  # likewise
     unsafe: int = 0
+    voice: str | None = ""
 
     @property
     def is_idle(self) -> bool:
@@ -210,17 +213,17 @@ def known_runs(kept: Kept, known_m: float) -> list[Known]:
     out = []
     for run in kept.runs:
         if (found := last.get(run.key)) is None:
-            out.append(Known(run.key, run.hello, None, 0))
+            out.append(Known(run.key, run.hello, None, 0, voice=run.voice))
             continue
         map_id, T_map_body = there[Key(run.key, found.id)]
         if map_id in joined:
-            out.append(Known(run.key, run.hello, Foot.of(found), found.id + 1))
+            out.append(Known(run.key, run.hello, Foot.of(found), found.id + 1, voice=run.voice))
             continue
         T_map_odom = se3.orthonormal(T_map_body @ se3.inverse(found.T_odom_body))
         at_body = None if map_id.startswith(f"{run.key}/") else cov
         at_odom = None if at_body is None else se3.inverse_cov(found.T_odom_body, at_body)
         finding = in_map(run.key, map_id, T_map_odom, found.id, at_odom)
-        out.append(Known(run.key, run.hello, Foot.of(found), found.id + 1, finding))
+        out.append(Known(run.key, run.hello, Foot.of(found), found.id + 1, finding, run.voice))
     return out
 
 

@@ -62,7 +62,7 @@ class Runs(Mapping[bytes, Peer]):
         """One of an earlier life: it is not here, but may go on where it was."""
         asked = run.next_keyframe
         peer = Peer(run.hello, run.key, 0, InOrder(asked), asked, run.foot, gone=True, greeted=False)
-        peer.newest, peer.was_heard = run.finding, False
+        peer.newest, peer.was_heard, peer.voice = run.finding, False, run.voice
         self.add(peer_id(run.hello.run_id), peer)
         if run.foot is None:
             self._emptied[run.key] = -1

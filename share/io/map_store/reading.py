@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from share.core.keeping import KeepPoses, Kept, KeptKeyframe
@@ -21,7 +22,8 @@ def kept(found: Found) -> Kept:
     """What the rows say; they are taken out of `found`. Raises StoreError for another wire version."""
     following = {key: next for _, (key, next, *_) in found.tables["run"]}
     all_runs, bad_runs = _values(found, "run", rows.run)
-    runs = {run.key: run for run in all_runs}
+    voices = rows.voices(found.tables["about"])
+    runs = {run.key: replace(run, voice=voices.get(run.key, "")) for run in all_runs}
     keyframes, bad_keyframes = _values(found, "keyframe", rows.keyframe)
     homeless = [k for k in keyframes if k.key not in runs]
     links, bad_links = _values(found, "link", rows.link)
