@@ -304,19 +304,17 @@ class Edge:
             return []
 
     def _apply(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> None:
-        begins = peer.foot is None
+        # no run without a keyframe is kept
+        run = (KeepRun(peer.key, peer.hello, peer.voice),) if peer.foot is None else ()
         try:
             keyframe, complaint = peer.place(keyframe)
         except ValueError as error:
             self._complain(peer, str(error), now_ns)
             return
         if complaint:
-            peer.refusals.add(complaint, now_ns)
+            peer.doubts.add(complaint, now_ns)
             self._record_seldom(now_ns, "odometry doubted", peer, complaint)
         assert peer.foot is not None
-        run = (
-            (KeepRun(peer.key, peer.hello, peer.voice),) if begins else ()
-        )  # no run without a keyframe is kept
         self._keep(*run, KeepKeyframe(peer.key, keyframe))
         extra = self._allowance.is_extra(peer.hello.name, now_ns)
         self._effects.append(ed.Add(peer.key, keyframe, extra))
@@ -399,15 +397,14 @@ class Edge:
 
     def report(self, mapped: dict[str, Any]) -> dict[str, Any]:
         """edge.json: per agent and in all, but for `series`. mapped: the mapper's report, whose `agents` are
-        by run. An agent's earlier runs stand under their run's own key.
-        """
+        by run. An agent stands under its name, its earlier runs as `Runs.label` has them."""
         of_agents, now_ns = mapped.get("agents", {}), self._now_ns
         return {
             "session": self._session,
             "policy": self._config.edge.policy,
             **mapped,
             "agents": {
-                peer.hello.name if self._runs.is_latest(peer) else peer.key: peer.report(now_ns)
+                self._runs.label(peer): peer.report(now_ns)
                 | self._report_of(peer)
                 | of_agents.get(peer.key, {})
                 for peer in self._runs.values()

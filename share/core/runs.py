@@ -46,6 +46,12 @@ class Runs(Mapping[bytes, Peer]):
         """Whether no other run of that name came, or came back, after it."""
         return next(reversed(self._of_name[peer.hello.name])) == peer.key
 
+    def label(self, peer: Peer) -> str:
+        """Of this run in reports: its name, if it is the latest of that; else also the end of its key, behind
+        a character that is in no name, so that no name can be taken for it."""
+        name = peer.hello.name
+        return name if self.is_latest(peer) else f"{name}/{peer.key.removeprefix(f'{name}-')}"
+
     def add(self, peer_id: bytes, peer: Peer) -> None:
         """It is its name's present one from now on."""
         self._peers[peer_id] = peer

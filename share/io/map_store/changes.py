@@ -32,8 +32,8 @@ def apply(db: sqlite3.Connection, change: Change) -> None:
     match change:
         case KeepRun():
             _run(db, change)
-        case KeepVoice(key, voice):
-            _voice(db, key, voice)
+        case KeepVoice(run, voice):
+            _voice(db, run, voice)
         case KeepKeyframe():
             _keyframe(db, change)
         case KeepLink():
