@@ -15,6 +15,7 @@ from share.io.map_store.scan import Found
 from share.merge.join import Key
 
 _TIED = "keyframes lost the one before them and are tied to an earlier one"
+_ABOUT = "rows about the file, and who speaks for which run, could not be read"
 _UNSOLVED = "solutions could not be read: odometry and loops say where keyframes are"
 
 
@@ -33,6 +34,7 @@ def kept(found: Found) -> Kept:
     there = {k.at for k in whole.keyframes}
     tied = tuple(loop for loop in loops if loop.a in there and loop.b in there)
     lost = [
+        _counted(found, "about", found.lost["about"], _ABOUT),
         _counted(found, "run", bad_runs, "agent runs could not be read"),
         _counted(found, "keyframe", bad_keyframes, "keyframes could not be read"),
         _counted(found, "", len(homeless), "keyframes are of a run that could not be read"),
