@@ -7,7 +7,6 @@ own and answers with findings; what must survive a crash goes to the keeper, whi
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -19,7 +18,7 @@ from share.core.admission import Admission, new_key, other_name
 from share.core.allowance import Allowance
 from share.core.finding import Finding
 from share.core.keeping import Change, ForgetRun, KeepKeyframe, KeepRun, KeepVoice
-from share.core.peer import Known, Peer, Refusals, refused_lines
+from share.core.peer import Known, Peer, Strangers, refused_lines
 from share.core.rate import seconds
 from share.core.records import Records
 from share.core.runs import Runs
@@ -53,8 +52,7 @@ class Edge:
         self._config, self._session = config, session
         self._runs = Runs()
         self._schedule = Schedule(config.control, config.edge.policy)
-        self._strangers: Counter[str] = Counter()
-        self._strangers_refused = Refusals()
+        self._strangers = Strangers()
         self._admission = Admission(config.edge, self.tracks)
         self._allowance = Allowance(self._schedule.most_hz)
         self._records, self._versions = Records(began_ns), OtherVersions()
@@ -104,7 +102,7 @@ class Edge:
 
     def _receive(self, event: ed.Received, now_ns: int) -> None:
         peer = self._runs.get(event.peer)
-        counts = self._counts(peer)
+        counts = self._of(peer).counts
         counts["bytes_up"] += sum(len(frame) for frame in event.frames)
         try:
             message = decode(event.frames)
@@ -159,20 +157,20 @@ class Edge:
                 self._unexpected(peer, message, now_ns)
 
     def _unexpected(self, peer: Peer | None, message: wire.Message, now_ns: int) -> None:
-        self._counts(peer)["unexpected"] += 1
+        self._of(peer).counts["unexpected"] += 1
         what = "before its hello" if peer is None else "which is not an agent's to send"
-        self._refusals(peer).add(f"a {type(message).__name__} {what}", now_ns)
+        self._of(peer).refusals.add(f"a {type(message).__name__} {what}", now_ns)
 
     def _other_version(self, peer_id: bytes, error: VersionError, now_ns: int) -> None:
-        self._strangers["other_version"] += 1
+        self._strangers.counts["other_version"] += 1
         if (reason := self._versions.refusal(peer_id, error, now_ns)) is not None:
             self._refuse(peer_id, reason, now_ns, error.version)
 
     def _complain(self, peer: Peer | None, reason: str, now_ns: int) -> None:
         """Counts a bad message; says the first of each peer."""
-        counts = self._counts(peer)
+        counts = self._of(peer).counts
         counts["bad_messages"] += 1
-        self._refusals(peer).add(reason, now_ns)
+        self._of(peer).refusals.add(reason, now_ns)
         if counts["bad_messages"] == 1:
             self._record(now_ns, "bad message", peer, reason)
 
@@ -243,7 +241,7 @@ class Edge:
 
     def _refuse(self, peer_id: bytes, reason: str, now_ns: int, version: int = VERSION) -> None:
         self._send(peer_id, wire.Refused(reason), version)
-        self._refusals(self._runs.get(peer_id)).add(reason, now_ns)
+        self._of(self._runs.get(peer_id)).refusals.add(reason, now_ns)
         self._record_seldom(now_ns, "refused", None, reason)
 
     def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
@@ -367,11 +365,11 @@ class Edge:
 
     def _send(self, peer_id: bytes, message: wire.Down, version: int = VERSION) -> None:
         frames = encode(message, version)
-        self._counts(self._runs.get(peer_id))["bytes_down"] += sum(len(frame) for frame in frames)
+        self._of(self._runs.get(peer_id)).counts["bytes_down"] += sum(len(frame) for frame in frames)
         self._effects.append(ed.Send(peer_id, frames))
 
-    def _counts(self, peer: Peer | None) -> Counter[str]:
-        return peer.counts if peer else self._strangers
+    def _of(self, peer: Peer | None) -> Peer | Strangers:
+        return peer or self._strangers
 
     def _record(self, now_ns: int, what: str, peer: Peer | None, reason: str, **fields: Any) -> None:
         agent = peer.hello.name if peer else None
@@ -382,9 +380,6 @@ class Edge:
         agent = peer.hello.name if peer else None
         if (record := self._records.seldom(now_ns, what, agent, reason, **fields)) is not None:
             self._effects.append(record)
-
-    def _refusals(self, peer: Peer | None) -> Refusals:
-        return peer.refusals if peer else self._strangers_refused
 
     def series(self) -> dict[str, Any]:
         """Of every agent, its evaluations and what came of them (`share.core.schedule`)."""
@@ -409,8 +404,8 @@ class Edge:
                 | of_agents.get(peer.key, {})
                 for peer in self._runs.values()
             },
-            "strangers": dict(self._strangers),
-            "refused": refused_lines(self._runs.values(), self._strangers_refused, now_ns),
+            "strangers": dict(self._strangers.counts),
+            "refused": refused_lines(self._runs.values(), self._strangers, now_ns),
             "internal_errors": self._internal_errors,
             "forgotten_runs": self._runs.forgotten,
             "version": __version__,

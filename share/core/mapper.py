@@ -83,8 +83,7 @@ class Mapper:
 
     def speaks(self, agent: str, voice: str) -> None:
         """See `Speaks`."""
-        if agent in self._hellos:  # else a damaged file has lost it
-            self._atlas.enter(agent, self._hellos[agent].name, voice)
+        self._atlas.enter(agent, self.name(agent), voice)
 
     def name(self, agent: str) -> str:
         """Of the agent whose run it is."""

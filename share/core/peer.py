@@ -190,6 +190,14 @@ class Peer:
         }
 
 
+@dataclass
+class Strangers:
+    """Peers that have not joined, all as one."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    refusals: Refusals = field(default_factory=Refusals)
+
+
 _COUNTS = (
     "keyframes",
     "poses",
@@ -202,12 +210,12 @@ _COUNTS = (
 )
 
 
-def refused_lines(peers: Iterable[Peer], strangers: Refusals, now_ns: int) -> list[str]:
+def refused_lines(peers: Iterable[Peer], strangers: Strangers, now_ns: int) -> list[str]:
     """Who sends again and again what is refused or doubted: a line each."""
     found: dict[str, list[Refusals]] = {}
     for peer in peers:
         found.setdefault(f"agent '{peer.hello.name}'", []).extend((peer.refusals, peer.doubts))
-    found["peers that have not joined"] = [strangers]
+    found["peers that have not joined"] = [strangers.refusals]
     lines = ((who, one.line(now_ns)) for who, several in found.items() for one in several)
     return [f"{who}: {line}" for who, line in lines if line]
 

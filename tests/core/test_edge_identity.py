@@ -140,12 +140,11 @@ def test_no_name_is_taken_for_an_earlier_run_of_another() -> None:
     edge, number = Edge(Config(), 7), next(n for n in range(10**6) if m.public_tag(n).startswith("0001"))
     tell(edge, hello_of("eve-0001", SECRET), None)
     for run, now_ns in ((number, 1), (5, 2)):
-        effects = tell(edge, hello_of("eve", run), None, run, now_ns)
+        tell(edge, hello_of("eve", run), None, run, now_ns)
         tell(edge, m.Bye(), None, run, now_ns)
     assert of(tell(edge, keyframe(0), None, now_ns=3), ed.Add)
-    mapped = {"agents": {"eve-0001": {"map_id": "hers"}, edge._runs[m.peer_id(SECRET)].key: {"map_id": "own"}}}
-    report = edge.report(mapped)
-    agents = report["agents"]
+    own = edge.report({})["agents"]["eve-0001"]["run"]
+    agents = edge.report({"agents": {"eve-0001": {"map_id": "hers"}, own: {"map_id": "own"}}})["agents"]
     assert agents.keys() == {"eve-0001", "eve", "eve/0001"}
     assert (agents["eve-0001"]["gone"], agents["eve-0001"]["keyframes"]) == (False, 1)
     assert (agents["eve-0001"]["map_id"], agents["eve/0001"]["map_id"]) == ("own", "hers")
@@ -156,13 +155,12 @@ def test_no_name_is_taken_for_an_earlier_run_of_another() -> None:
 
 def test_earlier_runs_of_two_names_are_never_one_entry() -> None:
     """Whatever comes after whatever."""
-    edge, now_ns = Edge(Config(), 7), 0
+    edge, run = Edge(Config(), 7), 0
     for name in ("a", "a-b", "a-b.c", "a"):
-        for number in range(3):
-            now_ns += 1
-            run = now_ns
-            tell(edge, hello_of(name, run), None, run, now_ns * 10**10)
-            tell(edge, m.Bye(), None, run, now_ns * 10**10)
+        for _ in range(3):
+            run += 1
+            tell(edge, hello_of(name, run), None, run, run * 10**10)
+            tell(edge, m.Bye(), None, run, run * 10**10)
     agents = edge.report({})["agents"]
     assert len(agents) == 12
     assert len({agent["run"] for agent in agents.values()}) == 12

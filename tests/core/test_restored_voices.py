@@ -83,7 +83,6 @@ def test_a_restored_run_has_the_voice_that_was_kept_until_another_is_heard(kept:
     voice = mapper._atlas._parting.agreement.subjects.voice
     assert [voice(name) for name in KEYS] == ["A", kept, kept]
     mapper.speaks("e2", "F")
-    mapper.speaks("lost with a damaged file", "E")
     assert [voice(name) for name in KEYS] == ["A", kept, "F"]
     mapper.join("e2-2", replace(people[2].hello, run_id=5), "")
     assert voice("e2") not in (None, "A", "E", "F")  # without a key a name has one of its own
