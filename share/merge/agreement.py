@@ -311,8 +311,10 @@ class Agreement:
         agree = [names for names, pair in self._pairs.items() if self._agrees(pair)]
         agents = {name for names in self._pairs for name in names}
         suspects = {name for name in agents if self.subjects.follows_one_apart(name, self.apart)}
-        ways = self.subjects.voicings(agents)
-        apart = frozenset.intersection(*(outvoted(disagree, agree, way, suspects) for way in ways))
+        apart = frozenset(agents)
+        for voices in self.subjects.voicings(agents):
+            if apart:  # else no other way can change that
+                apart &= outvoted(disagree, agree, voices, suspects)
         was = self.apart, self.disputed
         self.apart = apart
         self.disputed = frozenset(names for names in disagree if not names & apart)
