@@ -35,7 +35,8 @@ def tell(
 ) -> list[ed.Effect]:
     """names: of its key; None: no keys are used."""
     frames, owned = [bytes(frame) for frame in encode(message)], None if names is None else frozenset(names)
-    return edge.handle(ed.Received(m.peer_id(run_id), frames, owned), round(now_s * S))
+    key = "" if names is None else "its key"
+    return edge.handle(ed.Received(m.peer_id(run_id), frames, owned, key), round(now_s * S))
 
 
 def come(edge: Edge, name: str, run_id: int, now_s: float = 0) -> list[ed.Effect]:
