@@ -34,6 +34,7 @@ _KEPT_NS = 5_000_000_000
 _MOST_KEPT = 4096  # an IMU gives fewer in that time
 _NONE = np.zeros(6, np.bool_)
 _FEW = 3  # samples in a chain: fewer are held against what was before the gap, too
+_NOISE = _MORE / _TIMES  # steps up to this may be so, where there were none before
 _SURE = 12  # samples in a chain, and
 _MOST_OF = 2 / 3  # of all since the beginning: it is over
 _YOUNG, _LOOKED_AT = 40, 64  # samples that a beginning has at most, and with those of the next frame
@@ -213,7 +214,7 @@ class Breaks:
         steps = self._steps
         chains = _chains(stamps, values, steps.max(axis=0, initial=0.0))
         if len(steps) == 0 and len(chains[0]) < len(values):  # not even noise is known
-            usual = np.median(np.abs(np.diff(values, axis=0)), axis=0).clip(max=_MORE / _TIMES)
+            usual = np.median(np.abs(np.diff(values, axis=0)), axis=0).clip(max=_NOISE)
             steps = usual[None]
             chains = _chains(stamps, values, usual)
         if before is not None:
@@ -309,7 +310,7 @@ def _chains(stamps_ns: I64, values: F64, lately: F64) -> list[list[int]]:
         if may.any():
             last = n - 1 - int(np.where(may, length[:n], 0)[::-1].argmax())
             length[n], back[n] = length[last] + 1, last
-            most[n] = np.maximum(most[last], far[last])
+            most[n] = np.maximum(most[last], far[last].clip(max=_NOISE))
     chains = []
     for end in np.flatnonzero(length == length.max()).tolist():
         chain = [end]
