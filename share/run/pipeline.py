@@ -16,7 +16,6 @@ from share.estimator.visual import VisualTracker
 from share.geometry import trackable
 from share.geometry.camera import Rig
 from share.io.images import load
-from share.io.live import LiveSource
 from share.io.source import Source
 from share.types import Frame, ImuBatch
 
@@ -58,7 +57,7 @@ def frames_of(
         source.imu_range,
     )
     left_out, silent = _LeftOut(on_bad or partial(_lose, source)), set(_NO_MEASUREMENTS)
-    stopped = None if rig.imu is None or isinstance(source, LiveSource) else _Stopped(say)
+    stopped = None if rig.imu is None or source.tells_silence else _Stopped(say)
     for bundle in bundles:
         if stopped is not None:
             stopped.look(bundle)
