@@ -175,9 +175,7 @@ def test_so_is_a_wrong_one_among_them_and_anything(gap_at: int | None) -> None:
         assert begun(values, [first + 12], gap_at)[0] == list(range(at, at + length))
 
 
-@pytest.mark.parametrize(
-    ("gap_at", "count", "by"), [(None, 1, 80.0), (None, 8, 80.0), (100, 1, 20.0), (100, 8, 80.0)]
-)
+@pytest.mark.parametrize(("gap_at", "count", "by"), [(None, 1, 80.0), (None, 8, 80.0), (100, 8, 20.0)])
 def test_what_the_next_frame_outvotes_is_taken_back(gap_at: int | None, count: int, by: float) -> None:
     values, first, right = walking(130), gap_at or 0, 2 if count > 1 else 0
     values[first : first + count, [1, 5]] += [-by / 4, by]
@@ -189,20 +187,31 @@ def test_what_the_next_frame_outvotes_is_taken_back(gap_at: int | None, count: i
     from_ns = past * STEP + (GAP if gap_at else 0)
     told = breaks.doubt(from_ns, from_ns + STEP)  # whoever has heard it is unsure from now on
     assert told is not None and not told.axes.any()
-    off = np.array([by / 4, by]) * count * STEP * 1e-9
+    off = np.array([by / 4, by]) * (count * STEP + (GAP if gap_at else 0)) * 1e-9
     assert told.turn == pytest.approx(min(off[0], 0.3), rel=0.2)
     assert told.speed == pytest.approx(min(off[1], 3.0), rel=0.2)
     assert samples._most.max() < 20  # nor is it the end of a scale
 
 
-def test_a_lone_one_after_a_gap_is_held_against_those_before_it() -> None:
+@pytest.mark.parametrize(("count", "by"), [(1, 5.0), (1, 30.0), (8, 10.0)])
+def test_those_that_alone_came_after_a_gap_are_held_against_what_was_before(count: int, by: float) -> None:
     values = walking(130)
-    assert begun(values, [100, 101], 100)[0] == []
-    values[100, 2] += 30.0
-    out, breaks, _ = begun(values, [100, 101], 100)
-    assert out == [100] and breaks.taken_back == []
-    told = breaks.doubt(100 * STEP + GAP, 101 * STEP + GAP)
+    assert begun(values, [100, 100 + count], 100)[0] == []
+    values[100 : 100 + count, 2] += by
+    out, breaks, _ = begun(values, [100, 100 + count], 100)
+    assert out == list(range(100, 100 + count)) and breaks.taken_back == []
+    told = breaks.doubt(100 * STEP + GAP, (100 + count) * STEP + GAP)
     assert told is not None and told.axes.tolist() == [False, False, True, False, False, False]
+
+
+def test_where_they_may_be_right_the_filter_is_unsure_of_the_gap() -> None:
+    values = walking(104)
+    values[100:, 2] += 4.0
+    out, breaks, _ = begun(values, [100], 100)
+    assert out == []
+    told = breaks.doubt(99 * STEP, 99 * STEP + GAP)
+    assert told is not None and not told.axes.any()
+    assert told.turn == pytest.approx(4.0 * (GAP + STEP) * 1e-9, rel=0.2)
 
 
 def test_an_imu_slower_than_that_is_believed() -> None:

@@ -97,6 +97,7 @@ class Breaks:
         self._stamp_ns, self._value = 0, np.zeros(6)  # of the last that was believed
         self._steps = np.zeros((0, 6))  # the last few between such
         self._newest: tuple[int, F64] | None = None  # of any
+        self._step_ns = 0  # from the one before to that
         self._run: deque[F64] = deque(maxlen=_LATELY)  # steps, of the doubted too, while a run goes on
         self._since_ns: int | None = None  # of its first sample,
         self._until_ns = 0  # and of its last so far
@@ -133,8 +134,10 @@ class Breaks:
                 if odd:
                     self._look(stamps_ns, steps)
                 self._steps = np.concatenate([self._steps, steps])[-_LATELY:]
+                if len(stamps_ns) > 1:
+                    self._hear(int(stamps_ns[-2]), values[-2])
+                self._hear(int(stamps_ns[-1]), values[-1])
                 self._stamp_ns, self._value = int(stamps_ns[-1]), values[-1]
-                self._newest = (self._stamp_ns, self._value)
                 if self._beginning is not None:
                     self._go_on(self._beginning, stamps_ns, values, np.ones(len(values), np.bool_))
                 return None
@@ -144,7 +147,8 @@ class Breaks:
             if self._newest is None:
                 self._beginning = _Beginning(None)
             elif stamp_ns - self._newest[0] > _APART_NS:
-                self._beginning = _Beginning((self._stamp_ns, self._value))
+                is_gap = 0 < self._step_ns <= _APART_NS  # and not as far as they always are
+                self._beginning = _Beginning((self._stamp_ns, self._value) if is_gap else None)
             if self._beginning is None:
                 good[k] = self._is_good(stamp_ns, self._newest, values[k])
                 k += 1
@@ -184,13 +188,10 @@ class Breaks:
         known = [n for n in chain if n < old]
         first = known[-1] if known else chain[0]  # how things are, from here on
         good = np.zeros(len(values), np.bool_)
-        if (
-            not old
-            and len(chain) < _FEW
-            and self._is_far(beginning.before, int(stamps[first]), window[first])
-        ):
-            self._leave_out(stamps_ns, values, self._value)
-            self._newest = (int(stamps_ns[-1]), values[-1])
+        before = None if old else beginning.before
+        if before and self._is_far(before, int(stamps[first]), window[first], len(chain)):
+            self._leave_out(stamps_ns, values, before[1])
+            self._hear(int(stamps_ns[-1]), values[-1])
         else:
             if self._stamp_ns not in stamps[known]:
                 self._take_back(beginning, chain, window[first], int(stamps_ns[0]))
@@ -198,7 +199,7 @@ class Breaks:
             if first >= old:
                 good[first - old] = True
                 self._leave_out(stamps_ns[: first - old], values[: first - old], window[first])
-                self._newest = (int(stamps[first]), window[first])
+                self._hear(int(stamps[first]), window[first])
             for n in range(max(0, first - old + 1), len(values)):
                 good[n] = self._is_good(int(stamps_ns[n]), self._newest, values[n])
         self._go_on(beginning, stamps_ns, values, good)
@@ -221,15 +222,15 @@ class Breaks:
             chains.sort(key=lambda chain: float((np.abs(values[chain[0]] - before[1]) / _MORE).max()))
         return chains[0], steps
 
-    def _is_far(self, before: tuple[int, F64] | None, stamp_ns: int, value: F64) -> bool:
-        """Whether no motion leads there from `before` a gap; what is only odd is minded."""
-        if before is None:
-            return False
-        usual = (stamp_ns - before[0]) / _USUAL_NS
+    def _is_far(self, before: tuple[int, F64], stamp_ns: int, value: F64, count: int) -> bool:
+        """Whether `count` samples after a gap, the first of them this one, cannot be, for what was before
+        it. Where they can, and are odd, the filter is unsure of the time of the gap."""
+        gap_ns = stamp_ns - before[0]
         far, lately = np.abs(value - before[1]), self._steps.max(axis=0, initial=0.0)
-        if (far > usual * (_TIMES * lately + _MORE)).any():
+        times = 1.0 if count < _FEW else gap_ns / _USUAL_NS
+        if (far > times * (_TIMES * lately + _MORE)).any():
             return True
-        self._mind(stamp_ns, far, lately)
+        self._mind(before[0] + 1, far, lately, gap_ns)
         return False
 
     def _leave_out(self, stamps_ns: I64, values: F64, near: F64) -> None:
@@ -246,11 +247,12 @@ class Breaks:
             beginning.believed[n] = False
             self.taken_back.append(beginning.stamps[n])
             self.count += 1
-            self._left.append(_Left(now_ns, _NONE, np.abs(beginning.values[n] - near), _USUAL_NS))
+            step_ns = _USUAL_NS if n or not beginning.before else beginning.stamps[0] - beginning.before[0]
+            self._left.append(_Left(now_ns, _NONE, np.abs(beginning.values[n] - near), step_ns))
 
     def _is_good(self, stamp_ns: int, newest: tuple[int, F64] | None, value: F64) -> bool:
         assert newest is not None
-        self._newest = (stamp_ns, value)
+        self._hear(stamp_ns, value)
         step_ns = stamp_ns - newest[0]
         far = np.abs(value - self._value)
         between = max(_TIMES, (stamp_ns - self._stamp_ns) / max(step_ns, 1))
@@ -270,12 +272,16 @@ class Breaks:
         self._left.append(_Left(stamp_ns, leaps, np.where(leaps, far, 0.0), step_ns))
         return False
 
-    def _mind(self, stamp_ns: int, step: F64, lately: F64) -> None:
+    def _hear(self, stamp_ns: int, value: F64) -> None:
+        self._step_ns = 0 if self._newest is None else stamp_ns - self._newest[0]
+        self._newest = (stamp_ns, value)
+
+    def _mind(self, stamp_ns: int, step: F64, lately: F64, for_ns: int = _SOFT_NS) -> None:
         """A sample that is believed, whose step (6,) is long beside those before it."""
         if (step > _ODD_TIMES * lately + _ODD_MORE).any():
             self._odd_ns = stamp_ns
             if (soft := step > _TIMES * lately + _SOFT_MORE).any():
-                self._left.append(_Left(stamp_ns, _NONE, np.where(soft, step, 0.0), _SOFT_NS))
+                self._left.append(_Left(stamp_ns, _NONE, np.where(soft, step, 0.0), for_ns))
 
     def _begin(self, stamp_ns: int, value: F64, steps: F64) -> None:
         """As things are from this sample on."""
