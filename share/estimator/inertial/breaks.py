@@ -227,7 +227,7 @@ class Breaks:
         it. Where they can, and are odd, the filter is unsure of the time of the gap."""
         gap_ns = stamp_ns - before[0]
         far, lately = np.abs(value - before[1]), self._steps.max(axis=0, initial=0.0)
-        times = 1.0 if count < _FEW else gap_ns / _USUAL_NS
+        times = gap_ns / _USUAL_NS if count >= _FEW else max(1.0, gap_ns / _SOFT_NS)
         if (far > times * (_TIMES * lately + _MORE)).any():
             return True
         self._mind(before[0] + 1, far, lately, gap_ns)
