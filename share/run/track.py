@@ -44,7 +44,7 @@ def track(
     guard = Guard(say)
     tracker, log, counters = GuardedTracker(source.rig, settings, guard), RunLog(), SequencerCounters()
     stamps, poses = [], []
-    for frame in frames_of(source, settings, counters, spent=log.add_decode):
+    for frame in frames_of(source, settings, counters, spent=log.add_decode, say=say):
         began, cpu = time.perf_counter(), time.process_time()
         result = tracker.track(frame)
         track_ms = 1e3 * (time.perf_counter() - began)

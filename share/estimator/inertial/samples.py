@@ -35,6 +35,8 @@ class Samples:
         good = self._breaks.believed(imu.stamps_ns, values)
         if good is not None:
             imu, values = imu.take(good), values[good]
+        if self._breaks.taken_back:
+            self._take_back(self._breaks.taken_back)
         self._most = np.abs(values).max(axis=0, initial=0.0).clip(self._most)
         self.all = self.all.take(slice(-_KEPT, None)).join(imu)
 
@@ -44,6 +46,10 @@ class Samples:
         out.all, out._most, out._breaks = self.all, self._most, self._breaks.copy()
         out.add(imu)
         return out
+
+    def _take_back(self, stamps_ns: list[int]) -> None:
+        self.all = self.all.take(~np.isin(self.all.stamps_ns, stamps_ns))
+        self._most = np.abs(np.hstack([self.all.gyro, self.all.accel])).max(axis=0, initial=0.0)
 
     @property
     def doubted(self) -> int:
