@@ -19,12 +19,15 @@ from share.emulate.sensor.effects import Effects
 from share.emulate.sensor.exposure import Shot, Shots
 from share.emulate.sensor.imu import ImuStreams, measured
 from share.emulate.sensor.photometry import Imager
+from share.emulate.sensor.vibration import knocks, turning, vibration
 from share.emulate.types import Path
 from share.io.profile_types import Inertial, Profile
 from share.types import F32, F64, I64, U8
 
 _READOUT = 0.9  # of a frame's time is what an exposure can take
-_PHASE, _DROPS, _JITTER, _LAMP, _CAMERA, _DEPTH, _GYRO, _ACCEL = range(8)  # streams of random numbers
+_PHASE, _DROPS, _JITTER, _LAMP, _CAMERA, _DEPTH, _GYRO, _ACCEL, _SHAKING = range(
+    9
+)  # streams of random numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,10 +137,21 @@ class Device:
         index, true = self._stream(sensor.rate_hz, stream).times(path.start_ns, path.end_ns)
         effects = self.effects
         errors = (effects.imu_noise, effects.imu_bias, effects.imu_limits)
-        values = measured(path.inertial(true)[which], sensor, (*self._seed, _GYRO, which), *errors)
+        shaken = path.inertial(true)[which] + self._shaking(true, which)
+        values = measured(shaken, sensor, (*self._seed, _GYRO, which), *errors)
         sigma_ns = effects.imu_jitter_ms * 1e6
         error = clocks.jitter((*self._seed, _JITTER, stream), index, sigma_ns, sensor.rate_hz)
         return self.clock.read(true + error), values
+
+    def _shaking(self, times_ns: I64, which: int) -> F64:
+        """What vibration and knocks add to gyro (0) or accelerometer (1), (N, 3)."""
+        effects, seed = self.effects, (*self._seed, _SHAKING)
+        seconds, out = (times_ns - self._origin_ns) * 1e-9, np.zeros((len(times_ns), 3))
+        if effects.vibration:
+            out += vibration(seconds, effects.vibration, seed)
+        if effects.knocks:
+            out += knocks(seconds, effects.knocks, effects.knock_every_s, seed)
+        return out if which else turning(out)
 
     # -- parts -------------------------------------------------------------------------------
 

@@ -31,6 +31,9 @@ class Effects:
     imu_noise: bool = True
     imu_bias: bool = True
     imu_limits: bool = True  # saturation and digits
+    vibration: float = 0.0  # m/s^2, rms of each axis: a machine's, at 70 to 220 Hz
+    knocks: float = 0.0  # m/s^2 of a knock, as of tiles or heels
+    knock_every_s: float = 1.0  # mean time between knocks
     lamp_every_s: float = 0.0  # mean time between switchings of a lamp; 0: none
     lamp_stops: float = 1.5  # how much a switching changes the light, as a power of two, at most
     drops: float = 0.0  # share of frames that are lost
@@ -69,6 +72,9 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "imu_jitter_ms": (0, 20),
     "time_offset_ms": (-1000, 1000),
     "camera_phase_ms": (0, 1000),
+    "vibration": (0, 50),
+    "knocks": (0, 100),
+    "knock_every_s": (0.05, 1e6),
     "clock_offset_ms": (-1e12, 1e12),
     "clock_drift_ppm": (-1000, 1000),
 }

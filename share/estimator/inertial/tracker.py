@@ -21,7 +21,7 @@ from share.estimator.inertial.features import Looks
 from share.estimator.inertial.health import Agreement, Straying
 from share.estimator.inertial.imu import integrate
 from share.estimator.inertial.keyframes import Keyframes
-from share.estimator.inertial.noise import louder, without
+from share.estimator.inertial.noise import louder, shaken, without
 from share.estimator.inertial.pivot import Pivot
 from share.estimator.inertial.readiness import converged, tilt, waits_for, worth_telling
 from share.estimator.inertial.samples import Samples, coasting, mean_rate, unclipped
@@ -240,7 +240,8 @@ class InertialTracker:
             return True
         clipped, doubt = self._samples.clipped(imu), self._samples.doubt(s.stamp_ns)
         silent = clipped if doubt is None else clipped | doubt.axes
-        noise = without(self._noise, self._coasting, silent)
+        noise = shaken(self._noise, self._samples.latest(to_ns))
+        noise = without(noise, self._coasting, silent)
         imu = unclipped(imu, clipped[:3], self._rate + s.bg)
         self._rate = ekf.propagate(s, imu, to_ns, noise, gravity)
         if doubt is not None:
