@@ -29,8 +29,8 @@ def shaken(imu: ImuNoise, samples: ImuBatch) -> ImuNoise:
     """Densities no smaller than those that the samples themselves show.
 
     Vibration that is too fast for the sampling is, to who integrates the samples, noise that is white from
-    one to the next. A body's motion is smooth beside it: third differences of samples s apart hold 20 times the
-    variance of such noise, and of a motion of frequency f only (2 sin(pi f s))^6, about as much as the
+    one to the next. A body's motion is smooth beside it: third differences of samples s apart hold 20 times
+    the variance of such noise, and of a motion of frequency f only (2 sin(pi f s))^6, about as much as the
     trapezoidal rule leaves of it.
     """
     if len(samples) < _FEWEST:
