@@ -285,8 +285,8 @@ class InertialTracker:
         if good.all():
             ekf.update(s, rows, HP, S)
         elif good.any():
-            twice = np.repeat(good, 2)
-            ekf.update(s, rows.take(good), HP[twice], S[np.ix_(twice, twice)])
+            twice = np.flatnonzero(np.repeat(good, 2))
+            ekf.update(s, rows.take(good), HP.take(twice, axis=0), ekf.square(S, twice))
         seen[rows.which[~good]] = False
         return seen
 
