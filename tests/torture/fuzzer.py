@@ -192,8 +192,10 @@ class Attacker:
         if self.args.valid:
             return self._valid(identity)
         message = self.draw.choice(self.small)
-        if self.args.kind == "hello" and self.draw.random() < 0.3:
-            message = self.corpus.hello(f"m{self.draw.randrange(10**6)}", identity)
+        if self.args.kind == "hello":
+            any_name = f"m{self.draw.randrange(10**6)}"
+            name = any_name if self.draw.random() < 0.3 else own_name(identity, self.args.keys)
+            message = self.corpus.hello(name, identity)
         return mutate(self.draw, message)
 
     def _valid(self, identity: bytes) -> Message:
