@@ -146,7 +146,8 @@ class Device:
     def _shaking(self, times_ns: I64, which: int) -> F64:
         """What vibration and knocks add to gyro (0) or accelerometer (1), (N, 3)."""
         effects, seed = self.effects, (*self._seed, _SHAKING)
-        seconds, out = (times_ns - self._origin_ns) * 1e-9, np.zeros((len(times_ns), 3))
+        seconds = np.asarray((times_ns - self._origin_ns) * 1e-9, np.float64)
+        out = np.zeros((len(seconds), 3))
         if effects.vibration:
             out += vibration(seconds, effects.vibration, seed)
         if effects.knocks:

@@ -34,7 +34,8 @@ def vibration(seconds: F64, rms: float, seed: Seed) -> F64:
         angle = 2 * np.pi * np.interp(seconds, grid, turns)[:, None]
         out += direction[0] * np.sin(angle + phase[0]) + _DOUBLE * direction[1] * np.sin(2 * angle + phase[1])
     usual = np.sqrt(_ROTORS * (1 + _DOUBLE**2) / 2)
-    return rms / usual * out
+    shaken: F64 = rms / usual * out
+    return shaken
 
 
 def knocks(seconds: F64, peak: float, every_s: float, seed: Seed) -> F64:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from share.config import InertialConfig, TrackerConfig
 from share.estimator import relocalise
 from share.estimator.inertial import ekf, find, parsac
-from share.estimator.inertial.beginning import first_state, state_by_camera
+from share.estimator.inertial.beginning import first_state, state_by_camera, unknown_bias
 from share.estimator.inertial.features import Looks
 from share.estimator.inertial.health import Agreement, Straying
 from share.estimator.inertial.imu import integrate
@@ -26,12 +26,12 @@ from share.estimator.inertial.pivot import Pivot
 from share.estimator.inertial.readiness import converged, tilt, waits_for, worth_telling
 from share.estimator.inertial.samples import Samples, coasting, mean_rate, unclipped
 from share.estimator.inertial.scene import Scene
-from share.estimator.inertial.state import State
+from share.estimator.inertial.state import ACCEL_BIAS, GYRO_BIAS, State
 from share.estimator.inertial.window import Window, window_for, without_force
 from share.estimator.localmap import LocalMap
 from share.estimator.result import TrackResult, typical
 from share.geometry import se3
-from share.geometry.camera import ImuNoise, Rig
+from share.geometry.camera import ImuBias, ImuNoise, Rig
 from share.types import F64, U8, Candidate, Footing, Frame, ImuBatch, TrackState, Wait
 from share.vision import corners
 from share.vision.view import measures_depth
@@ -42,6 +42,7 @@ _GAP_NS = 250_000_000  # between frames: more than an IMU of this sort is modell
 _DOUBT = 0.02, 0.1, 0.3  # rad, m, m/s: how wrong the filter may be after it that believes nobody
 _REST_RATE, _REST_M_S = 0.03, 0.02  # rad/s of a body at rest; m/s of its velocity
 _SLOW_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to a filter that knows it moves
+_LEARNT = 0.3  # of the sigma that a bias has which nobody knows
 _PATIENCE = 10  # frames without a sample of the IMU, after which we begin without
 _LEVEL_RAD = np.radians(3.0)  # sigma of tilt up to which others are told what is up
 
@@ -49,10 +50,19 @@ _LEVEL_RAD = np.radians(3.0)  # sigma of tilt up to which others are told what i
 class InertialTracker:
     """Feed frames in order to `track`. Deterministic: the same frames give the same poses."""
 
-    def __init__(self, rig: Rig, config: InertialConfig, places: TrackerConfig, seed: int = 0) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        config: InertialConfig,
+        places: TrackerConfig,
+        seed: int = 0,
+        bias: ImuBias | None = None,
+    ) -> None:
+        """bias: of the IMU, where something is known of it."""
         if rig.imu is None:
             raise ValueError("without an IMU there is VisualTracker")
         self._rig, self._config = rig, config
+        self._bias = unknown_bias(config) if bias is None else bias
         self._noise = louder(rig.imu, config.imu_noise)
         self._coasting = ImuNoise(config.turning_noise, config.moving_noise, 0.0, 0.0, rig.imu.rate_hz)
         self._common = np.diag(np.repeat([config.common_rad**2, config.common_m**2], 3))
@@ -79,6 +89,16 @@ class InertialTracker:
     def state(self) -> State | None:
         """The filter's; for those who look into it."""
         return self._scene.state if self._scene else None
+
+    @property
+    def bias(self) -> ImuBias | None:
+        """Of the IMU, as the filter knows it now; None where it knows no more than at the beginning."""
+        if self._scene is None or not self._ready or not self._knows_up:
+            return None
+        s, diagonal = self._scene.state, np.diag(self._scene.state.cov)
+        gyro, accel = (float(np.sqrt(diagonal[at].max())) for at in (GYRO_BIAS, ACCEL_BIAS))
+        surer = accel < _LEARNT * self._config.accel_bias and gyro < self._config.gyro_bias
+        return ImuBias(s.bg, s.ba, gyro, accel) if surer else None
 
     @property
     def looks(self) -> Looks | None:
@@ -347,11 +367,11 @@ class InertialTracker:
         lost_ns = 0 if self._lost_ns is None else frame.stamp_ns - self._lost_ns
         if found is None and 0 < lost_ns < self._places_config.new_stretch_s * 1e9:
             return TrackResult(waiting, None)
-        state = first_state(frame.stamp_ns, self._samples.all, self._rig, self._config)
+        state = first_state(frame.stamp_ns, self._samples.all, self._rig, self._config, self._bias)
         self._waited += state is None
         self._knows_up = state is not None
         if state is None and self._waited >= _PATIENCE:
-            state = state_by_camera(frame.stamp_ns, self._rig, self._config)
+            state = state_by_camera(frame.stamp_ns, self._rig, self._config, self._bias)
         if state is None:
             return TrackResult(waiting, None, waits=Wait.IMU)
         if found is not None:
