@@ -212,8 +212,8 @@ class Town:
                 case ed.Present(key, here):
                     edge.mapper.present(key, here)
                     self._mapped(edge, [])
-                case ed.Add(key, keyframe):
-                    self._mapped(edge, edge.mapper.add(key, keyframe))
+                case ed.Add(key, keyframe, is_extra):
+                    self._mapped(edge, edge.mapper.add(key, keyframe, is_extra))
                 case ed.Forget(key):
                     edge.mapper.forget(key)
                 case ed.Record(fields):

@@ -24,11 +24,13 @@ class Policy:
     """Of one edge. It answers each evaluation of an agent with the rate that holds from then on.
 
     gated: merges that would add little are skipped (`share.control.gate`). alike: headsets are not served
-    before robots. raw: agents send what their sensors see, the edge tracks each alone, nothing is shared.
+    before robots. limits: no agent is asked for more than `rate_max_hz`. raw: agents send what their sensors
+    see, the edge tracks each alone, nothing is shared.
     """
 
     gated: ClassVar[bool] = False
     alike: ClassVar[bool] = True
+    limits: ClassVar[bool] = True
     raw: ClassVar[bool] = False
 
     def __init__(self, config: ControlConfig) -> None:
@@ -49,6 +51,8 @@ class Policy:
 
 class CovinsG(Policy):
     """Every keyframe is sent, every verified loop is merged."""
+
+    limits = False
 
 
 class Streamed(Policy):

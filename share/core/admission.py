@@ -8,7 +8,7 @@ from math import ceil
 from share.config import EdgeConfig
 from share.core.edge_events import Received
 from share.core.peer import Peer
-from share.core.rate import TokenBucket, seconds
+from share.core.rate import Buckets, TokenBucket, seconds
 from share.wire.messages import Hello, public_tag
 
 # New runs that are taken in: each stays in the report, and in the map once it has a keyframe. Of one name as
@@ -22,12 +22,11 @@ class Newcomers:
 
     def __init__(self) -> None:
         self._all = TokenBucket(_EDGE_BURST, _EDGE_HZ)
-        self._of_name: dict[str, TokenBucket] = {}
+        self._of_name = Buckets(_NAME_BURST, _NAME_HZ)
 
     def objection(self, name: str, now_ns: int) -> str | None:
         """Why no new run of this name may come now, and when one may; None if one may."""
-        of_name = self._of_name.get(name)
-        if of_name is not None and (wait_s := of_name.wait_s(now_ns)):
+        if wait_s := self._of_name.of(name, now_ns).wait_s(now_ns):
             return f"too many new runs of '{name}': try again in {ceil(wait_s)} s"
         if wait_s := self._all.wait_s(now_ns):
             return f"too many new runs of all agents: try again in {ceil(wait_s)} s"
@@ -35,8 +34,7 @@ class Newcomers:
 
     def came(self, name: str, now_ns: int) -> None:
         """A new run of this name, to which there was no objection."""
-        self._of_name = {who: kept for who, kept in self._of_name.items() if not kept.is_full(now_ns)}
-        for bucket in (self._all, self._of_name.setdefault(name, TokenBucket(_NAME_BURST, _NAME_HZ))):
+        for bucket in (self._all, self._of_name.of(name, now_ns)):
             bucket.take(now_ns)
 
 

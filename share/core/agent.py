@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from share.config import Config
@@ -27,7 +28,7 @@ from share.core.versions import EdgeVersion
 from share.core.whereabouts import Whereabouts, pose_update
 from share.core.worth import Worth
 from share.errors import UsageError, VersionError, WireError
-from share.types import F64, Correction, Keyframe
+from share.types import F64, Candidate, Correction, Keyframe
 from share.wire import messages as m
 from share.wire.codec import Bytes, decode, encode, size
 
@@ -89,7 +90,7 @@ class Agent:
             case ev.FrameTracked():
                 self._frame_tracked(event, now_ns)
             case ev.KeyframeMade():
-                self._offer(event, now_ns)
+                self._keyframe_made(event.frame, event.candidate, now_ns)
             case ev.FrameArrived() if self._streaming:
                 self._status.image_came(event.arrived_ns)
                 self._streaming.arrived(event, self._connected)
@@ -156,10 +157,15 @@ class Agent:
         if self._streaming or not frame.keyframe:
             self._frame_done(frame, sent=False)
 
-    def _offer(self, made: ev.KeyframeMade, now_ns: int) -> None:
+    def _keyframe_made(self, frame: ev.FrameTracked, candidate: Candidate | None, now_ns: int) -> None:
+        if candidate is None:
+            self._frame_done(replace(frame, keyframe=False), sent=False)
+        else:
+            self._offer(frame, candidate, now_ns)
+
+    def _offer(self, frame: ev.FrameTracked, candidate: Candidate, now_ns: int) -> None:
         """Makes a keyframe of a candidate, if the rate allows (drop_rate)."""
         self._counts["candidates"] += 1
-        frame, candidate = made.frame, made.candidate
         self._error.processed((now_ns - frame.arrived_ns) / 1e6)
         self._chain.extend(candidate)
         sent = self._bucket.take(now_ns, self._worth.is_rather_high(candidate.view))

@@ -94,8 +94,9 @@ class ClockFilter:
 
     @property
     def asymmetry_ns(self) -> int | None:
-        """What `offset_ns` can be wrong by unseen: half of the least recent round trip by our own clock. That
-        the edge held the question for long is its word: it makes this no less, but more."""
+        """What `offset_ns` can be wrong by unseen, rounded up; None before the first exchange. It is half of
+        the least sum, among recent exchanges, of the round trip by our own clock and the time that the edge
+        says it held the question. Added, so that an edge that says it held it for long makes this more."""
         return -(-min(self._unproven_ns) // 2) if self._unproven_ns else None
 
     @property

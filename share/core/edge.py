@@ -56,7 +56,7 @@ class Edge:
         self._strangers: Counter[str] = Counter()
         self._strangers_refused = Refusals()
         self._admission = Admission(config.edge, self.tracks)
-        self._allowance = Allowance()
+        self._allowance = Allowance(self._schedule.most_hz)
         self._records, self._versions = Records(began_ns), OtherVersions()
         self._internal_errors = 0
         self._safekeeping = Safekeeping(keeps)
@@ -185,6 +185,7 @@ class Edge:
     def _come_back(self, peer: Peer, now_ns: int) -> None:
         self._supersede(peer.hello.name, now_ns)
         peer.gone = False
+        self._runs.came_back(peer)
         self._effects.append(ed.Present(peer.key, True))
         self._record_seldom(now_ns, "back", peer, "is heard again")
 
@@ -201,6 +202,7 @@ class Edge:
 
     def _gone(self, peer: Peer, what: str, reason: str, now_ns: int) -> None:
         peer.gone = True
+        peer.inorder.drop_waiting()
         self._effects.append(ed.Present(peer.key, False))
         self._record_seldom(now_ns, what, peer, reason)
 
@@ -217,7 +219,7 @@ class Edge:
                 self._forget(*idle)
             self._admission.came(hello, now_ns)
             self._supersede(hello.name, now_ns)
-            self._enter(peer_id, Peer(hello, new_key(hello, self._runs.by_key), now_ns))
+            self._enter(peer_id, Peer(hello, new_key(hello, self._runs.by_key), now_ns), event.voice)
             self._schedule.begin(hello.name)
             joined = f"{hello.kind} '{hello.name}'"
             self._record_seldom(now_ns, "joined the edge", self._runs[peer_id], joined)
@@ -240,9 +242,9 @@ class Edge:
         if peer.newest is not None:
             self._correct(peer_id, peer, peer.newest, now_ns, again=True)
 
-    def _enter(self, peer_id: bytes, peer: Peer) -> None:
+    def _enter(self, peer_id: bytes, peer: Peer, voice: str) -> None:
         self._runs.add(peer_id, peer)
-        self._effects.append(ed.Join(peer.key, peer.hello))
+        self._effects.append(ed.Join(peer.key, peer.hello, voice))
 
     def _forget_emptied(self, now_ns: int) -> None:
         for peer in self._runs.forgettable():
@@ -270,7 +272,7 @@ class Edge:
 
     def _in_order(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> list[Keyframe]:
         """What can be applied now; nothing of an agent that sends more than is taken in."""
-        if keyframe.id >= peer.inorder.next_keyframe:  # else it costs nothing
+        if peer.inorder.is_new(keyframe.id):  # else it costs nothing
             name = peer.hello.name
             reason = peer.too_many() or self._allowance.objection(name, keyframe, now_ns)
             if reason is not None:
@@ -296,7 +298,8 @@ class Edge:
         assert peer.foot is not None
         run = (KeepRun(peer.key, peer.hello),) if begins else ()  # no run without a keyframe is kept
         self._keep(*run, KeepKeyframe(peer.key, keyframe))
-        self._effects.append(ed.Add(peer.key, keyframe))
+        extra = self._allowance.is_extra(peer.hello.name, now_ns)
+        self._effects.append(ed.Add(peer.key, keyframe, extra))
 
     def _keep(self, *changes: Change) -> None:
         if (keep := self._safekeeping.keep(changes)) is not None:

@@ -31,6 +31,11 @@ class Received:
     def speaks_for(self, name: str) -> bool:
         return self.names is None or name in self.names
 
+    @property
+    def voice(self) -> str:
+        """See `Join`."""
+        return min(self.names, default="") if self.names else ""
+
 
 @dataclass(frozen=True)
 class Found:
@@ -92,18 +97,22 @@ class Send:
 
 @dataclass(frozen=True)
 class Join:
-    """To the mapper: a run of an agent, before its first keyframe."""
+    """To the mapper: a run of an agent, before its first keyframe. voice: the same for all names that one key
+    speaks for, where agents vote; empty: the name's own."""
 
     key: str
     hello: wire.Hello
+    voice: str = ""
 
 
 @dataclass(frozen=True)
 class Add:
-    """To the mapper: the next keyframe of a run, each once and in order."""
+    """To the mapper: the next keyframe of a run, each once and in order. is_extra: more than its agent may
+    send; it is looked up only when nothing else waits, and maps may be joined by it."""
 
     key: str
     keyframe: Keyframe
+    is_extra: bool = False
 
 
 @dataclass(frozen=True)

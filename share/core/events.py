@@ -18,7 +18,7 @@ from share.wire.messages import Status
 class FrameTracked:
     """The tracker has a frame's pose. T_odom_body (4, 4) where the state has one.
 
-    arrived_ns, done_ns: when the frame came in and its pose was known. keyframe: it became one, and
+    arrived_ns, done_ns: when the frame came in and its pose was known. keyframe: it is to become one, and
     `KeyframeMade` follows; new_stretch: odometry broke before it. error_cm: expected position error,
     where somebody estimates it. waits: for what the tracker waits before it tells a pose.
     """
@@ -41,10 +41,10 @@ class FrameTracked:
 
 @dataclass(frozen=True, eq=False)
 class KeyframeMade:
-    """What a tracked frame shows to others: made after its pose was out."""
+    """What a tracked frame shows to others: made after its pose was out. candidate: None if that failed."""
 
     frame: FrameTracked
-    candidate: Candidate
+    candidate: Candidate | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +154,8 @@ class CorrectionApplied:
 
 @dataclass(frozen=True)
 class FrameDone:
-    """One per frame, once it is known whether it is sent; so a candidate's comes once its keyframe is made.
+    """One per frame, once it is known whether it is sent; so a candidate's comes once its keyframe is made,
+    or that has failed.
 
     keyframe: the tracker offered it as one. sent: it was given a keyframe id.
     """

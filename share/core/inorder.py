@@ -25,6 +25,14 @@ class InOrder:
         self._hold = hold
         self._waiting: dict[int, Keyframe] = {}
 
+    def drop_waiting(self) -> None:
+        """What is held back was not acknowledged: the agent sends it again."""
+        self._waiting.clear()
+
+    def is_new(self, number: int) -> bool:
+        """Whether no keyframe of that id has been applied, or waits."""
+        return number >= self.next_keyframe and number not in self._waiting
+
     def push(self, keyframe: Keyframe) -> list[Keyframe]:
         """The keyframes, rising by id, that can be applied now that this one is here.
 

@@ -57,7 +57,11 @@ class Lookups:
         for known in (self.skipped, self._waiting, self._weight, self._served):
             known.pop(agent, None)
 
-    def add(self, agent: str, kind: AgentKind, number: int) -> None:
+    def add(self, agent: str, kind: AgentKind, number: int, is_extra: bool = False) -> None:
+        """is_extra: it is passed over at once."""
+        if is_extra:
+            self._pass_over(agent, number)
+            return
         self._weight[agent] = _WEIGHT[kind]
         self._served.setdefault(agent, self._turn)
         self._waiting.setdefault(agent, deque()).append(number)
@@ -81,7 +85,10 @@ class Lookups:
         return self._late.pop() if self._late else None
 
     def _skip(self, agent: str) -> None:
-        self._late.append(self._take(agent, oldest=True))
+        self._pass_over(agent, self._take(agent, oldest=True))
+
+    def _pass_over(self, agent: str, number: int) -> None:
+        self._late.append(number)
         self.skipped[agent] += 1
 
     def _take(self, agent: str, oldest: bool) -> int:

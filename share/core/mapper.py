@@ -15,14 +15,7 @@ from share.config import Config
 from share.core.concern import Concern
 from share.core.finding import Finding, in_map
 from share.core.gating import Gating
-from share.core.keeping import (
-    Change,
-    DropLoop,
-    KeepLoop,
-    KeepPoses,
-    Kept,
-    KeptKeyframe,
-)
+from share.core.keeping import Change, DropLoop, KeepLoop, KeepPoses, Kept, KeptKeyframe
 from share.core.lookups import Lookups, form_of, served_as
 from share.core.map_news import changes_of, kept_link, placed_again
 from share.core.search import Effort, Search
@@ -82,11 +75,11 @@ class Mapper:
         self._ms = {kind: deque[float](maxlen=_TIMES) for kind in ("place", "verify", "solve")}
         self._counts: Counter[str] = Counter()
 
-    def join(self, agent: str, hello: Hello) -> None:
-        """A run of an agent, before its first keyframe."""
+    def join(self, agent: str, hello: Hello, voice: str = "") -> None:
+        """A run of an agent, before its first keyframe. voice: see `Join`."""
         self._hellos[agent] = hello
         self._accounts[agent] = _Account()
-        self._atlas.enter(agent, hello.name)
+        self._atlas.enter(agent, hello.name, voice)
 
     def name(self, agent: str) -> str:
         """Of the agent whose run it is."""
@@ -107,15 +100,16 @@ class Mapper:
         self._closed.loops_tried += closed.loops_tried
         self._closed.merges += closed.merges
 
-    def add(self, agent: str, keyframe: Keyframe) -> list[Finding]:
-        """A keyframe, in order, each once."""
+    def add(self, agent: str, keyframe: Keyframe, is_extra: bool = False) -> list[Finding]:
+        """A keyframe, in order, each once. is_extra: see `Add`."""
         self._accounts[agent].newest = keyframe.id
         keyframe, link = self._atlas.tied(agent, keyframe)
         self._changes += [] if link is None else [kept_link(link)]
         number = self._atlas.add_keyframe(agent, keyframe, rank=self._rank(agent))
         self._see(number, agent, keyframe)
-        self._lookups.add(agent, served_as(self._config, self._hellos[agent]), number)
-        findings = [] if keyframe.reference >= 0 else [self._founding(agent, keyframe)]
+        self._lookups.add(agent, served_as(self._config, self._hellos[agent]), number, is_extra)
+        founds = keyframe.reference < 0 or (link is not None and link.reference is None)
+        findings = [self._founding(agent, keyframe)] if founds else []
         self._thin()
         return findings
 
@@ -133,6 +127,10 @@ class Mapper:
         placed = [placed_again(found, kept.links) for found in kept.keyframes]
         numbers = self._atlas.restore(stretches, placed, kept.loops, poses)
         self._unseen = list(zip(numbers, kept.keyframes, strict=True))
+        for found in kept.keyframes:
+            account = self._accounts.get(found.key)  # a damaged file may have lost its run
+            if account is not None:
+                account.newest = max(account.newest, found.keyframe.id)
 
     def _see_restored(self) -> None:
         for number, found in self._unseen:
@@ -348,9 +346,8 @@ class Mapper:
         most = self._config.edge.max_keyframes
         if not self._leaving and len(self._atlas) > max(most * _SLACK, self._crowded):
             self._leaving = self._atlas.redundant(len(self._atlas) - most)
-            self._crowded = (
-                0.0 if self._leaving else len(self._atlas) * _SLACK
-            )  # nothing may go: not each time
+            # Where nothing may go, it is not asked each time.
+            self._crowded = 0.0 if self._leaving else len(self._atlas) * _SLACK
         if not self._leaving:
             return
         self._see_restored()
@@ -362,7 +359,7 @@ class Mapper:
         self._counts["taken_out"] += len(taken)
         self._changes += changes_of(taken)
         empty = {out.key.agent for out in taken if self._atlas.is_forgotten(out.key.agent)}
-        self._emptied += [Key(agent, self._accounts[agent].newest) for agent in empty]
+        self._emptied += [Key(agent, self._accounts[agent].newest) for agent in sorted(empty)]
 
     # ------------------------------------------------------------------ report
 

@@ -141,14 +141,14 @@ class ModelledMapper:
     def present(self, agent: str, here: bool) -> None:
         """Everybody is told at once here, so it does not matter."""
 
-    def add(self, agent: str, keyframe: Keyframe) -> list[Finding]:
+    def add(self, agent: str, keyframe: Keyframe, is_extra: bool = False) -> list[Finding]:
         run, number = self._runs[agent], len(self._stored)
         k = self._which(run.hello.name, keyframe.stamp_ns)
         T = self._truth.T_world_body[run.hello.name][k]
         self._stored.append(_Stored(agent, keyframe, k, T))
         run.numbers.append(number)
         run.ks.append(k)
-        self._lookups.add(agent, served_as(self._config, run.hello), number)
+        self._lookups.add(agent, served_as(self._config, run.hello), number, is_extra)
         if keyframe.reference >= 0:
             return []
         run.map_of = run.told = f"{agent}/{keyframe.id}"

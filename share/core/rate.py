@@ -70,3 +70,20 @@ class TokenBucket:
         self._seen_ns = now_ns
         if self.hz is not None:
             self._tokens = min(self._burst, self._tokens + self.hz * passed_ns / SECOND_NS)
+
+
+class Buckets:
+    """A token bucket of each key. One that is full is as if it had never been, and is not kept."""
+
+    def __init__(self, burst: float, hz: float | None) -> None:
+        self._burst, self._hz = burst, hz
+        self._kept: dict[str, TokenBucket] = {}
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def of(self, key: str, now_ns: int) -> TokenBucket:
+        if key not in self._kept:
+            self._kept = {one: kept for one, kept in self._kept.items() if not kept.is_full(now_ns)}
+            self._kept[key] = TokenBucket(self._burst, self._hz)
+        return self._kept[key]

@@ -16,16 +16,15 @@ _MAX_FORGOTTEN = (
 
 
 class Runs(Mapping[bytes, Peer]):
-    """By who speaks for them on the link. Each has a key, which names it everywhere else, and the newest of
-    a name is that agent's present one."""
+    """By who speaks for them on the link. Each has a key, which names it everywhere else, and of each name
+    the one that came or came back last is that agent's present one."""
 
     def __init__(self) -> None:
         self._peers: dict[bytes, Peer] = {}
         self._by_key: dict[str, bytes] = {}
-        self._latest: dict[str, Peer] = {}  # run of each name
-        self._emptied: dict[
-            str, int
-        ] = {}  # runs of which the map has nothing any more, and their newest keyframe
+        self._of_name: dict[str, dict[str, Peer]] = {}  # by key, the present one last
+        # runs of which the map has nothing any more, and their newest keyframe
+        self._emptied: dict[str, int] = {}
         self._forgotten: dict[bytes, None] = {}
         self.forgotten = 0  # how many, since the edge began
 
@@ -44,13 +43,20 @@ class Runs(Mapping[bytes, Peer]):
         return self._by_key
 
     def is_latest(self, peer: Peer) -> bool:
-        """Whether no other run of that name came after it."""
-        return self._latest[peer.hello.name] is peer
+        """Whether no other run of that name came, or came back, after it."""
+        return next(reversed(self._of_name[peer.hello.name])) == peer.key
 
     def add(self, peer_id: bytes, peer: Peer) -> None:
         """It is its name's present one from now on."""
-        self._peers[peer_id] = self._latest[peer.hello.name] = peer
+        self._peers[peer_id] = peer
         self._by_key[peer.key] = peer_id
+        self.came_back(peer)
+
+    def came_back(self, peer: Peer) -> None:
+        """It is its name's present one again."""
+        runs = self._of_name.setdefault(peer.hello.name, {})
+        runs.pop(peer.key, None)
+        runs[peer.key] = peer
 
     def recall(self, run: Known) -> None:
         """One of an earlier life: it is not here, but may go on where it was."""
@@ -81,8 +87,10 @@ class Runs(Mapping[bytes, Peer]):
         peer_id = self._by_key.pop(peer.key)
         del self._peers[peer_id]
         self._emptied.pop(peer.key, None)
-        if was_latest := self.is_latest(peer):
-            del self._latest[peer.hello.name]
+        was_latest, name = self.is_latest(peer), peer.hello.name
+        del self._of_name[name][peer.key]
+        if not self._of_name[name]:
+            del self._of_name[name]
         if peer.foot is not None:
             self.forgotten += 1
             self._forgotten[peer_id] = None

@@ -31,6 +31,7 @@ class Schedule:
 
     def __init__(self, config: ControlConfig, policy: str) -> None:
         self._config, self._policy = config, POLICIES[policy](config)
+        self.most_hz = config.rate_max_hz if self._policy.limits else None  # that any agent may send
         self._rated: dict[str, History] = {}  # of all runs of that name
         self._newest: dict[str, Rated] = {}  # of the present one
 

@@ -19,6 +19,7 @@ _OF_AGENT = (
     *((name,) for name in ("keyframes", "poses", "evaluations", "corrections", "bytes_up", "bytes_down")),
     *((name,) for name in ("bad_messages", "unexpected", "queries_skipped", "refused_messages")),
 )
+_MOST_RUNS = 4096  # that are remembered
 
 
 class Totals:
@@ -26,19 +27,24 @@ class Totals:
 
     def __init__(self) -> None:
         self._before: Mapping[str, Any] = {}
+        self._runs: dict[str, Mapping[str, Any]] = {}  # of agents, also those that the last life did not hear
 
     def ended(self, report: Mapping[str, Any]) -> None:
         """A life's last report, with what was `added`."""
         self._before = report
+        for agent in report["agents"].values():
+            self._runs.pop(agent["run"], None)
+            self._runs[agent["run"]] = agent
+        for run in list(self._runs)[:-_MOST_RUNS]:
+            del self._runs[run]
 
     def added(self, report: Mapping[str, Any]) -> dict[str, Any]:
         """A life's report, with the counts of those before it. An agent's are those of the same run."""
         if not self._before:
             return dict(report)
         out = _sum(report, self._before, _OF_ALL)
-        before = {agent["run"]: agent for agent in self._before["agents"].values()}
         out["agents"] = {
-            name: _sum(agent, before.get(agent["run"], {}), _OF_AGENT)
+            name: _sum(agent, self._runs.get(agent["run"], {}), _OF_AGENT)
             for name, agent in report["agents"].items()
         }
         was = self._before["strangers"]

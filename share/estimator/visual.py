@@ -91,7 +91,6 @@ class VisualTracker:
         T_odom_body = self._T_odom_body()
         up = T_odom_body[2, :3] if self._gravity else np.zeros(3)
         T_last_body = T_odom_body if new_stretch else se3.inverse(self._T_shown) @ T_odom_body
-        self._T_shown = T_odom_body
         cov = se3.compose_cov(self._T_cam_body, self._cov, np.zeros((6, 6)))
         self._unsettled = frame, view
         return Candidate(T_odom_body, T_last_body, cov, up, gravity.SIGMA_RAD, view, new_stretch)
@@ -101,6 +100,7 @@ class VisualTracker:
         if self._unsettled is None:
             return
         (frame, view), self._unsettled = self._unsettled, None
+        self._T_shown = self._T_odom_body()  # only now: before, making its candidate might have failed
         if self._to_anchor:
             self._anchor(frame)
         self._map.set_view(view)

@@ -10,7 +10,8 @@ wrong, and they keep a map each. An agent is a subject here, all runs of a name 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Container, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,6 +20,7 @@ from share.graph.posegraph import Edge
 from share.merge.claims import Claims
 from share.merge.consistency import (
     Comparison,
+    Equations,
     Estimate,
     Walked,
     Witness,
@@ -27,6 +29,7 @@ from share.merge.consistency import (
     points_scale,
     solved,
 )
+from share.merge.held import by_gravity, severity_of, told, worst
 from share.merge.subjects import Subjects
 from share.merge.sureness import Meeting, Sureness
 from share.place.scale import Scale
@@ -34,8 +37,7 @@ from share.types import F64
 
 _MOST = 32  # loops kept of two stretches
 _MOST_SCALES = 160
-_SIGMAS = 4.5  # that a difference must have: of thousands of comparisons none by chance
-_TURN, _TILT = np.radians(1.5), np.radians(1.0)  # rad, less does no harm
+_TURN = np.radians(1.5)  # rad, less does no harm
 _NIS = 3.0  # beyond what honest agents are too sure
 _ENOUGH_POINTS, _ENOUGH_PATH = 3, 8  # loops before a comparison by points, or by ways, says anything
 _NEW_POINTS, _NEW_PATH = 6, 12  # newest loops that are looked at on their own
@@ -43,6 +45,7 @@ _INSIDE = 0.6  # of the loops must fit, or they are of more than one place
 _CALM = 0.6  # a disagreement ends below this part of what began it
 _TELLS, _TELLS_STILL = 2.5, 1.25  # sigmas from which on, and down to which, a scale is taken into account
 _SCALE_STEP = 0.001  # log scale that it has to change by
+_PAST: Meeting = (-1, -1)  # newest loops of stretches that are gone
 
 
 @dataclass(frozen=True)
@@ -74,8 +77,8 @@ class _Met:
 
 @dataclass(eq=False)
 class _Pair:
-    """Of two agents, the lesser first. met: by stretches. scales: of more loops, by which what does no harm
-    is put right."""
+    """Of two agents, the lesser first. met: by stretches, those that are gone as one. scales: of more loops,
+    by which what does no harm is put right."""
 
     met: dict[Meeting, _Met] = field(default_factory=dict)
     scales: deque[Scale] = field(default_factory=lambda: deque(maxlen=_MOST_SCALES))
@@ -111,9 +114,10 @@ class Agreement:
         self._walked: dict[int, Walked] = {}
         self._pairs: dict[Names, _Pair] = {}
 
-    def enter(self, run: str, name: str) -> None:
-        """A run of the agent of this name comes; what is held against the name is held against the run."""
-        self.subjects.enter(run, name, self.apart.union(*self.disputed))
+    def enter(self, run: str, name: str, voice: str = "") -> None:
+        """A run of the agent of this name comes; what is held against the name is held against the run.
+        voice: whose names count once; "": the name's own."""
+        self.subjects.enter(run, name, self.apart.union(*self.disputed), voice)
 
     def walk(self, run: str, number: int, before: int | None, T_ref_body: F64, cov: F64) -> None:
         """A new node, by odometry from the one before; None: it begins a stretch."""
@@ -130,10 +134,32 @@ class Agreement:
         """By what the variances of its odometry have to be multiplied to be believed."""
         return self._sureness.factor.get(self.subjects.of(run), 1.0)
 
-    def forget(self, numbers: Collection[int]) -> None:
-        """Nodes that are taken out."""
+    def forget(self, numbers: Collection[int], live: Container[int]) -> None:
+        """Nodes that are taken out. live: stretches that have others. What loops of those that have not said
+        stays only so far as it decides who agrees: a disagreement does not end because its loops went."""
         for number in numbers:
             self._walked.pop(number, None)
+        over = set[Meeting]()
+        for pair in self._pairs.values():
+            if ended := {m for m in pair.met if m != _PAST and not (m[0] in live and m[1] in live)}:
+                over |= ended
+                past = [pair.met.get(_PAST, _Met()), *(pair.met.pop(meeting) for meeting in sorted(ended))]
+                loops = [w for met in past for w in met.loops][-_MOST:]
+                worst = max(past, key=self._severity_of) if pair.disagrees else _Met()
+                pair.met[_PAST] = _Met(loops, worst.ways, worst.newest)
+        self._sureness.leave(sorted(over))
+
+    def leave(self, run: str) -> None:
+        """A run of which nothing is left, and that will not come back. With the last of an agent's goes all
+        that is known of it, but for what is held against its name."""
+        gone = self.subjects.forget(run, self.apart, frozenset[str]().union(*self.disputed))
+        if gone is None:
+            return
+        self._pairs = {names: pair for names, pair in self._pairs.items() if gone not in names}
+        self.apart -= {gone}
+        self.disputed = frozenset(names for names in self.disputed if gone not in names)
+        self.scale.pop(gone, None)
+        self._sureness.remove(gone)
 
     def witness(
         self,
@@ -152,6 +178,7 @@ class Agreement:
             one, other, stretches, edge = other, one, stretches[::-1], edge.reverse()
             scale = None if scale is None else scale.reverse()
         pair = self._pairs.setdefault((one, other), _Pair())
+        self._sureness.met(one, other)
         met = pair.met.setdefault(stretches, _Met())
         a, b = self._walked[edge.a], self._walked[edge.b]
         met.loops.append(Witness(a, b, edge.T_a_b, edge.cov, scale, tilt))
@@ -205,7 +232,7 @@ class Agreement:
         )
 
     def _why(self, unproven: str) -> str:
-        if self.subjects.has_earlier(unproven):
+        if unproven in self.subjects.suspected:
             return "since an earlier run of its name was kept apart"
         return "since the edge was started again"
 
@@ -222,8 +249,8 @@ class Agreement:
         pair.points = _pooled(scales)
         pair.newest = _pooled(list(pair.scales)[-_NEW_POINTS:]) if len(scales) > _NEW_POINTS else None
         pair.gauge = _pooled(pair.scales)
-        self._compare_ways(met, names, meeting)
-        found = [*self._by_points(pair), *_by_gravity(every), *_by_gravity(met.loops[-_ENOUGH_PATH:])]
+        ways = _compared_ways(met)
+        found = [*self._by_points(pair), *by_gravity(every), *by_gravity(met.loops[-_ENOUGH_PATH:])]
         for one in pair.met.values():
             found += [*self._by_ways(one.ways), *self._by_ways(one.newest)]
         pair.doubt = max((severity for severity, _, _ in found), default=0.0)
@@ -231,50 +258,45 @@ class Agreement:
         if pair.disagrees:
             self._sureness.leave(pair.met)
         else:
+            if _PAST in pair.met:
+                pair.met[_PAST].ways = pair.met[_PAST].newest = None
             self._prove(pair, names)
+            if ways is not None and met.ways is not None and not self.apart & {*names}:
+                with suppress(np.linalg.LinAlgError):  # of absurd numbers, which say nothing
+                    self._sureness.take(meeting, names, ways, met.ways.weight)
         said = sorted((f for f in found if f[0] >= _CALM), reverse=True)
-        pair.what, pair.turned = _worst([t for _, t, _ in said]), _worst([t for *_, t in said])
-
-    def _compare_ways(self, met: _Met, names: Names, meeting: Meeting) -> None:
-        """Absurd numbers leave no solution, and say nothing."""
-        met.ways = met.newest = None
-        if len(met.loops) < _ENOUGH_PATH:
-            return
-        try:
-            told = equations(met.loops)
-            met.ways = solved(told)
-            self._sureness.take(meeting, names, told, met.ways.weight)
-            if len(met.loops) > _NEW_PATH:
-                met.newest = compare(met.loops[-_NEW_PATH:])
-        except np.linalg.LinAlgError:
-            return
+        pair.what, pair.turned = worst([t for _, t, _ in said]), worst([t for *_, t in said])
 
     def _prove(self, pair: _Pair, names: Names) -> None:
         """Who was to be compared has been, if the other is not under suspicion itself. What was wrong with a
         name before may have been its way, so there depths are not enough."""
         ways = any(met.ways is not None for met in pair.met.values())
         for one, other in (names, names[::-1]):
-            earlier = self.subjects.has_earlier(one)
+            earlier = one in self.subjects.suspected
             suspect = other in self.apart or (earlier and other in self.subjects.unproven)
             if not suspect and (ways or (self._agrees(pair) and not earlier)):
-                self.subjects.unproven.discard(one)
+                self.subjects.prove(one)
 
     def _by_points(self, pair: _Pair) -> list[tuple[float, str, str]]:
         found = [points for points in (pair.points, pair.newest) if points is not None]
         words = "its depths are {} % {}", ("larger", "smaller")
-        return [_told(points, self._tolerance, *words) for points in found]
+        return [told(points, self._tolerance, *words) for points in found]
 
     def _by_ways(self, ways: Comparison | None) -> list[tuple[float, str, str]]:
         if ways is None:
             return []
         out = []
         if ways.inside >= _INSIDE:
-            out.append(_told(ways.path, self._tolerance, "its way is {} % {}", ("longer", "shorter")))
+            out.append(told(ways.path, self._tolerance, "its way is {} % {}", ("longer", "shorter")))
             turn = f"its camera is turned by {np.degrees(ways.turn.value):.1f} degrees against what it says"
-            out.append((_severity(ways.turn, _TURN), turn, turn))
+            out.append((severity_of(ways.turn, _TURN), turn, turn))
         sure = f"loops are off by {ways.nis:.1f} times the variance that it claims"
         out.append((ways.nis / _NIS, sure, sure))
         return out
+
+    def _severity_of(self, met: _Met) -> float:
+        """By its ways."""
+        return max((s for s, _, _ in (*self._by_ways(met.ways), *self._by_ways(met.newest))), default=0.0)
 
     def _agrees(self, pair: _Pair) -> bool:
         return not pair.disagrees and pair.points is not None and pair.points.sigma < self._tolerance / 2
@@ -290,11 +312,11 @@ class Agreement:
         while left:
             against = self._votes(tuple(names) for names in left)
             rank = {
-                name: (count, self.subjects.follows(name, self.apart), -friends[name])
+                name: (count, self.subjects.follows_one_apart(name, self.apart), -friends[name])
                 for name, count in against.items()
             }
             who = {agent for agent in rank if rank[agent] == max(rank.values())}
-            if len({self.subjects.name(agent) for agent in who}) > 1:
+            if len({self.subjects.voice(agent) for agent in who}) > 1:
                 break
             apart |= who
             left = {names for names in left if not names & who}
@@ -304,15 +326,16 @@ class Agreement:
         return was != (self.apart, self.disputed)
 
     def _votes(self, pairs: Iterable[tuple[str, ...]]) -> Counter[str]:
-        """With how many others each is paired, of whom those of one name count once."""
-        others = {(one, self.subjects.name(b)) for a, b in pairs for one, b in ((a, b), (b, a))}
+        """With how many others each is paired: voices, but for its own."""
+        voice = self.subjects.voice
+        others = {(a, voice(b)) for pair in pairs for a, b in (pair, pair[::-1]) if voice(a) != voice(b)}
         return Counter(one for one, _ in others)
 
     def _gauge(self) -> None:
         """What is sure of everybody's scale; nothing of those kept apart, for their maps are theirs."""
         kept_apart = self.apart.union(*self.disputed)
         known = self._scales(kept_apart)
-        for agent in known.keys() | self.scale.keys():
+        for agent in sorted(known.keys() | self.scale.keys()):
             log, sigma = known.get(agent, (0.0, 1.0))
             was = self.scale.get(agent, 0.0)
             now = log if abs(log) > (_TELLS_STILL if was else _TELLS) * sigma else 0.0
@@ -333,53 +356,28 @@ class Agreement:
             J[row, at[a]], J[row, at[b]] = -1 / points.sigma, 1 / points.sigma
             z[row] = points.value / points.sigma
         x = np.linalg.pinv(J) @ z
-        counts = {self.subjects.name(agent): x[at[agent]] for agent in agents if agent not in self.apart}
-        x -= np.median([*counts.values()] or x)  # a name counts once
+        counts = {self.subjects.voice(agent): x[at[agent]] for agent in agents if agent not in self.apart}
+        x -= np.median([*counts.values()] or x)  # a voice counts once
         sigma = np.sqrt(np.diag(np.linalg.pinv(J.T @ J)))
         return {name: (float(x[i]), float(sigma[i])) for name, i in at.items()}
 
 
-def tilt_between(
-    up_a: F64, sigma_a: float, up_b: F64, sigma_b: float, edge: Edge
-) -> tuple[float, float] | None:
-    """Angle between two ups (3,) across a loop, and its sigma, rad; None if one is not known."""
-    if not up_a.any() or not up_b.any():
+def _compared_ways(met: _Met) -> Equations | None:
+    """Of all of its loops; None where they are too few, or absurd numbers leave no solution."""
+    met.ways = met.newest = None
+    if len(met.loops) < _ENOUGH_PATH:
         return None
-    there = edge.T_a_b[:3, :3] @ up_b
-    cross = np.linalg.norm(np.cross(up_a, there)) / np.linalg.norm(up_a) / np.linalg.norm(up_b)
-    sigma = np.sqrt(sigma_a**2 + sigma_b**2 + np.trace(edge.cov[:3, :3]) / 3)
-    return float(np.arcsin(min(1.0, float(cross)))), float(sigma)
-
-
-def _by_gravity(loops: list[Witness]) -> list[tuple[float, str, str]]:
-    known = np.array([w.tilt for w in loops if w.tilt is not None]).reshape(-1, 2)
-    if len(known) < _ENOUGH_PATH:
-        return []
-    angle, sigmas = float(np.median(known[:, 0])), float(np.median(known[:, 0] / known[:, 1]))
-    text = f"its up is {np.degrees(angle):.1f} degrees off"
-    return [(min(angle / _TILT, sigmas / _SIGMAS), text, text)]
+    with suppress(np.linalg.LinAlgError):
+        tell = equations(met.loops)
+        met.ways = solved(tell)
+        if len(met.loops) > _NEW_PATH:
+            met.newest = compare(met.loops[-_NEW_PATH:])
+        return tell
+    return None
 
 
 def _pooled(scales: Collection[Scale]) -> Estimate | None:
     return points_scale(list(scales)) if len(scales) >= _ENOUGH_POINTS else None
-
-
-def _severity(found: Estimate, harmless: float) -> float:
-    """1 where it is as large as may be, or as sure as must be, whichever comes later."""
-    return min(abs(found.value) / harmless, found.significance / _SIGMAS)
-
-
-def _told(found: Estimate, harmless: float, text: str, words: Names) -> tuple[float, str, str]:
-    """Severity, and the text for either side."""
-    size = f"{100 * abs(np.expm1(found.value)):.1f} ± {100 * np.exp(found.value) * found.sigma:.1f}"
-    more, less = (text.format(size, word) for word in words)
-    return (_severity(found, harmless), *((more, less) if found.value > 0 else (less, more)))
-
-
-def _worst(said: list[str]) -> str:
-    """Of each kind of thing the first."""
-    kinds = {" ".join(text.split()[:2]): text for text in reversed(said)}
-    return ", ".join(text for text in said if text in kinds.values())
 
 
 def _reason(agent: str, bad: list[tuple[Names, _Pair]]) -> str:

@@ -140,10 +140,10 @@ class Atlas:
 
     # ------------------------------------------------------------ what arrives
 
-    def enter(self, agent: str, name: str) -> None:
-        """A run of the agent of this name comes."""
+    def enter(self, agent: str, name: str, voice: str = "") -> None:
+        """A run of the agent of this name comes. voice: of names that count once; "": the name's own."""
         self._owners.join(agent, name)
-        self._parting.enter(agent, name)
+        self._parting.enter(agent, name, voice)
 
     def present(self, agent: str, here: bool) -> None:
         """Who is not heard need not be told where he is, and nobody waits for him. Once he is heard again, a
@@ -155,7 +155,7 @@ class Atlas:
 
     def is_forgotten(self, agent: str) -> bool:
         """Whether it is not heard, and nothing of it is left."""
-        return self._owners.is_absent(agent) and self._chart.trails.newest(agent) is None
+        return self._owners.is_absent(agent) and not self._chart.trails.has_any(agent)
 
     def forget(self, agent: str) -> None:
         """A run of which nothing is left will not come back."""
@@ -245,7 +245,7 @@ class Atlas:
         live = {chart.founder[stretch] for stretch in chart.trails.live}
         chart.unsolved = dict.fromkeys(founder for founder in chart.unsolved if founder in live)
         self._judge.forget({out.key for out in taken})
-        self._parting.agreement.forget([out.number for out in taken])
+        self._parting.agreement.forget([out.number for out in taken], chart.trails.live)
         return taken
 
     def propose(self, loop: Loop) -> Decision:

@@ -1,15 +1,17 @@
 """Which keyframes go where there are too many: fair between names, and what is over before what goes on.
 
-The unit is the name, not the run: nobody has more by starting again and again. Of a name that has to give
-go, in this order: what looks like another keyframe in maps that are over, the same in the others, whole maps
-that are over, the smallest first, and then what is most alike. A map is over where nobody walks in it any
-more and only one name ever did.
+The unit is the name, not the run: nobody has more by starting again and again. All names that are away count
+as one beside those that are heard: any number of them takes no more of these than one would. Of a name that
+has to give go, in this order: what looks like another keyframe in maps that are over, the same in the others,
+whole maps that are over, the smallest first, and then what is most alike. A map is over where nobody walks in
+it any more and only one name ever did.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from enum import Enum, auto
 
 import numpy as np
 
@@ -19,7 +21,17 @@ from share.merge.chart import Chart
 from share.merge.owners import Owners, dues
 from share.merge.thinning import redundant
 
+_AWAY = ""  # no name
 _ALIKE = 1.0  # nearer than this in the measure of `redundant` two keyframes are of one place
+
+
+class Awaited(Enum):
+    """What stays for the return of who is away, the most first: its newest keyframes, and something of its
+    map; only this; nothing."""
+
+    WITH_PLACES = auto()
+    IN_MAPS = auto()
+    NOBODY = auto()
 
 
 class Culling:
@@ -30,26 +42,28 @@ class Culling:
 
     def choose(self, count: int) -> list[int]:
         """Numbers of so many keyframes, if there are as many that may go. The newest of a run that is away
-        stay for its return, unless there is no other way."""
-        chosen = self._chosen(count, return_expected=True)
-        return chosen if len(chosen) >= count else self._chosen(count, return_expected=False)
+        stay for its return, and something of a map in which nobody is heard, if there is another way."""
+        for awaited in Awaited:
+            if len(chosen := self._chosen(count, awaited)) >= count:
+                break
+        return chosen
 
     def may_go(self, number: int) -> bool:
         """Whether a keyframe can be taken out now."""
         chart = self._chart
         stretch = chart.trails.nodes[number].stretch
         nodes, founder = chart.trails.stretches[stretch].nodes, chart.founder[stretch]
-        if self._walks(stretch, return_expected=False) and number in nodes[-self._config.min_loop_gap :]:
+        if self._walks(stretch, Awaited.NOBODY) and number in nodes[-self._config.min_loop_gap :]:
             return False
-        if self._is_over(chart.stretches_of(founder)):
+        if self._is_over(chart.stretches_of(founder), Awaited.NOBODY):
             return True
         return number != chart.anchor(founder) and (len(nodes) > 1 or stretch not in bridging(chart.bonds))
 
-    def _chosen(self, count: int, return_expected: bool) -> list[int]:
+    def _chosen(self, count: int, awaited: Awaited) -> list[int]:
         maps = self._maps()
-        over = [founder for founder, stretches in maps.items() if self._is_over(stretches)]
+        over = [founder for founder, stretches in maps.items() if self._is_over(stretches, awaited)]
         others = [founder for founder in maps if founder not in set(over)]
-        stay = self._staying(others, return_expected)
+        stay = self._staying(others, awaited)
         due, out = self._due(count, stay), dict[int, None]()
         for founders, below in ((over, _ALIKE), (others, _ALIKE)):
             for founder in founders:
@@ -80,15 +94,28 @@ class Culling:
         """How many keyframes each name gives."""
         held = Counter(map(self._name, self._chart.poses))
         free = Counter(self._name(n) for n in self._chart.poses if n not in stay)
-        return dues(held, free, count, self._owners.heard_of())
+        owners, heard_of = self._owners, self._owners.heard_of()
+        away = {name for name in held if owners.is_away(name)}
+        least = (held.total() - count) // (len(held.keys() - away) + 1) if away else 0
+        for name in held.keys() - away:
+            free[name] = min(free[name], max(0, held[name] - least))
 
-    def _staying(self, founders: Iterable[int], return_expected: bool) -> set[int]:
+        def of_all(counts: Counter[str]) -> Counter[str]:
+            here = Counter({name: n for name, n in counts.items() if name not in away})
+            here[_AWAY] = sum(counts[name] for name in away)
+            return here
+
+        out = dues(of_all(held), of_all(free), count, heard_of)
+        held, free = (Counter({name: counts[name] for name in away}) for counts in (held, free))
+        return out + dues(held, free, out.pop(_AWAY, 0), heard_of)
+
+    def _staying(self, founders: Iterable[int], awaited: Awaited) -> set[int]:
         """The newest of every agent that walks on, and of these maps what holds their gauge, or them
         together."""
         chart, trails = self._chart, self._chart.trails
         out = {chart.anchor(founder) for founder in founders}
         for stretch in trails.live:
-            if self._walks(stretch, return_expected):
+            if self._walks(stretch, awaited):
                 out.update(trails.stretches[stretch].nodes[-self._config.min_loop_gap :])
         for stretch in bridging(chart.bonds):
             nodes = trails.stretches[stretch].nodes
@@ -105,19 +132,20 @@ class Culling:
     def _size(self, stretch: int) -> int:
         return len(self._chart.trails.stretches[stretch].nodes)
 
-    def _is_over(self, stretches: Sequence[int]) -> bool:
+    def _is_over(self, stretches: Sequence[int], awaited: Awaited) -> bool:
         """Whether nobody walks in the map of these any more and only one name ever did."""
         agents = {self._chart.trails.stretches[s].agent for s in stretches}
-        return len(set(map(self._owners.name, agents))) == 1 and not any(
-            self._walks(s, return_expected=True) for s in stretches
-        )
+        if awaited is Awaited.IN_MAPS:
+            awaited = Awaited.WITH_PLACES
+        alone = awaited is Awaited.NOBODY or len(set(map(self._owners.name, agents))) == 1
+        return alone and not any(self._walks(s, awaited) for s in stretches)
 
-    def _walks(self, stretch: int, return_expected: bool) -> bool:
-        """Whether keyframes come to this stretch; return_expected: or would if its agent came back, which has
+    def _walks(self, stretch: int, awaited: Awaited) -> bool:
+        """Whether keyframes come to this stretch, or would if its agent came back and is awaited, which has
         not begun another run."""
         agent, owners = self._chart.trails.stretches[stretch].agent, self._owners
-        here = not (owners.is_ended(agent) if return_expected else owners.is_absent(agent))
-        return here and self._chart.trails.current(agent) == stretch
+        away = owners.is_ended if awaited is Awaited.WITH_PLACES else owners.is_absent
+        return not away(agent) and self._chart.trails.current(agent) == stretch
 
     def _name(self, number: int) -> str:
         return self._owners.name(self._chart.trails.nodes[number].key.agent)

@@ -38,12 +38,18 @@ class Owners:
         self._absent.discard(run)
         if self._latest.get(name) == run:
             del self._latest[name]
+            if left := [one for one in self._name if self._name[one] == name]:
+                self._latest[name] = left[-1]
 
     def name(self, run: str) -> str:
         return self._name.get(run, run)
 
     def is_absent(self, run: str) -> bool:
         return run in self._absent
+
+    def is_away(self, name: str) -> bool:
+        """Whether none of its runs is heard."""
+        return self._latest.get(name, name) in self._absent
 
     def is_ended(self, run: str) -> bool:
         """Whether it is not heard, and another run of its name has come after it."""

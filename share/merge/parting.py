@@ -11,10 +11,11 @@ import numpy as np
 
 from share.geometry import se3
 from share.graph.posegraph import Edge
-from share.merge.agreement import Agreement, Standing, tilt_between
+from share.merge.agreement import Agreement, Standing
 from share.merge.chart import Chart, shortened
+from share.merge.held import tilt_between
 from share.merge.join import Loop
-from share.merge.judge import Judge
+from share.merge.judge import Decision, Judge
 from share.merge.thinning import TakenOut
 from share.place.scale import Scale
 from share.place.verify import Sight
@@ -42,13 +43,13 @@ class Parting:
         self._chart, self._judge, self._sights = chart, judge, sights
         self._taken_back: list[Loop] = []
 
-    def enter(self, run: str, name: str) -> None:
+    def enter(self, run: str, name: str, voice: str = "") -> None:
         """A run of the agent of this name comes: what is known of the name holds for it."""
-        self.agreement.enter(run, name)
+        self.agreement.enter(run, name, voice)
 
     def forget(self, run: str) -> None:
         """Nothing is left of it, and it will not come back."""
-        self.agreement.subjects.forget(run)
+        self.agreement.leave(run)
         self._chart.scale.pop(run, None)
         self._chart.width.pop(run, None)
 
@@ -68,10 +69,11 @@ class Parting:
         a, b = self._chart.ends(loop)
         edge = Edge(a, b, loop.T_a_b, loop.cov)
         stretches = self._chart.stretch_of(loop.a), self._chart.stretch_of(loop.b)
-        before = self.agreement.apart, self.agreement.disputed
+        before, unproven = (self.agreement.apart, self.agreement.disputed), self.agreement.subjects.unproven
+        to_compare = len(unproven)
         changed = self.agreement.witness(agents, stretches, edge, scale, self._tilt(edge))
         self._put_right()
-        if not changed:
+        if not changed and len(unproven) == to_compare:
             return Parted()
         now = self.agreement.apart, self.agreement.disputed
         who = map(self.agreement.subjects.newest, (before[0] ^ now[0]).union(*(before[1] ^ now[1])))
@@ -118,16 +120,19 @@ class Parting:
 
     def _put_right(self) -> None:
         agreement, chart = self.agreement, self._chart
-        for agent in {chart.trails.stretches[stretch].agent for stretch in chart.trails.live}:
+        for agent in sorted({chart.trails.stretches[stretch].agent for stretch in chart.trails.live}):
             told = agreement.scale_of(agent), agreement.widened(agent)
             if told != (self._scale_of(agent), chart.width.get(agent, 1.0)):
                 chart.rescale(agent, *told)
 
     def restored(self) -> None:
         """An earlier life's map. Who was set apart is not known, but he was not in the map of most agents."""
+        subjects = self.agreement.subjects
         maps = [self._agents_of(founder) for founder in sorted(set(self._chart.founder))]
-        most = max(maps, key=len, default=set[str]())
-        self.agreement.subjects.doubt(set[str]().union(*maps) - (most if len(most) > 1 else set()))
+        names = [set(map(subjects.name, agents)) for agents in maps]
+        most = max(range(len(maps)), key=lambda i: len(names[i]), default=0)
+        trusted = maps[most] if maps and len(names[most]) > 1 else set[str]()
+        subjects.doubt(set[str]().union(*maps) - trusted)
 
     def _part(self) -> tuple[Loop, ...]:
         """Take back what ties agents that are kept apart: first the loops between them, then the fewest
@@ -158,16 +163,20 @@ class Parting:
         return out
 
     def _give_back(self) -> tuple[tuple[Loop, ...], tuple[Loop, ...]]:
-        """Loops that were taken back, of agents that are no longer kept apart, are judged anew: those that
-        are believed, and those that are not because of them."""
-        some = [x for x in self._taken_back if not self._keeps_apart(x.a.agent, x.b.agent)]
-        self._taken_back = [x for x in self._taken_back if x not in some]
-        decisions = [
-            self._judge.decide(loop)
-            for loop in some
-            if self._chart.trails.has(loop.a) and self._chart.trails.has(loop.b) and not self.forbids(loop)
-        ]
-        return tuple(x for d in decisions for x in d.tied), tuple(x for d in decisions for x in d.dropped)
+        """Loops that were taken back and that nothing forbids any more are judged anew: those that are
+        believed, and those that are not because of them. The others wait on, as long as their keyframes are
+        there."""
+        trails, decisions, left = self._chart.trails, list[Decision](), list[Loop]()
+        for loop in self._taken_back:
+            if not (trails.has(loop.a) and trails.has(loop.b)):
+                continue
+            if self._keeps_apart(loop.a.agent, loop.b.agent) or self.forbids(loop):
+                left.append(loop)
+            else:
+                decisions.append(self._judge.decide(loop))
+        self._taken_back = left
+        undone = tuple(x for d in decisions for x in d.dropped)
+        return tuple(x for d in decisions for x in d.tied if x not in undone), undone
 
     def _keeps_apart(self, one: str, other: str) -> bool:
         return bool(self.agreement.forbids([one], [other]))

@@ -12,28 +12,41 @@ from collections.abc import Collection, Iterable
 
 class Subjects:
     """Of runs. A subject is called as its first run is; one that nobody announced is its own, of its own
-    name. unproven: subjects that are yet to be compared with others before they come into a map with them."""
+    name. unproven: subjects that are yet to be compared with others before they come into a map with them;
+    suspected: those of them whose name was under suspicion. A name's voice is its key's, where keys are used:
+    one key counts once."""
 
     def __init__(self) -> None:
         self.unproven: set[str] = set()
+        self.suspected: set[str] = set()
+        self._voices: dict[str, str] = {}  # of each name
         self._of: dict[str, str] = {}
         self._names: dict[str, str] = {}
         self._runs: dict[str, list[str]] = {}
         self._newest: dict[str, str] = {}  # of each name
+        self._held: dict[str, bool] = {}  # names of suspects that are gone, and whether one was set apart
 
-    def enter(self, run: str, name: str, suspects: Iterable[str]) -> None:
+    def enter(self, run: str, name: str, suspects: Iterable[str], voice: str = "") -> None:
         """A run of this name; suspects: subjects that are. What is known already changes nothing."""
+        if voice:
+            self._voices[name] = voice
         if run in self._of:
             return
         before = self._newest.get(name)
-        if before is not None and before not in self.unproven.union(suspects):
+        if before is not None and before not in self.suspected.union(suspects):
             self._add(run, before)
             return
         self._names[run] = name
         self._newest[name] = run
         self._add(run, run)
-        if before is not None:
+        if before is not None or name in self._held:
             self.unproven.add(run)
+            self.suspected.add(run)
+
+    def prove(self, subject: str) -> None:
+        """It has been compared, and agrees."""
+        self.unproven.discard(subject)
+        self.suspected.discard(subject)
 
     def doubt(self, runs: Collection[str]) -> None:
         """Of an earlier life, of which nothing else is known: those of each name are a subject, unproven."""
@@ -47,6 +60,7 @@ class Subjects:
             self._names[first], self._newest[name] = name, first
             self._add(run, first)
         self.unproven = {first for (_, doubted), first in firsts.items() if doubted}
+        self.suspected = set()
 
     def _add(self, run: str, subject: str) -> None:
         self._of[run] = subject
@@ -54,12 +68,27 @@ class Subjects:
         if run not in runs:
             runs.append(run)
 
-    def forget(self, run: str) -> None:
-        """A run that will not come back. What is known of its name stays, with its newest run."""
-        runs = self._runs.get(self.of(run), [])
-        if len(runs) > 1 and run in runs:
+    def forget(self, run: str, apart: Collection[str], disputed: Collection[str]) -> str | None:
+        """A run that will not come back; apart, disputed: subjects that are. Returns its subject if that was
+        its last run. What is held against that is held against the next run of its name."""
+        subject = self.of(run)
+        runs = self._runs.get(subject, [run])
+        if run in runs:
             runs.remove(run)
-            del self._of[run]
+            self._of.pop(run, None)
+        if runs:
+            return None
+        name, newest = self.name(subject), self._newest.get(self.name(subject)) == subject
+        if subject in self.suspected.union(apart, disputed):
+            self._held[name] = self._held.get(name, False) or subject in apart
+        elif newest:
+            self._held.pop(name, None)
+        if newest:
+            del self._newest[name]
+        self.prove(subject)
+        self._runs.pop(subject, None)
+        self._names.pop(subject, None)
+        return subject
 
     def of(self, run: str) -> str:
         return self._of.get(run, run)
@@ -69,13 +98,17 @@ class Subjects:
         subject = self.of(run)
         return self._names.get(subject, subject)
 
+    def voice(self, subject: str) -> str:
+        """Whose it is: names of one key have one."""
+        return self._voices.get(self.name(subject), self.name(subject))
+
     def newest(self, subject: str) -> str:
         """Its newest run."""
         return self._runs.get(subject, [subject])[-1]
 
-    def has_earlier(self, run: str) -> bool:
-        """Whether another subject of its name came before."""
-        return self.follows(run, self._names)
+    def follows_one_apart(self, run: str, apart: Iterable[str]) -> bool:
+        """Whether another subject of its name was set apart; apart: those that are still there."""
+        return self.follows(run, apart) or self._held.get(self.name(run), False)
 
     def follows(self, run: str, some: Iterable[str]) -> bool:
         """Whether one of these is another subject of its name."""

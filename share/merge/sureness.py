@@ -33,7 +33,8 @@ _ENOUGH = 8  # such loops
 _PRIOR_DOF = 4.0  # of an agent
 _LOOP_PRIOR, _LOOP_DOF = 1.7, 12.0  # honest loops are a little too sure, see `consistency`
 _LEAST, _MOST = 0.25, 1e4
-_TELLS, _CHANGES = 2.0, 1.25  # variance from which on it is taken into account; by what part it has to change
+_TELLS, _TELLS_STILL = 2.0, 1.5  # variance from which on, and down to which, it is taken into account
+_CHANGES = 1.25  # by what part it has to change
 
 Meeting = tuple[int, int]  # two stretches
 
@@ -64,12 +65,17 @@ class Sureness:
         if self._claims.add(agent, T_ref_body, cov):
             self._settle()
 
+    def met(self, one: str, other: str) -> None:
+        """There is a loop between these agents."""
+        self._claims.met(one, other)
+
     def take(self, meeting: Meeting, agents: tuple[str, str], e: Equations, weight: F64) -> None:
         """What loops of two stretches say by now, of weight (N,) each; it takes the place of what they said
         before. Raises LinAlgError where absurd numbers leave no solution."""
+        self.met(*agents)
         fits = np.flatnonzero(weight > _FITS)
         if len(fits) < _ENOUGH:
-            self._told.pop(meeting, None)
+            self.leave([meeting])
             return
         now = [self._now.get(agent, self._claims.least(agent)) for agent in agents]
         factors = np.array([*now, self._loops.get(meeting, _LOOP_PRIOR)])
@@ -77,17 +83,26 @@ class Sureness:
         self._settle()
 
     def leave(self, meetings: Iterable[Meeting]) -> None:
-        """What these loops say is of two worlds."""
-        for meeting in meetings:
-            self._told.pop(meeting, None)
+        """What these loops say is of two worlds, or of what is gone."""
+        gone = [meeting for meeting in meetings if self._told.pop(meeting, None) is not None]
+        if gone:
+            self._settle()
 
     def forget(self, agents: Collection[str]) -> None:
         """What these and others say of each other is of two worlds; nobody is measured by what they claim."""
+        if self._claims.leave_out(agents):
+            self._settle()
         self.leave([meeting for meeting, told in self._told.items() if set(told.agents) & set(agents)])
-        self._claims.leave_out(agents)
+
+    def remove(self, agent: str) -> None:
+        """Nothing is left of it."""
+        self._told = {meeting: told for meeting, told in self._told.items() if agent not in told.agents}
+        self._claims.remove(agent)
+        self._settle()
+        self.factor.pop(agent, None)
 
     def _settle(self) -> None:
-        agents = sorted({name for told in self._told.values() for name in told.agents} | self._claims.agents)
+        agents = sorted({name for told in self._told.values() for name in told.agents})
         at, n = {name: i for i, name in enumerate(agents)}, len(agents)
         size = n + len(self._told)
         q, F, made_with = np.zeros(size), np.zeros((size, size)), np.full(size, _MOST)
@@ -103,11 +118,12 @@ class Sureness:
         found = np.linalg.solve(F + np.diag(sure), q + sure * prior).clip(_LEAST, _MOST)
         self._loops = dict(zip(self._told, found[n:].tolist(), strict=True))
         self._now = dict(zip(agents, found[:n].tolist(), strict=True))
-        for name in agents:
-            self._tell(name, self._now[name])
+        for name in sorted({*agents, *self.factor, *self._claims.agents}):
+            self._tell(name, self._now.get(name, self._claims.least(name)))
 
     def _tell(self, name: str, now: float) -> None:
-        was, now = self.factor.get(name, 1.0), now if now > _TELLS else 1.0
+        was = self.factor.get(name, 1.0)
+        now = now if now > (_TELLS_STILL if was > 1 else _TELLS) else 1.0
         if max(now / was, was / now) > _CHANGES:
             self.factor[name] = now
 

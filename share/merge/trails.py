@@ -97,6 +97,10 @@ class Trails:
         nodes = self.stretches[self._current[agent]].nodes if agent in self._current else []
         return nodes[-1] if nodes else None
 
+    def has_any(self, agent: str) -> bool:
+        """Whether a node of the agent is left, on any of its stretches."""
+        return any(self.stretches[number].agent == agent for number in self.live)
+
     def has(self, key: Key) -> bool:
         return key in self._at
 

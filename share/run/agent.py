@@ -196,13 +196,16 @@ class AgentRun:
         self._post(tracked)  # the pose goes out before others are served
         self._log.add_result(result.new_stretch, result.sound, result.waits)
         if result.keyframe:
-            self._tracker.attempt("making a keyframe", frame, partial(self._keyframe, frame, tracked))
+            self._keyframe(frame, tracked)
         self._log.imu_doubted = self._tracker.doubted
         self._log.cpu_s += time.thread_time() - cpu
 
     def _keyframe(self, frame: Frame, tracked: ev.FrameTracked) -> None:
-        self._post(ev.KeyframeMade(tracked, self._errors.keyframe(frame, self._tracker)))
-        self._tracker.settle()
+        make = partial(self._errors.keyframe, frame, self._tracker)
+        candidate = self._tracker.attempt("making a keyframe", frame, make)
+        self._post(ev.KeyframeMade(tracked, candidate))
+        if candidate is not None:
+            self._tracker.attempt("settling a keyframe", frame, self._tracker.settle)
 
     def _post(self, event: ev.AgentEvent) -> None:
         """Waits for room, as long as anybody takes what is posted."""

@@ -56,6 +56,7 @@ from share.io.map_store import MapStore
 from share.io.transport import EdgeLink
 from share.process import Heap
 from share.run.companion import Companion
+from share.run.guard import Guard
 from share.run.keeper import Keeper
 from share.run.mapping import Mapped, Restore, Restored, SolverLost, map_all
 from share.run.restarts import Restarts
@@ -121,9 +122,10 @@ class EdgeRun:
         self._trouble: dict[str, float] = {}  # what to say until when
         self._of_agents: dict[str, float] = {}  # the same, where it is one agent's alone
         self._report: dict[str, Any] = {}
-        self._report_at = 0.0
+        self._report_at = self._noted_at = 0.0  # when the next is due, and when there was one last
         self._heap = Heap()
         self._totals = Totals()
+        self._guard = Guard(lambda text: self._say("internal error", text))
         self._begin(self._found())
 
     def stop(self) -> None:
@@ -139,7 +141,7 @@ class EdgeRun:
                 self._step()
         finally:
             self.close()
-            self._note()
+            self._try_to_note()
             self._report["series"] = self._machine.series()
             self._finish(self._report)
         if self._incomplete is not None:
@@ -166,11 +168,16 @@ class EdgeRun:
 
     def report(self) -> dict[str, Any]:
         """As edge.json, 0.1 s old, and `trouble`: what is wrong now. From any thread."""
-        report, late_s = self._report, time.monotonic() - self._report_at
+        report, late_s = self._report, time.monotonic() - self._noted_at - _REPORT_S
         if not report or late_s < _STUCK_S:
             return report
         stuck = f"the edge has been stuck for {late_s:.0f} s; what is shown of agents is as old as that"
         return {**report, "trouble": [stuck, *report["trouble"]]}
+
+    def _try_to_note(self) -> None:
+        """A fault of ours costs this report, which is then shown to be old."""
+        with self._guard.step("a report"):
+            self._note()
 
     def _note(self) -> None:
         """A report, and when the next is due."""
@@ -190,6 +197,7 @@ class EdgeRun:
             "uptime_s": round((time.monotonic_ns() - self._began_ns) * 1e-9, 3),
             **({} if self._solved_at is None else {"last_solve_s": round(now - self._solved_at, 3)}),
         }
+        self._noted_at = now
 
     def _standstill(self, now: float) -> str | None:
         """Which process does not go on though it is alive, if one does not."""
@@ -261,7 +269,7 @@ class EdgeRun:
         if self._begin_at is not None and time.monotonic() >= self._begin_at:
             self._begin_anew(self._waits_for)
         if time.monotonic() >= self._report_at:
-            self._note()
+            self._try_to_note()
 
     def _take_answers(self) -> None:
         while not self._inbox.empty():

@@ -26,6 +26,7 @@ class GuardedTracker:
         self._make = partial(tracker_of, rig, config)
         self._tracker, self._guard = self._make(), guard
         self._has_posed = False  # since it failed last
+        self._doubted = 0  # by trackers before this one
 
     def track(self, frame: Frame) -> TrackResult:
         result = self.attempt("tracking a frame", frame, lambda: self._tracker.track(frame))
@@ -65,8 +66,8 @@ class GuardedTracker:
 
     @property
     def doubted(self) -> int:
-        """How many IMU samples this tracker did not believe."""
-        return self._tracker.doubted
+        """How many IMU samples were not believed, since the beginning."""
+        return self._doubted + self._tracker.doubted
 
     def _give_up(self, frame: Frame) -> None:
         had_posed, self._has_posed = self._has_posed, False
@@ -76,4 +77,5 @@ class GuardedTracker:
                 return
         except Exception as error:
             self._guard.note("looking for itself again", error)
+        self._doubted += self._tracker.doubted
         self._tracker = self._make()

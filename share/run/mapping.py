@@ -128,7 +128,7 @@ class _Mapping:
                 self._mapper.restore(message.kept)
                 self._is_restoring = True
             case Join():
-                self._mapper.join(message.key, message.hello)
+                self._mapper.join(message.key, message.hello, message.voice)
             case Present():
                 self._mapper.present(message.key, message.here)
             case Forget():
@@ -149,7 +149,7 @@ class _Mapping:
             spent_ms = 0.0 if self._ended else 1e3 * (time.perf_counter() - began)
             if (add := self._turns.next(spent_ms)) is None:
                 return
-            work = partial(self._mapper.add, add.key, add.keyframe)
+            work = partial(self._mapper.add, add.key, add.keyframe, add.is_extra)
             self._findings += self._guarded("keyframe", work, [], add.key)
 
     def _guarded(self, what: str, work: Callable[[], T], otherwise: T, agent: str | None = None) -> T:

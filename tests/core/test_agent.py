@@ -225,6 +225,20 @@ def test_a_lost_frame_has_no_pose_but_is_done() -> None:
     assert only(ev.FrameDone, effects)[0].state is TrackState.LOST
 
 
+def test_a_keyframe_that_could_not_be_made_leaves_a_frame_that_is_done() -> None:
+    agent = welcomed()
+    handle(agent, tracked(0, pose(0), candidate=True), 0)
+    frame = tracked(1, pose(1), candidate=True)
+    effects = agent.handle(frame, 60 * MS) + agent.handle(ev.KeyframeMade(frame, None), 70 * MS)
+    assert only(ev.FrameDone, effects) == [
+        ev.FrameDone(frame.stamp_ns, 4.0, TrackState.OK, keyframe=False, sent=False)
+    ]
+    assert not only(Keyframe, effects, messages=True)
+    [after] = only(Keyframe, handle(agent, tracked(2, pose(2), candidate=True), 100 * MS), messages=True)
+    assert (after.id, after.reference, agent.report()["candidates"]) == (1, 0, 2)
+    np.testing.assert_allclose(after.T_ref_body, pose(2))
+
+
 def test_poses_go_relative_to_the_last_keyframe_that_the_edge_has() -> None:
     agent = welcomed()
     handle(agent, tracked(0, pose(1), candidate=True), 0)

@@ -146,3 +146,14 @@ def test_exchanges_out_of_order_do_no_harm() -> None:
     for k in np.argsort(np.arange(240) + rng.uniform(0, 3, 240)):
         clock.update(*stamps[k])
     assert abs(error_us(clock, world, 120 * S)) < 150
+
+
+def test_what_an_edge_says_it_held_a_question_for_adds_to_what_may_be_wrong() -> None:
+    clock = ClockFilter(ClockConfig())
+    assert clock.asymmetry_ns is None
+    clock.update(0, S + 400 * US, S + 500 * US, 900 * US)
+    assert clock.asymmetry_ns == 500 * US  # half of 900 and 100
+    clock.update(S, 2 * S + 100 * US, 2 * S + 700 * US, S + 800 * US)  # on its way for 200 only, as it says
+    assert clock.asymmetry_ns == 500 * US
+    clock.update(2 * S, 3 * S + 100 * US, 3 * S + 101 * US, 2 * S + 200 * US)
+    assert clock.asymmetry_ns == 100_500

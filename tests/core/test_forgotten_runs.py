@@ -17,6 +17,7 @@ from share.core.mapper import Mapper
 from share.core.peer import known_runs
 from share.geometry import se3
 from share.io.map_store import MapStore
+from share.merge.join import Key, Loop
 from share.types import F64, Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -212,3 +213,109 @@ def test_runs_that_never_sent_a_keyframe_leave_the_mapper_too(tmp_path: Path) ->
         for k in range(300):
             life.run(f"n{k}", 1000 + k, 0)
         assert len(life.mapper.report()["agents"]) <= 258
+
+
+def test_a_restored_run_that_is_emptied_is_forgotten_in_this_life(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = Life(store)
+        life.run("ann", 1, 30, stays=True)
+        life.run("eve", 100, 5)
+        life.run("eve", 101, 3)
+        life = Life(store, session=8)
+        for k in range(12):
+            life.run("eve", 300 + k, 8)
+        report = life.edge.report(life.mapper.report())
+        held = {key.agent for key in life.mapper.poses().keys}
+        kept = store.load()
+    assert {run.key for run in kept.runs} == {agent["run"] for agent in report["agents"].values()}
+    assert {run.key for run in kept.runs} - held <= {f"ann-{m.public_tag(1)[:4]}"}
+
+
+def emptied(life: Life, run_id: int) -> None:
+    """All keyframes of a run of eve are taken out."""
+    atlas, run = life.mapper._atlas, f"eve-{m.public_tag(run_id)[:4]}"
+    life.mapper._leaving = [n for n in atlas._chart.poses if atlas.key(n).agent == run]
+    while life.mapper._leaving:
+        life.mapper._thin()
+    for _ in range(2):
+        life.handle(ed.Tick())
+
+
+def test_a_run_that_came_back_is_its_names_present_one_and_stays_so(tmp_path: Path) -> None:
+    """When the later run of the name is forgotten: the edge ended (KeyError)."""
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = Life(store)
+        life.run("ann", 1, 30, stays=True)
+        life.run("eve", 100, 5)
+        life.run("eve", 101, 3)
+        life.tell(100, hello_of("eve", 100))
+        emptied(life, 101)
+        report = life.edge.report(life.mapper.report())
+    assert report["agents"]["eve"]["run"] == f"eve-{m.public_tag(100)[:4]}"
+    assert report["forgotten_runs"] == 1
+
+
+def test_of_a_name_whose_newest_run_is_forgotten_the_one_before_it_is_shown(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = Life(store)
+        life.run("ann", 1, 30, stays=True)
+        life.run("eve", 100, 5)
+        life.tell(101, hello_of("eve", 101))
+        for k in range(256):  # which have no keyframe either, so the oldest of all is forgotten
+            life.tell(1000 + k, hello_of(f"n{k}", 1000 + k))
+            life.tell(1000 + k, m.Bye())
+            life.now_ns += 10 * S
+            life.tell(1, m.Ping(0, 0))
+            life.handle(ed.Tick())
+        report = life.edge.report(life.mapper.report())
+    assert report["agents"]["eve"]["run"] == f"eve-{m.public_tag(100)[:4]}"
+
+
+def test_a_run_is_forgotten_only_with_the_last_of_its_stretches(tmp_path: Path) -> None:
+    """Two stretches, of 9 and 3 keyframes, of which the newer goes first."""
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = Life(store)
+        life.run("ann", 1, 2, stays=True)
+        life.tell(100, hello_of("eve", 100))
+        for k in range(12):
+            before, T = (-1, at(k)) if k in (0, 9) else (k - 1, at(1.0))
+            own = Keyframe(k, before, k * S, T, 1e-6 * np.eye(6), at(k), np.zeros(3), 0.0, EMPTY, k - 1)
+            life.tell(100, own)
+        life.tell(100, m.Bye())
+        life.run("eve", 101, 2)
+        gone = next(key.agent for key in life.mapper.poses().keys if key.id == 11)
+
+        def leave(ids: range) -> None:
+            keys, atlas = {(gone, k) for k in ids}, life.mapper._atlas
+            life.mapper._leaving = [n for n in life.mapper._sights if atlas.key(n) in keys]
+            while life.mapper._leaving:
+                life.mapper._thin()
+            life.handle(ed.Tick())
+            life.handle(ed.Tick())
+
+        leave(range(9, 12))
+        assert {k.at.id for k in store.load().keyframes if k.key == gone} == set(range(9))
+        assert gone in life.mapper.report()["agents"]
+        leave(range(9))
+        assert gone not in {run.key for run in store.load().runs} | life.mapper.report()["agents"].keys()
+
+
+def test_a_run_that_comes_back_to_nothing_hears_that_it_is_in_a_map_of_its_own(tmp_path: Path) -> None:
+    """It was in ann's; all its keyframes were taken out while it was away."""
+    with MapStore.open(tmp_path / "room.sqlite") as store:
+        life = Life(store)
+        life.run("ann", 1, 20, stays=True)
+        life.run("eve", 100, 5)
+        atlas, mapper = life.mapper._atlas, life.mapper
+        ann, eve = sorted({key.agent for key in mapper.poses().keys})
+        atlas._chart.tie(Loop(Key(ann, 3), Key(eve, 3), np.eye(4), 1e-4 * np.eye(6), 50))
+        assert atlas.current_map(eve) == f"{ann}/0"
+        atlas.take_out([n for n in range(len(atlas)) if atlas.key(n).agent == eve])
+        mapper.present(eve, True)
+        own = Keyframe(5, 4, 5 * S, at(1.0), 1e-6 * np.eye(6), at(5), np.zeros(3), 0.0, EMPTY, 4)
+        (finding,) = mapper.add(eve, own)
+        assert finding.correction is not None
+        assert (finding.agent, finding.correction.map_id) == (eve, f"{eve}/0")
+        assert np.allclose(finding.correction.T_map_odom, np.eye(4))
+        step = Keyframe(6, 5, 6 * S, at(1.0), 1e-6 * np.eye(6), at(6), np.zeros(3), 0.0, EMPTY, 5)
+        assert mapper.add(eve, step) == []

@@ -73,3 +73,11 @@ def test_another_run_of_a_name_counts_for_itself() -> None:
     before["agents"]["ann"]["run"] = "ann-ffff"
     totals.ended(totals.added(before))
     assert totals.added(now)["agents"] == now["agents"]
+
+
+def test_an_agent_that_one_life_did_not_hear_goes_on_in_the_next() -> None:
+    totals, heard = Totals(), life(1, 3, 5)
+    totals.ended(totals.added(heard))
+    totals.ended(totals.added(Edge(Config(), 2).report({})))
+    added = totals.added(life(3, 3, 5))
+    assert numbers(added, "agents.ann.bytes_up") == 2 * numbers(heard, "agents.ann.bytes_up")

@@ -65,7 +65,7 @@ def apart_m(a: list[TrackResult], b: list[TrackResult]) -> list[float]:
         (10, 10, 2, 34.0),
         (3, 4, 3, 150.0),
         (5, 10, 5, -60.0),
-        (12, 2, 1, 2.5),
+        (11, 2, 1, 2.5),
     ],
 )
 def test_a_run_of_wrong_samples_moves_no_pose_and_is_said(
@@ -77,6 +77,18 @@ def test_a_run_of_wrong_samples_moves_no_pose_and_is_said(
     assert results[AT].state is TrackState.VISION_ONLY
     assert results[-1].state is TrackState.OK
     assert np.trace(results[AT].cov) > np.trace(clean[AT].cov)
+
+
+def test_a_wrong_sample_after_the_image_is_held_against_the_next_frame_only(
+    walk: tuple[Frame, ...], clean: list[TrackResult]
+) -> None:
+    last = len(walk[AT].imu) - 1
+    assert walk[AT].imu.stamps_ns[last] > walk[AT].stamp_ns
+    results, tracker = tracked(spoiled(walk, last, 1, 3, 80.0))
+    assert tracker.doubted == 1
+    doubted = [result.state is TrackState.VISION_ONLY for result in results]
+    assert doubted == [k == AT + 1 for k in range(len(walk))]
+    assert max(apart_m(results, clean)) < 0.02
 
 
 @pytest.mark.parametrize(("axis", "by"), [(1, 0.5), (4, 8.0)])

@@ -95,14 +95,27 @@ def test_what_is_doubted_is_known_for_the_frame_that_it_is_in() -> None:
     samples, values = Samples(), walking()
     values[104:108, 3] += 50.0
     samples.add(batch(values[:100]))
-    assert samples.doubt(0) is None
+    assert samples.doubt(0, 100 * STEP) is None
     samples.add(batch(values[100:110], 100))
-    told = samples.doubt(100 * STEP)
+    told = samples.doubt(100 * STEP, 110 * STEP)
     assert told is not None and samples.doubted == 4
     assert told.axes.tolist() == [False] * 3 + [True, False, False]
     assert told.turn == 0.0 and told.speed == pytest.approx(4 * 50 * 0.005, abs=0.2)
-    assert samples.doubt(108 * STEP) is None
+    assert samples.doubt(108 * STEP, 118 * STEP) is None
     assert not set(range(104, 108)) & set((samples.all.stamps_ns // STEP).tolist())
+
+
+def test_what_is_doubted_is_of_one_frame_only() -> None:
+    samples, values = Samples(), walking()
+    values[110, 3] += 50.0  # the sample after the image's time that came with it
+    samples.add(batch(values[:111]))
+    at = 110 * STEP - 1_500_000
+    assert samples.doubt(100 * STEP, at) is None
+    assert samples.doubt(100 * STEP, 110 * STEP) is None
+    samples.add(batch(values[111:121], 111))
+    told = samples.doubt(at, at + 10 * STEP)
+    assert told is not None and told.axes[3]
+    assert samples.doubt(110 * STEP, 120 * STEP) is not None
 
 
 def test_looking_ahead_changes_nothing() -> None:

@@ -18,13 +18,13 @@ from share.io.rig_pictures import RigPictures, find_stamped
 
 CORNER = Detection(np.array([3]), np.array([[10.0, 20.0]]))
 
-CAMERA = {"intrinsics": [9.0, 9.0, 6.0, 4.0], "resolution": [12, 8]}
+CAMERA = {"intrinsics": [36.0, 36.0, 24.0, 16.0], "resolution": [48, 32]}
 
 
 def written(folder: Path, *names: str) -> Path:
     folder.mkdir(parents=True)
     for name in names:
-        cv2.imwrite(str(folder / name), np.full((8, 12), 90, np.uint8))
+        cv2.imwrite(str(folder / name), np.full((32, 48), 90, np.uint8))
     return folder
 
 

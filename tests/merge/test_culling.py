@@ -71,6 +71,11 @@ def test_a_run_is_over_when_another_of_its_name_has_come_and_it_is_away() -> Non
     assert (owners.is_ended("ann-1"), owners.is_ended("ann-2")) == (False, True)
     owners.forget("ann-2")
     assert owners.name("ann-2") == "ann-2"
+    owners.present("ann-1", False)
+    assert not owners.is_ended("ann-1")  # no run of its name has come after it any more
+    owners.join("ann-3", "ann")
+    owners.forget("ann-3")
+    assert not owners.is_ended("ann-1")
 
 
 @pytest.mark.parametrize(
@@ -193,7 +198,18 @@ def test_where_there_is_no_other_way_the_newest_of_those_who_are_away_go_too() -
         walk(atlas, f"n{k}-1", f"n{k}", 12)
         atlas.present(f"n{k}-1", False)
     thin(atlas, 47)
-    assert held(atlas) == Counter({"ann-1": 11} | {f"n{k}-1": 4 for k in range(9)})
+    assert held(atlas) == Counter({"ann-1": 12, "n0-1": 3} | {f"n{k}-1": 4 for k in range(1, 9)})
+
+
+def test_any_number_of_names_that_come_and_go_leaves_its_share_to_one_that_is_heard() -> None:
+    atlas = Atlas(CONFIG)
+    walk(atlas, "ann-1", "ann", 100)
+    for k in range(100):
+        walk(atlas, f"n{k}-1", f"n{k}", 12)
+        atlas.present(f"n{k}-1", False)
+        thin(atlas, 120)
+        assert len(atlas) <= 120
+    assert held(atlas)["ann-1"] == 60
 
 
 def test_a_stretch_that_holds_two_others_together_is_not_forgotten() -> None:

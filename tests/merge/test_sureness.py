@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from test_agent_consistency import FRAMES, LOOP_COV, STEP_COV, chain, ring, steps_of
 
 from share.geometry import se3
+from share.graph.posegraph import Edge
+from share.merge.agreement import Agreement
 from share.merge.claims import Claims
 from share.merge.consistency import Witness, equations, points_scale, solved
 from share.merge.sureness import Sureness
@@ -17,8 +21,9 @@ WALKERS = {"ann": 0.0, "bob": 0.7, "eve": 1.4}
 DRIFT = 4.0  # by what all odometry is worse than STEP_COV, so that it shows beside the loops' noise
 
 
-def factors(seed: int, sure: float, rounds: int = 8) -> dict[str, float]:
-    """Of three agents that have gone round a room, of whom eve's sigmas are so many times too small."""
+def walkers(seed: int, sure: float, rounds: int = 8) -> Sureness:
+    """What is known of three agents that have gone round a room, of whom eve's sigmas are so many times too
+    small."""
     rng, paths, walked = np.random.default_rng(seed), {}, {}
     for name, phase in WALKERS.items():
         paths[name] = ring(phase)
@@ -37,6 +42,11 @@ def factors(seed: int, sure: float, rounds: int = 8) -> dict[str, float]:
     for _ in range(rounds):
         for meeting, (agents, told) in met.items():
             sureness.take(meeting, agents, told, solved(told).weight)
+    return sureness
+
+
+def factors(seed: int, sure: float, rounds: int = 8) -> dict[str, float]:
+    sureness = walkers(seed, sure, rounds)
     return {name: sureness.factor.get(name, 1.0) for name in WALKERS}
 
 
@@ -68,7 +78,19 @@ def claimed(sigmas: dict[str, float]) -> Claims:
     for name, sigma in sigmas.items():
         for _ in range(10):
             claims.add(name, MOVED, sigma**2 * STEP_COV)
+    for one, other in itertools.combinations(sigmas, 2):
+        claims.met(one, other)
     return claims
+
+
+def test_who_was_never_met_measures_nobody():
+    """Its variances may be anything."""
+    claims = claimed({"ann": 1.0})
+    for _ in range(10):
+        claims.add("eve", MOVED, 1e6 * STEP_COV)
+    assert claims.least("ann") == 1.0
+    claims.met("ann", "eve")
+    assert claims.least("ann") == 100.0
 
 
 def test_until_loops_tell_nobody_is_much_surer_than_the_surest_of_the_others():
@@ -76,7 +98,13 @@ def test_until_loops_tell_nobody_is_much_surer_than_the_surest_of_the_others():
     assert claims.least("ann") == claims.least("bob") == 1.0
     assert claims.least("eve") == pytest.approx(100 / 2.25)
     claims.leave_out(["ann"])
-    assert claims.least("eve") == pytest.approx(900 / 2.25)
+    assert claims.least("eve") == 100.0  # of 400
+    claims.leave_out(["eve"])
+    assert claims.least("ann") == pytest.approx(9 / 2.25)
+    assert claims.least("eve") == pytest.approx(100 / 2.25)
+    claims.remove("ann")
+    assert claims.least("eve") == 100.0  # of 400
+    assert claims.agents == {"bob", "eve"}
 
 
 def test_honest_agents_may_differ():
@@ -95,3 +123,42 @@ def test_depths_that_are_spread_say_so():
     found = [points_scale([Scale(log, 0.005) for log in one]) for one in logs]
     off = np.array([(one.value - 0.4) / one.sigma for one in found])
     assert 0.6 < np.sqrt((off**2).mean()) < 1.7
+
+
+def test_what_loops_said_is_no_longer_told_once_they_are_left():
+    """At once, not with the next step; what eve claims still holds."""
+    claimed_only = 100 / 2.25
+    for let_go in (lambda s: s.leave([(0, 1), (1, 2), (2, 3)]), lambda s: s.forget(["eve"])):
+        sureness = walkers(0, 10.0, rounds=2)
+        assert sureness.factor["eve"] != pytest.approx(claimed_only, rel=0.01)
+        let_go(sureness)
+        assert sureness.factor["eve"] == pytest.approx(claimed_only, rel=0.01)
+
+
+def test_loops_between_agents_that_disagree_widen_nobody():
+    """Bob's way is a tenth too long, which is no reason to take either for less sure than it says."""
+    rng, agreement, widths = np.random.default_rng(1), Agreement(0.015), []
+    x, y = ring(0.0), ring(0.7)
+    for name, first, steps in (("ann", 0, steps_of(x, rng)), ("bob", 1000, steps_of(y, rng, scale=1.1))):
+        for i, step in enumerate([np.eye(4), *steps]):
+            agreement.walk(name, first + i, first + i - 1 if i else None, step, STEP_COV)
+    for j in range(4, FRAMES - 7, 2):
+        noise = se3.exp(np.sqrt(np.diag(LOOP_COV)) * rng.standard_normal(6))
+        T = se3.orthonormal(se3.inverse(x[j + 7]) @ y[j] @ noise)
+        agreement.witness(("ann", "bob"), (0, 1), Edge(j + 7, 1000 + j, T, LOOP_COV), None, None)
+        widths.append((agreement.widened("ann"), agreement.widened("bob")))
+    assert agreement.disputed
+    assert set(widths) == {(1.0, 1.0)}
+
+
+def test_who_is_just_sure_enough_to_be_widened_is_not_told_so_again_and_again():
+    """Its variances are 4.5 times below another's, twice the leeway; steps differ in size."""
+    rng, sureness, told = np.random.default_rng(0), Sureness(Claims()), list[float]()
+    sureness.met("ann", "bob")
+    for _ in range(300):
+        for name, part in (("ann", 1.0), ("bob", 1 / 4.5)):
+            step = se3.exp(np.r_[rng.normal(0, 0.05, 3), rng.normal(0, 0.15, 3)])
+            sureness.claimed(name, step, part * STEP_COV)
+            if (now := sureness.factor.get("bob", 1.0)) != (told or [1.0])[-1]:
+                told.append(now)
+    assert 1 <= len(told) <= 4

@@ -51,8 +51,10 @@ def test_images_by_the_hosts_clock_do_not_cost_the_imu(tmp_path: Path) -> None:
     source = open_source(str(tmp_path / "a.mcap"))
     stamps = source.stamps()
     assert len(stamps["imu"]) == bench.report["imu"] > 0.95 * 60 * 13
-    assert len(stamps["cam0"]) > 55
-    np.testing.assert_array_equal(stamps["cam1"], stamps["cam0"])
+    pairs = np.intersect1d(stamps["cam0"], stamps["cam1"])
+    assert len(pairs) > 55
+    longer = max(len(stamps["cam0"]), len(stamps["cam1"]))
+    assert longer <= len(pairs) + 1  # one eye may begin an image earlier
     assert 0.8 * 10**9 < stamps["cam0"][0] < 3 * 10**9
     assert bench.said == [
         "cam0, cam1 carry the host's clock, accel, gyro the camera's: "

@@ -12,8 +12,10 @@ from plain_walk import RIG
 
 from share.config import Config
 from share.estimator.inertial import ekf
+from share.estimator.inertial.tracker import InertialTracker
 from share.estimator.result import TrackResult
-from share.geometry import trackable
+from share.geometry import se3, trackable
+from share.geometry.camera import Rig
 from share.run.guard import Guard
 from share.run.guarded_tracker import GuardedTracker
 from share.types import TrackState
@@ -65,7 +67,7 @@ def test_one_that_fails_twice_begins_anew(walk: rig_fuzzer.Walk) -> None:
     tracker = GuardedTracker(RIG, Config(), guard)
 
     class Broken:
-        doubted = 0
+        doubted = 7
 
         def track(self, frame: object) -> TrackResult:
             raise FloatingPointError
@@ -78,6 +80,7 @@ def test_one_that_fails_twice_begins_anew(walk: rig_fuzzer.Walk) -> None:
     results = [tracker.track(frame) for frame in walk.frames[:4]]
     assert [result.state for result in results[:1]] == [TrackState.LOST]
     assert results[-1].state is TrackState.OK and guard.failed == 2
+    assert tracker.doubted == 7  # by the first
 
 
 def test_a_keyframe_that_fails_is_none(walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,6 +91,36 @@ def test_a_keyframe_that_fails_is_none(walk: rig_fuzzer.Walk, monkeypatch: pytes
     kept = tracker.attempt("a keyframe", walk.frames[0], lambda: tracker.keyframe(walk.frames[0]))
     assert kept is None and guard.failed == 1
     assert tracker.track(walk.frames[1]).state is TrackState.LOST
+
+
+@pytest.mark.parametrize("rig", [RIG, RIG.without_imu()], ids=["imu", "cameras"])
+def test_after_a_keyframe_that_failed_the_next_step_is_from_the_last_that_others_have(
+    walk: rig_fuzzer.Walk, rig: Rig
+) -> None:
+    tracker = GuardedTracker(rig, Config(), Guard(lambda text: None))
+    tracker.track(walk.frames[0])
+    first = tracker.keyframe(walk.frames[0])
+    for frame in walk.frames[1:5]:
+        assert not tracker.track(frame).keyframe
+
+    def fails_once_made() -> None:
+        tracker.keyframe(frame)
+        _no_gain()
+
+    assert tracker.attempt("a keyframe", frame, fails_once_made) is None
+    wanted = [frame for frame in walk.frames[5:] if tracker.track(frame).keyframe]
+    again = tracker.keyframe(wanted[-1])
+    step = se3.inverse(first.T_odom_body) @ again.T_odom_body
+    assert not again.new_stretch and np.linalg.norm(step[:3, 3]) > 1e-3
+    np.testing.assert_allclose(again.T_last_body, step, atol=1e-4)
+
+
+def test_giving_up_leaves_nothing_of_a_keyframe_for_the_next_beginning(walk: rig_fuzzer.Walk) -> None:
+    tracker, frame = InertialTracker(RIG, Config().inertial, Config().tracker), walk.frames[0]
+    tracker.track(frame)
+    tracker.keyframe(frame)
+    tracker.give_up(frame)
+    assert tracker._keyframes._unsettled is None
 
 
 # ---------------------------------------------------------------- rigs that nobody has

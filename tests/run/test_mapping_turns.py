@@ -41,7 +41,7 @@ def test_whoever_sends_many_waits_for_itself(monkeypatch: pytest.MonkeyPatch, en
             inbox.put(add(run, k))
     work = mapping._Mapping(inbox, lambda answer: None, Config())
     taken = work._mapper.add
-    monkeypatch.setattr(work._mapper, "add", lambda run, kf: order.append(run) or taken(run, kf))
+    monkeypatch.setattr(work._mapper, "add", lambda run, *more: order.append(run) or taken(run, *more))
     if ends:
         inbox.put(END)
         work.go()

@@ -213,3 +213,15 @@ def test_a_tracker_that_dies_is_its_agents_trouble(monkeypatch):
     finally:
         run.stop()
         run.go()
+
+
+def test_a_report_that_fails_costs_itself_and_is_shown_to_be_old(edge, monkeypatch):
+    run, _, told = edge(dies_later)
+    step_until(run, run.report)
+    report = run._machine.report
+    monkeypatch.setattr(run._machine, "report", lambda mapped: report({})["nobody"])
+    monkeypatch.setattr(edge_module, "_STUCK_S", 0.2)
+    step_until(run, lambda: any("stuck" in line for line in run.report()["trouble"]))
+    assert [line["event"] for line in told].count("internal error") == 1
+    monkeypatch.setattr(run._machine, "report", report)
+    step_until(run, lambda: not any("stuck" in line for line in run.report()["trouble"]))

@@ -25,9 +25,8 @@ from share.io.profile_types import Inertial, Profile
 from share.types import F32, F64, I64, U8
 
 _READOUT = 0.9  # of a frame's time is what an exposure can take
-_PHASE, _DROPS, _JITTER, _LAMP, _CAMERA, _DEPTH, _GYRO, _ACCEL, _SHAKING = range(
-    9
-)  # streams of random numbers
+# streams of random numbers
+_PHASE, _DROPS, _JITTER, _LAMP, _CAMERA, _DEPTH, _GYRO, _ACCEL, _SHAKING = range(9)
 
 
 @dataclass(frozen=True, eq=False)

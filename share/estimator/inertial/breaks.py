@@ -95,9 +95,9 @@ class Breaks:
         good = np.array([self._is_good(at, value) for at, value in each], np.bool_)
         return None if good.all() else good
 
-    def doubt(self, from_ns: int) -> Doubt | None:
-        """What of the samples since `from_ns` is doubted, if any is."""
-        left = [one for one in self._left if one.stamp_ns >= from_ns]
+    def doubt(self, from_ns: int, to_ns: int) -> Doubt | None:
+        """What of the samples in [from_ns, to_ns) is doubted, if any is."""
+        left = [one for one in self._left if from_ns <= one.stamp_ns < to_ns]
         if not left:
             return None
         sums = sum((one.excess * (one.step_ns * 1e-9) for one in left), np.zeros(6))

@@ -27,7 +27,7 @@ class Showing(NamedTuple):
 
 
 class Unsettled(NamedTuple):
-    """A keyframe that others have been told of."""
+    """A keyframe whose candidate was made, and that others are told of unless something fails."""
 
     frame: Frame
     view: View
@@ -65,12 +65,16 @@ class Keyframes:
     def settle(self, scene: Scene, rate: F64) -> Unsettled | None:
         """What `show` left to do. The keyframe that it was done for, if there was any."""
         todo, self._unsettled = self._unsettled, None
-        if todo is not None and todo.fresh:
+        if todo is None:
+            return None
+        self._shown.told(scene.state)  # only now: before, making its candidate might have failed
+        if todo.fresh:
             self._add_features(todo.frame, scene, rate)
         return todo
 
     def forget(self) -> None:
-        """The filter begins anew, and numbers its keyframes anew."""
+        """The filter begins anew, and numbers its keyframes anew. What `show` left to do is void."""
+        self._unsettled = None
         self._shown.forget()
 
     def _add_pose(self, frame: Frame, scene: Scene, rate: F64) -> None:

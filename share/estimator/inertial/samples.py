@@ -55,9 +55,9 @@ class Samples:
         """Whether the last ones may be wrong, though they were believed."""
         return self._breaks.is_odd(now_ns)
 
-    def doubt(self, from_ns: int) -> Doubt | None:
-        """What of the samples since `from_ns` is doubted."""
-        return self._breaks.doubt(from_ns)
+    def doubt(self, from_ns: int, to_ns: int) -> Doubt | None:
+        """What of the samples in [from_ns, to_ns) is doubted."""
+        return self._breaks.doubt(from_ns, to_ns)
 
     @property
     def last_ns(self) -> int:

@@ -11,6 +11,8 @@ from share.geometry import se3
 from share.graph.posegraph import Edge
 from share.merge.agreement import Agreement
 from share.merge.atlas import Atlas
+from share.merge.join import Key, Loop
+from share.merge.judge import Decision
 from share.merge.subjects import Subjects
 from share.place.scale import Scale
 
@@ -153,7 +155,7 @@ def test_runs_of_an_earlier_life_that_were_outside_are_a_subject_of_their_own():
     assert subjects.unproven == {subjects.of("eve-1")}
     assert subjects.name("eve-2") == subjects.name("eve-3") == "eve"
     subjects.enter("eve-4", "eve", ())
-    assert "eve-4" in subjects.unproven
+    assert subjects.of("eve-4") in subjects.unproven
 
 
 def test_loops_of_a_restarted_suspect_are_not_believed_before_it_is_compared():
@@ -193,8 +195,184 @@ def test_a_run_that_is_forgotten_takes_nothing_of_its_name_with_it():
     subjects = Subjects()
     for number in range(1, 4):
         subjects.enter(f"eve-{number}", "eve", ())
-    for number in (1, 2, 3):
-        subjects.forget(f"eve-{number}")
+    assert [subjects.forget(f"eve-{number}", (), ()) for number in (1, 2)] == [None, None]
     subjects.enter("eve-4", "eve", ())
     assert subjects.of("eve-4") == "eve-1"
     assert (subjects.name("eve-1"), subjects.newest("eve-1")) == ("eve", "eve-4")
+    assert [subjects.forget(f"eve-{number}", (), ()) for number in (3, 4)] == [None, "eve-1"]
+    subjects.enter("eve-5", "eve", ())
+    assert (subjects.of("eve-5"), subjects.unproven) == ("eve-5", set())
+
+
+def test_what_is_held_against_a_name_outlives_its_runs():
+    subjects = Subjects()
+    subjects.enter("eve-1", "eve", ())
+    assert subjects.forget("eve-1", {"eve-1"}, ()) == "eve-1"
+    for number in range(2, 5):
+        subjects.enter(f"eve-{number}", "eve", ())
+        assert subjects.unproven == {f"eve-{number}"}
+        assert f"eve-{number}" in subjects.suspected
+        assert subjects.follows_one_apart(f"eve-{number}", ())
+        subjects.forget(f"eve-{number}", (), ())
+    assert not subjects.unproven
+    subjects.enter("eve-9", "eve", ())
+    subjects.prove("eve-9")  # it was compared, and agrees
+    subjects.forget("eve-9", (), ())
+    subjects.enter("eve-10", "eve", ())
+    assert not subjects.unproven
+
+
+def test_runs_of_a_suspect_without_end_leave_nothing_but_the_suspicion():
+    """Eve met ann in each of her runs, and disagreed; each is forgotten with its keyframes."""
+    ann, atlas, rng = Walker("ann", 1, n=20), Atlas(MergeConfig()), np.random.default_rng(0)
+    atlas.enter("ann", "ann")
+    for keyframe in ann.keyframes:
+        atlas.add_keyframe("ann", keyframe)
+    agreement = atlas._parting.agreement
+    for n in range(1, 6):
+        eve = Walker(f"eve-{n}", n, n=20, phase=0.1)
+        atlas.enter(eve.name, "eve")
+        assert agreement.subjects.unproven == ({eve.name} if n > 1 else set())
+        numbers = [atlas.add_keyframe(eve.name, keyframe) for keyframe in eve.keyframes]
+        for loop in near_loops(ann, eve, rng):
+            atlas.witness(loop, Scale(0.05, 0.005))
+        assert atlas.standing("ann").state == "disputed"
+        atlas.present(eve.name, False)
+        atlas.enter("eve-next", "eve")
+        atlas.take_out(numbers)
+        assert atlas.is_forgotten(eve.name)
+        atlas.forget(eve.name)
+        atlas.present("eve-next", False)
+        atlas.forget("eve-next")
+        assert not agreement._pairs
+        assert not agreement.disputed
+        assert agreement._sureness._claims.agents == {"ann"}
+        assert atlas.standing("ann").state == "unknown"
+
+
+def test_a_disagreement_outlives_the_keyframes_that_showed_it():
+    """Two loops with each of many runs of bob, whose stretches go one after the other."""
+    town = Town()
+    town.enter("ann-1")
+    for n in range(1, 30):
+        town.enter(f"bob-{n}")
+    for n in range(1, 30):
+        town.meet("ann-1", f"bob-{n}", 1.05, 2)
+        first = town.numbers[f"bob-{n}"]
+        town.agreement.forget(range(first, first + 12), {town.numbers["ann-1"]})
+        assert bool(town.agreement.disputed) == (n > 1)
+    (pair,) = town.agreement._pairs.values()
+    assert len(pair.met) == 1
+    assert sum(len(met.loops) for met in pair.met.values()) <= 32
+
+
+def test_what_loops_said_of_a_stretch_goes_with_it():
+    ann, bob = Walker("ann", 1), Walker("bob-1", 2, phase=0.3)
+    atlas, rng = Atlas(MergeConfig()), np.random.default_rng(0)
+    for walker in (ann, bob):
+        atlas.enter(walker.name, walker.name.partition("-")[0])
+        for keyframe in walker.keyframes:
+            atlas.add_keyframe(walker.name, keyframe)
+    for loop in near_loops(ann, bob, rng, every=2):
+        atlas.witness(loop, Scale(0.0, 0.005))
+    agreement = atlas._parting.agreement
+    (pair,) = agreement._pairs.values()
+    assert agreement._sureness._told.keys() == pair.met.keys() == {(0, 1)}
+    atlas.present("bob-1", False)
+    atlas.enter("bob-2", "bob")
+    gone = [n for n in range(len(atlas)) if atlas.key(n).agent == "bob-1"]
+    assert len(atlas.take_out(gone)) == len(gone)
+    assert not agreement._sureness._told
+    assert (0, 1) not in pair.met
+    assert atlas.standing("ann").state == "agrees"
+
+
+def test_who_is_doubted_since_the_edge_was_started_again_is_proven_by_another_who_is():
+    """Both were alone in their maps, and now meet: there is nobody else to compare them with."""
+    town = Town()
+    for run in ("ann-1", "bob-1"):
+        town.enter(run)
+    town.agreement.subjects.doubt({"ann-1", "bob-1"})
+    for run in ("ann-2", "bob-2"):
+        town.enter(run)
+    assert "started again" in town.agreement.yet_to_compare(["ann-2"], ["bob-2"])
+    town.meet("ann-2", "bob-2", 1.0, 10)
+    assert not town.agreement.yet_to_compare(["ann-2"], ["bob-2"])
+
+
+def test_names_of_one_key_have_one_voice():
+    """Eve speaks for three, whose metres are too long; ann and bob agree."""
+    for voice, apart in (("eve", {"e1-1", "e2-1", "e3-1"}), ("", None)):
+        town = Town()
+        for run in ("ann-1", "bob-1"):
+            town.enter(run)
+        for run in ("e1-1", "e2-1", "e3-1"):
+            town.agreement.enter(run, run[:2], voice)
+            town.enter(run)
+        town.meet("ann-1", "bob-1", 1.0, 12)
+        for run in ("e1-1", "e2-1", "e3-1"):
+            for honest in ("ann-1", "bob-1"):
+                town.meet(honest, run, 1.05, 12)
+        assert apart is None or town.agreement.apart == apart
+        assert not apart or not town.agreement.forbids(["ann-1"], ["bob-1"])
+
+
+def pair_that_met(decide=None) -> tuple[Atlas, list[Loop]]:
+    """An atlas of ann and bob, and loops between them that were taken back; decide: in the judge's place."""
+    ann, bob = Walker("ann", 1), Walker("bob", 2, phase=0.3)
+    atlas = Atlas(MergeConfig())
+    for walker in (ann, bob):
+        atlas.enter(walker.name, walker.name)
+        for keyframe in walker.keyframes:
+            atlas.add_keyframe(walker.name, keyframe)
+    loops = near_loops(ann, bob, np.random.default_rng(0))
+    atlas._parting._taken_back = list(loops)
+    if decide is not None:
+        atlas._judge.decide = decide
+    return atlas, loops
+
+
+def test_loops_that_were_taken_back_wait_while_anything_forbids_them():
+    """Bob is not kept apart any more, but has to be compared first."""
+    atlas, loops = pair_that_met()
+    parting, unproven = atlas._parting, atlas._parting.agreement.subjects.unproven
+    unproven.add("bob")
+    assert parting._give_back() == ((), ())
+    unproven.clear()
+    gone = Loop(Key("ann", 99), loops[0].b, loops[0].T_a_b, loops[0].cov, 9)
+    parting._taken_back.append(gone)
+    tied, undone = parting._give_back()
+    assert len(tied) > len(loops) / 2
+    assert not undone
+    assert not parting._taken_back
+
+
+def test_loops_that_were_taken_back_are_judged_once_who_was_to_be_compared_is():
+    atlas, loops = pair_that_met()
+    atlas._parting.agreement.subjects.unproven.add("bob")
+    said = [atlas.witness(loop, Scale(0.0, 0.005)) for loop in loops]
+    assert "bob" not in atlas._parting.agreement.subjects.unproven
+    assert sum(len(parted.tied) for parted in said) > len(loops) / 2
+    assert not any(parted.standing for parted in said)
+
+
+def test_a_loop_that_is_believed_again_and_undone_at_once_is_not_said_to_be_tied():
+    def decide(loop: Loop) -> Decision:
+        return Decision(True, "", None, (loop,), (loops[0],) if loop is loops[1] else ())
+
+    atlas, loops = pair_that_met(decide)
+    tied, undone = atlas._parting._give_back()
+    assert tied == tuple(loops[1:])
+    assert undone == (loops[0],)
+
+
+def test_what_is_put_right_is_so_in_one_order():
+    """Whatever the hashes of their names are."""
+    atlas, done = Atlas(MergeConfig()), list[str]()
+    names = [f"agent{k}" for k in range(10)]
+    for name in names:
+        atlas.add_keyframe(name, Walker(name, 1, n=1).keyframes[0])
+    atlas._parting.agreement.scale = dict.fromkeys(names, 0.01)
+    atlas._chart.rescale = lambda agent, log, width: done.append(agent)
+    atlas._parting._put_right()
+    assert done == names
