@@ -19,7 +19,7 @@ def batch(t, gyro, accel):
     return ImuBatch(np.rint(t * 1e9).astype(np.int64), gyro, accel)
 
 
-def shown(imu, window_s=0.15):
+def shown(imu, window_s=0.2):
     """Mean densities (2,) over windows of so long, gyro and accelerometer."""
     edges = np.arange(imu.stamps_ns[0], imu.stamps_ns[-1], round(window_s * 1e9))
     parts = [
@@ -91,7 +91,7 @@ def test_the_latest_samples_reach_one_beyond_the_image():
     samples = Samples()
     samples.add(batch(t, np.zeros((len(t), 3)), np.zeros((len(t), 3))))
     latest = samples.latest(502_000_000)
-    assert (latest.stamps_ns[0], latest.stamps_ns[-1]) == (355_000_000, 505_000_000)
+    assert (latest.stamps_ns[0], latest.stamps_ns[-1]) == (305_000_000, 505_000_000)
     assert len(samples.latest(0)) <= 2
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from share.geometry.camera import ImuNoise
 from share.types import F64, ImuBatch
 
-_BLOCKS_S = 0.005, 0.01  # of samples whose means are compared
+_BLOCKS_S = 0.005, 0.01, 0.015, 0.02  # of samples whose means are compared
 _TIMES = 20.0  # by which third differences have more variance than what is white
 
 

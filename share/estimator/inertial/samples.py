@@ -15,7 +15,7 @@ from share.types import F64, ImuBatch
 _KEPT = 600
 _REST_S, _FEWEST = 0.5, 20  # samples of so long, and so many, tell rest
 _REST_SHAKE, _REST_TURN = 0.12, 0.02  # m/s^2 and rad/s, standard deviations: about twice a D435i's noise
-_SHAKEN_S = 0.15  # samples of so long tell how much it is shaken
+_SHAKEN_S = 0.2  # samples of so long tell how much it is shaken
 _REPEATED = 4  # samples at the end of the scale,
 _MUCH = np.repeat([0.5, 11.0], 3)  # rad/s and m/s^2, which no scale ends below
 
