@@ -10,7 +10,7 @@ from share.geometry.camera import ImuBias
 from share.types import Wait
 
 _TILT_RAD, _SPEED_M_S = np.radians(3.0), 0.3  # sigmas
-_CARRIED_M_S, _CARRIED_S = 0.03, 3.0  # a tilt carries nobody off faster than this; or he has waited so long
+_CARRIED_M_S, _CARRIED_S = 0.03, 0.9  # a tilt carries nobody off faster than this; or he has waited so long
 _LEARNT = 0.3  # of the sigma that a bias has which nobody knows
 
 
@@ -28,7 +28,8 @@ def worth_telling(s: State, waited_s: float, anew: bool) -> bool:
     """Whether a first pose is, `waited_s` after the filter began; anew: so does odom.
 
     Who begins at rest is told it at once. Who begins at a run would be told a path that climbs or sinks by
-    the tilt that a bias looks like, until a second or two of turning have parted the two.
+    the tilt that a bias looks like, until turning has parted the two: mostly within a second, for which he
+    is made to wait. One who goes straight on is told then.
     """
     carried = tilt(s) * np.linalg.norm(s.v) > _CARRIED_M_S
     return converged(s) and not (carried and anew and waited_s < _CARRIED_S)
