@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 from share import __version__
 from share.config import Config
 from share.core import edge_events as ed
-from share.core.admission import Admission, new_key
+from share.core.admission import Admission, new_key, other_name
 from share.core.allowance import Allowance
 from share.core.finding import Finding
 from share.core.keeping import Change, ForgetRun, KeepKeyframe, KeepRun
@@ -115,7 +115,7 @@ class Edge:
             self._complain(peer, str(error), now_ns)
             return
         if peer is not None and not event.speaks_for(peer.hello.name):
-            self._complain(None, f"a key that does not speak for '{peer.hello.name}' used its run", now_ns)
+            self._not_its_run(event, peer.hello.name, message, now_ns)
             return
         if peer is not None and not self._heard(event.peer, peer, message, now_ns):
             return
@@ -132,6 +132,14 @@ class Edge:
                 self._told(event.peer, peer, message, now_ns)
             case _:  # from a stranger
                 self._unexpected(None, message, now_ns)
+
+    def _not_its_run(self, event: ed.Received, name: str, message: wire.Message, now_ns: int) -> None:
+        """A key speaks for a run whose name is not its own, or was taken from it. It is answered who asks."""
+        self._complain(None, f"a key that does not speak for '{name}' used its run", now_ns)
+        if isinstance(message, wire.Hello):
+            reason = other_name(name, event.names or ())
+            self._send(event.peer, wire.Refused(reason))
+            self._record_seldom(now_ns, "refused", None, reason)
 
     def _told(self, peer_id: bytes, peer: Peer, message: wire.Message, now_ns: int) -> None:
         """What an agent says of itself."""
@@ -217,7 +225,7 @@ class Edge:
         if peer_id not in self._runs:
             if (idle := self._runs.forget_idle()) is not None:
                 self._forget(*idle)
-            self._admission.came(hello, now_ns)
+            self._admission.came(event, hello, now_ns)
             self._supersede(hello.name, now_ns)
             self._enter(peer_id, Peer(hello, new_key(hello, self._runs.by_key), now_ns), event.voice)
             self._schedule.begin(hello.name)

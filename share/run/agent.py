@@ -30,6 +30,7 @@ from share.core.agent import Agent
 from share.core.lines import Lasting
 from share.core.sequencer import SequencerCounters
 from share.errors import DataError
+from share.estimator.result import TrackResult
 from share.io.live import LiveSource
 from share.io.pose_feed import PoseFeed
 from share.io.source import Source
@@ -195,7 +196,7 @@ class AgentRun:
             T_odom_body=result.T_odom_body,
             keyframe=result.keyframe,
             new_stretch=result.new_stretch,
-            error_cm=self._errors.after(frame, result),
+            error_cm=self._error_cm(frame, result),
             waits=result.waits,
         )
         self._post(tracked)  # the pose goes out before others are served
@@ -204,6 +205,12 @@ class AgentRun:
             self._keyframe(frame, tracked)
         self._log.imu_doubted = self._tracker.doubted
         self._log.cpu_s += time.thread_time() - cpu
+
+    def _error_cm(self, frame: Frame, result: TrackResult) -> float | None:
+        error_cm: float | None = None
+        with self._guard.step("estimating the error"):
+            error_cm = self._errors.after(frame, result)
+        return error_cm
 
     def _keyframe(self, frame: Frame, tracked: ev.FrameTracked) -> None:
         make = partial(self._errors.keyframe, frame, self._tracker)

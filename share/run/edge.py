@@ -185,7 +185,7 @@ class EdgeRun:
         self._report_at = now + _REPORT_S
         self._heap.tidy(now)
         disks = [writer.trouble for writer in (self._keeper, self._scribe) if writer is not None]
-        standing = [*disks, self._standstill(now)]
+        standing = [*disks, self._standstill(now), self._link.trouble()]
         self._trouble = {text: until for text, until in self._trouble.items() if now < until}
         self._of_agents = {text: until for text, until in self._of_agents.items() if now < until}
         report = self._totals.added(self._machine.report(self._mapped))
