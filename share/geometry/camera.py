@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from share.types import F64, checked_pose
+from share.types import F64, checked, checked_pose
 
 MOST_TIMESHIFT_S = 1.0
 BASELINE_M = (0.005, 2.0)  # of two cameras that see one room
@@ -19,6 +19,7 @@ MOST_PIXELS = 10**8  # of an image: beyond any camera's
 _FOCAL_PX = (1.0, 1e5)  # shorter or longer, and what is divided or multiplied by it is noise
 _MOST_PX = 1e6  # the principal point, which may lie outside the image, from its corner
 _MOST_NOISE, _MOST_RATE_HZ = 1e3, 1e5  # of an IMU
+_MOST_GYRO_BIAS, _MOST_ACCEL_BIAS = 0.5, 3.0  # rad/s, m/s^2
 _MOST_DISTORTION = 1e4  # of a coefficient; k3 of a lens with a narrow view is some hundreds
 
 
@@ -162,6 +163,29 @@ class ImuNoise:
             raise ValueError(
                 f"IMU: noise beyond {_MOST_NOISE:g} or a rate beyond {_MOST_RATE_HZ:g} Hz is none"
             )
+
+
+@dataclass(frozen=True, eq=False)
+class ImuBias:
+    """What an IMU adds to what it measures, as known before or after a run: gyro rad/s, accel m/s^2 (3,),
+    with a standard deviation for the axes of each. Raises ValueError for what no IMU has."""
+
+    gyro: F64
+    accel: F64
+    gyro_sigma: float
+    accel_sigma: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "gyro", checked("gyro bias", self.gyro, (3,), np.float64))
+        object.__setattr__(self, "accel", checked("accelerometer bias", self.accel, (3,), np.float64))
+        for name, value, most in (
+            ("gyro", max(np.abs(self.gyro).max(), self.gyro_sigma), _MOST_GYRO_BIAS),
+            ("accelerometer", max(np.abs(self.accel).max(), self.accel_sigma), _MOST_ACCEL_BIAS),
+        ):
+            if not value <= most:
+                raise ValueError(f"IMU: a bias of the {name} beyond {most:g} is none")
+        if not (self.gyro_sigma > 0 and self.accel_sigma > 0):
+            raise ValueError("IMU: a bias is never known exactly")
 
 
 @dataclass(frozen=True, eq=False)

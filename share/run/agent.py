@@ -42,6 +42,7 @@ from share.run.arrivals import Arrivals, Played, Seen
 from share.run.errors import Errors, Unknown
 from share.run.guard import Guard
 from share.run.guarded_tracker import GuardedTracker
+from share.run.imu_memory import ImuMemory
 from share.run.late import Late
 from share.run.lateness import Lateness
 from share.run.pipeline import check_trackable, frames_of
@@ -101,6 +102,7 @@ class AgentRun:
         self._say, self._show, self._verbose = say, show, verbose
         self._guard = Guard(say)
         self._machine = Agent(hello, settings)
+        self._memory: ImuMemory | None = None  # of who tracks itself
         self._prepare()
         self._files, self._scribe = AgentFiles(out, say), Scribe(out, say)
         self._log = RunLog(Written(self._files.frames, self._scribe))
@@ -123,7 +125,8 @@ class AgentRun:
     def _prepare(self) -> None:
         """Raises what is wrong with the source before there is a link."""
         check_trackable(self._source.name, self._source.rig)
-        self._tracker = GuardedTracker(self._source.rig, self._settings, self._guard)
+        self._memory = ImuMemory(self._source, self._settings.inertial, self._say)
+        self._tracker = GuardedTracker(self._source.rig, self._settings, self._guard, self._memory.bias)
 
     def stop(self) -> None:
         """End early, in good order: no more frames, but what was sent is still waited for."""
@@ -146,6 +149,8 @@ class AgentRun:
             if self._poses is not None:
                 self._poses.close()
             tracker.join(timeout=4)
+            if self._memory is not None:
+                self._scribe.do(partial(self._memory.keep, self._tracker.bias))
             self._errors.close()
             self._scribe.end()
         self._scribe.check()
@@ -339,6 +344,7 @@ class AgentRun:
             "drop_late": self._late.dropped,
             **self._lateness.report(),
             **self._source.report(),
+            **({} if self._memory is None else self._memory.report()),
             **self._errors.report(),
             "sequencer": dataclasses.asdict(self._counters),
             "clock": self._machine.clock(time.monotonic_ns()).report(),

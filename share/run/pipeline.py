@@ -14,7 +14,7 @@ from share.errors import DataError, MisfitError, UsageError
 from share.estimator.inertial.tracker import InertialTracker
 from share.estimator.visual import VisualTracker
 from share.geometry import trackable
-from share.geometry.camera import Rig
+from share.geometry.camera import ImuBias, Rig
 from share.io.images import load
 from share.io.source import Source
 from share.types import Frame, ImuBatch
@@ -158,8 +158,9 @@ def check_trackable(name: str, rig: Rig) -> None:
         raise UsageError(f"{name}: {why}")
 
 
-def tracker_of(rig: Rig, config: Config) -> VisualTracker | InertialTracker:
-    """The estimator that fits a rig. Raises ValueError where there is none."""
+def tracker_of(rig: Rig, config: Config, bias: ImuBias | None = None) -> VisualTracker | InertialTracker:
+    """The estimator that fits a rig. bias: of its IMU, where that is known. Raises ValueError where there is
+    none."""
     if rig.imu is not None:
-        return InertialTracker(rig, config.inertial, config.tracker)
+        return InertialTracker(rig, config.inertial, config.tracker, bias=bias)
     return VisualTracker(rig, config.tracker)

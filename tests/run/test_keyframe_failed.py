@@ -25,7 +25,7 @@ VIEW = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
 class Tracker:
     """Wants every frame as a keyframe; `fails`: what it cannot do."""
 
-    doubted = 0
+    doubted, bias = 0, None
 
     def __init__(self, fails: str = "") -> None:
         self._fails = fails

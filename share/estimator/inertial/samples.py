@@ -15,6 +15,7 @@ from share.types import F64, ImuBatch
 _KEPT = 600
 _REST_S, _FEWEST = 0.5, 20  # samples of so long, and so many, tell rest
 _REST_SHAKE, _REST_TURN = 0.12, 0.02  # m/s^2 and rad/s, standard deviations: about twice a D435i's noise
+_SHAKEN_S = 0.2  # samples of so long tell how much it is shaken
 _REPEATED = 4  # samples at the end of the scale,
 _MUCH = np.repeat([0.5, 11.0], 3)  # rad/s and m/s^2, which no scale ends below
 
@@ -80,6 +81,12 @@ class Samples:
         if len(told) == 0 or np.diff(np.r_[told, max(to_ns, int(told[-1]))]).max() > silent_ns:
             return None
         return part
+
+    def latest(self, to_ns: int) -> ImuBatch:
+        """Those of the last _SHAKEN_S."""
+        stamps = self.all.stamps_ns
+        first, last = np.searchsorted(stamps, [to_ns - round(_SHAKEN_S * 1e9), to_ns], side="right")
+        return self.all.take(slice(int(first), int(last) + 1))
 
     def still(self, now_ns: int) -> bool:
         """Whether the IMU shows a body at rest, no motor running, since _REST_S before."""

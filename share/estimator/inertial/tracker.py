@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from share.config import InertialConfig, TrackerConfig
 from share.estimator import relocalise
 from share.estimator.inertial import ekf, find, parsac
-from share.estimator.inertial.beginning import first_state, state_by_camera
+from share.estimator.inertial.beginning import first_state, state_by_camera, unknown_bias
 from share.estimator.inertial.breaks import Doubt
 from share.estimator.inertial.features import Looks
 from share.estimator.inertial.health import Agreement, Straying
 from share.estimator.inertial.imu import integrate
 from share.estimator.inertial.keyframes import Keyframes
-from share.estimator.inertial.noise import louder, without
+from share.estimator.inertial.noise import louder, shaken, without
 from share.estimator.inertial.pivot import Pivot
-from share.estimator.inertial.readiness import converged, tilt, waits_for, worth_telling
+from share.estimator.inertial.readiness import converged, learnt_bias, tilt, waits_for, worth_telling
 from share.estimator.inertial.samples import Samples, coasting, mean_rate, unclipped
 from share.estimator.inertial.scene import Scene
 from share.estimator.inertial.state import State
@@ -32,7 +32,7 @@ from share.estimator.inertial.window import Window, window_for, without_force
 from share.estimator.localmap import LocalMap
 from share.estimator.result import TrackResult, typical
 from share.geometry import se3
-from share.geometry.camera import ImuNoise, Rig
+from share.geometry.camera import ImuBias, ImuNoise, Rig
 from share.types import F64, U8, Candidate, Footing, Frame, ImuBatch, TrackState, Wait
 from share.vision import corners
 from share.vision.view import measures_depth
@@ -50,10 +50,19 @@ _LEVEL_RAD = np.radians(3.0)  # sigma of tilt up to which others are told what i
 class InertialTracker:
     """Feed frames in order to `track`. Deterministic: the same frames give the same poses."""
 
-    def __init__(self, rig: Rig, config: InertialConfig, places: TrackerConfig, seed: int = 0) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        config: InertialConfig,
+        places: TrackerConfig,
+        seed: int = 0,
+        bias: ImuBias | None = None,
+    ) -> None:
+        """bias: of the IMU, where a run before has learnt it."""
         if rig.imu is None:
             raise ValueError("without an IMU there is VisualTracker")
         self._rig, self._config = rig, config
+        self._bias = unknown_bias(config) if bias is None else bias
         self._noise = louder(rig.imu, config.imu_noise)
         self._coasting = ImuNoise(config.turning_noise, config.moving_noise, 0.0, 0.0, rig.imu.rate_hz)
         self._common = np.diag(np.repeat([config.common_rad**2, config.common_m**2], 3))
@@ -80,6 +89,13 @@ class InertialTracker:
     def state(self) -> State | None:
         """The filter's; for those who look into it."""
         return self._scene.state if self._scene else None
+
+    @property
+    def bias(self) -> ImuBias | None:
+        """Of the IMU, as the filter knows it now; None where that is not worth remembering."""
+        if self._scene is None or not (self._ready and self._knows_up and self._agreement.sound):
+            return None
+        return learnt_bias(self._scene.state, self._config)
 
     @property
     def looks(self) -> Looks | None:
@@ -245,7 +261,8 @@ class InertialTracker:
             return True
         clipped, doubt = self._samples.clipped(imu), self._doubt(frame, s)
         silent = clipped if doubt is None else clipped | doubt.axes
-        noise = without(self._noise, self._coasting, silent)
+        noise = shaken(self._noise, self._samples.latest(to_ns))
+        noise = without(noise, self._coasting, silent)
         imu = unclipped(imu, clipped[:3], self._rate + s.bg)
         self._rate = ekf.propagate(s, imu, to_ns, noise, gravity)
         if doubt is not None:
@@ -351,11 +368,11 @@ class InertialTracker:
         lost_ns = 0 if self._lost_ns is None else frame.stamp_ns - self._lost_ns
         if found is None and 0 < lost_ns < self._places_config.new_stretch_s * 1e9:
             return TrackResult(waiting, None)
-        state = first_state(frame.stamp_ns, self._samples.all, self._rig, self._config)
+        state = first_state(frame.stamp_ns, self._samples.all, self._rig, self._config, self._bias)
         self._waited += state is None
         self._knows_up = state is not None
         if state is None and self._waited >= _PATIENCE:
-            state = state_by_camera(frame.stamp_ns, self._rig, self._config)
+            state = state_by_camera(frame.stamp_ns, self._rig, self._config, self._bias)
         if state is None:
             return TrackResult(waiting, None, waits=Wait.IMU)
         if found is not None:
