@@ -180,7 +180,10 @@ class Edge:
             if isinstance(message, wire.Bye):  # said again, or late
                 return False
             if (reason := self._no_room(peer, now_ns)) is not None:
-                self._refuse(peer_id, reason, now_ns)
+                if isinstance(message, wire.Hello | wire.Ping):  # not each of many keyframes is answered
+                    self._refuse(peer_id, reason, now_ns)
+                else:
+                    peer.refusals.add(reason, now_ns)
                 return False
             self._come_back(peer, now_ns)
         peer.heard_ns, peer.was_heard = now_ns, True

@@ -168,10 +168,12 @@ def test_an_old_run_does_not_come_back_beside_the_present_one(message: m.Message
     tell(edge, 1, m.Bye())
     come(edge, "hope", 2)
     effects = tell(edge, 1, message, 1)
-    assert "in use" in str(refusal(effects))
+    asks = isinstance(message, m.Ping | m.Hello)  # what it may send many of is not answered
+    assert ("in use" in str(refusal(effects))) == asks
     assert not of(effects, ed.Present) + of(effects, ed.Add)
-    assert len(of(effects, ed.Send)) == 1
+    assert len(of(effects, ed.Send)) == asks
     assert present(edge) == 1
+    assert sum(agent["refused_messages"] for agent in edge.report({})["agents"].values()) == 1
     assert sum(agent["evaluations"] for agent in edge.report({})["agents"].values()) == 0
     tell(edge, 2, m.Bye(), 2)
     assert refusal(tell(edge, 1, m.Ping(1, 1), 2)) is None
@@ -197,7 +199,7 @@ def test_who_was_silent_for_too_long_has_lost_its_name() -> None:
     come(edge, "ann", 1)
     effects = come(edge, "ann", 2, 3.5)
     assert [(e.key, e.here) for e in of(effects, ed.Present)] == [(f"ann-{m.public_tag(1)[:4]}", False)]
-    assert "in use" in str(refusal(tell(edge, 1, m.Evaluation(0, 1.0, 1.0), 3.6)))
+    assert "in use" in str(refusal(tell(edge, 1, m.Ping(1, 1), 3.6)))
     assert present(edge) == 1
 
 
