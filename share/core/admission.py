@@ -16,6 +16,7 @@ from share.wire.messages import Hello, public_tag
 _NAME_BURST, _NAME_HZ = 8.0, 0.1
 _VOICE_BURST, _VOICE_HZ = 32.0, 0.25
 _EDGE_BURST, _EDGE_HZ = 128.0, 2.0
+_MUTE_S = 0.6  # an agent pings every half second
 
 
 class Newcomers:
@@ -72,6 +73,11 @@ class Admission:
     def came(self, event: Received, hello: Hello, now_ns: int) -> None:
         """This new run was taken in."""
         self._newcomers.came(hello.name, event.voice, now_ns)
+
+    def is_soon_free(self, name: str, peers: Mapping[bytes, Peer], now_ns: int) -> bool:
+        """Whether a run of this name is silent, perhaps for ever: its agent was killed and starts again."""
+        heard_ns = [peer.heard_ns for peer in peers.values() if not peer.gone and peer.hello.name == name]
+        return bool(heard_ns) and now_ns - max(heard_ns) > seconds(_MUTE_S)
 
     def no_room(self, hello: Hello, peers: Mapping[bytes, Peer], now_ns: int) -> str | None:
         """Why a run that is not present cannot be, beside those that are; None if it can."""

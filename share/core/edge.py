@@ -220,10 +220,12 @@ class Edge:
     # ------------------------------------------------------------------ coming in
 
     def _greet(self, event: ed.Received, hello: wire.Hello, now_ns: int) -> None:
-        """Welcome a new run or a known one; refuse a name that somebody else is using."""
+        """Welcome a new run or a known one; refuse a name that somebody else is using, once that is sure: who
+        gets no answer says hello again."""
         peer_id = event.peer
         if (reason := self._objection(event, hello, now_ns)) is not None:
-            self._refuse(peer_id, reason, now_ns)
+            if not self._admission.is_soon_free(hello.name, self._runs, now_ns):
+                self._refuse(peer_id, reason, now_ns)
             return
         if peer_id not in self._runs:
             if (idle := self._runs.forget_idle()) is not None:

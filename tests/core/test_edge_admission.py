@@ -203,6 +203,22 @@ def test_who_was_silent_for_too_long_has_lost_its_name() -> None:
     assert present(edge) == 1
 
 
+def test_an_agent_that_was_killed_and_started_again_is_let_in_once_its_name_is_free() -> None:
+    edge = Edge(Config(), 7)
+    come(edge, "ann", 1)
+    tell(edge, 1, m.Ping(1, 1), 1)
+    assert "in use" in str(refusal(come(edge, "ann", 2, 1.5)))  # it has a ping's time to answer for itself
+    for now_s in (1.7, 2.2, 3.9):
+        assert not of(come(edge, "ann", 2, now_s), ed.Send)
+    welcome = come(edge, "ann", 2, 4.1)
+    assert refusal(welcome) is None
+    assert of(welcome, ed.Join)
+    tell(edge, 2, m.Ping(1, 1), 5)
+    assert not of(come(edge, "ann", 3, 5.8), ed.Send)
+    tell(edge, 2, m.Ping(2, 2), 5.9)  # it was there all the time
+    assert "in use" in str(refusal(come(edge, "ann", 3, 6.3)))
+
+
 def test_bye_is_heard_once() -> None:
     edge = Edge(Config(), 7)
     come(edge, "ann", 1)
