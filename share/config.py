@@ -63,7 +63,6 @@ class InertialConfig:
     spacing_px: float = 18.0  # least distance between new ones
     sigma_px: float = 0.15  # of a feature found again, anew in every image,
     lasting_px: float = 0.3  # and of what is wrong with it for longer: edges, patches seen from elsewhere;
-    lasting_s: float = 1.0  # for so long
     stereo_px: float = 0.25  # of a new feature's disparity
     common_rad: float = 1e-3  # error of an image that all its features share: its blur, its time
     common_m: float = 1e-4  # the same, as a shift of the camera
@@ -96,7 +95,7 @@ class InertialConfig:
 
     def __post_init__(self) -> None:
         _require_positive(self, "features", "spacing_px", "sigma_px", "gate", "imu_noise", "gravity")
-        _require_positive(self, "max_keyframes", "lasting_s")
+        _require_positive(self, "max_keyframes")
 
 
 @dataclass(frozen=True)

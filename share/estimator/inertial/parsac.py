@@ -86,10 +86,9 @@ class _Fit:
         prior = ekf.motion_since(state) + np.diag(_FLOOR)
         J = rows.core[:, :, POSE] @ se3.adjoint(state.T) @ np.linalg.cholesky(prior)
         rho_variance = state.rho_variance[rows.which, None, None]
-        rho = rows.by_rho[:, :, None] * rows.by_rho[:, None, :] * rho_variance
-        lasts = state.lasting_at + 2 * rows.which[:, None] + (0, 1)
-        own: F64 = rho + state.cov[lasts[:, :, None], lasts[:, None, :]]
-        white = np.linalg.inv(np.linalg.cholesky(own + rows.sigma[:, None, None] ** 2 * np.eye(2)))
+        own: F64 = rows.by_rho[:, :, None] * rows.by_rho[:, None, :] * rho_variance
+        seen = (rows.sigma**2 + rows.lasting**2)[:, None, None] * np.eye(2)
+        white = np.linalg.inv(np.linalg.cholesky(own + seen))
         self._J, self._r = white @ J, (white @ rows.residual[:, :, None])[:, :, 0]
 
     @property

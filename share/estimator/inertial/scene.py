@@ -41,7 +41,6 @@ class Scene:
     def __init__(self, state: State, rig: Rig, config: InertialConfig) -> None:
         self.state, self._rig, self._config = state, rig, config
         self.looks: Looks = features.none()
-        self._lasting = config.lasting_px / rig.cam0.focal
         self._memory = Memory()
         self._shunned: list[F32] = []
         self._measured = True
@@ -64,7 +63,6 @@ class Scene:
     def step(self, seconds: float, measured: bool) -> None:
         """Since the frame before. measured: an IMU told how the body turned meanwhile."""
         self._measured = measured
-        ekf.fade(self.state, seconds, self._lasting, self._config.lasting_s)
         self._probation = int(_PROBATION_S / max(seconds, 1e-3))
 
     def seen(self, left: Sought, seen: NDArray[np.bool_]) -> None:
@@ -128,8 +126,9 @@ class Scene:
         which = np.flatnonzero(sought.found & ~sought.astray)
         uv = camera.normalise(sought.px[which].astype(np.float64), sought.prediction.uv[which])
         sigma = np.full(len(which), self._config.sigma_px / camera.focal)
+        lasting = np.full(len(which), self._config.lasting_px / camera.focal)
         seen = observe.predict(self.state, which, T_right_left) if anew else sought.prediction.take(which)
-        return ekf.sight(self.state, which, seen, uv, sigma, rate)
+        return ekf.sight(self.state, which, seen, uv, sigma, lasting, rate)
 
     def heard(self, first: ekf.Sight, *others: ekf.Sight) -> ekf.Sight:
         """What the filter hears of all that was seen in a frame's images, sorted by host."""
@@ -141,7 +140,8 @@ class Scene:
     def _with_doubt(self, rows: ekf.Sight) -> ekf.Sight:
         """While somebody moves in the view, what is new in it counts little."""
         unproven = (self._wary > 0) & ~self.proven(rows.which)
-        return replace(rows, sigma=np.where(unproven, _UNPROVEN, 1.0) * rows.sigma)
+        times = np.where(unproven, _UNPROVEN, 1.0)
+        return replace(rows, sigma=times * rows.sigma, lasting=times * rows.lasting)
 
     def proven(self, which: I64) -> NDArray[np.bool_]:
         """Which of features `which` (M,) have long done as they should."""
@@ -165,7 +165,7 @@ class Scene:
         self._next_feature += len(ids)
         far = far.take(good)
         hosts = np.full(len(ids), host)
-        ekf.add_features(s, ids, hosts, ray[good], far.rho, far.sigma, 0.0, far.like, far.common)
+        ekf.add_features(s, ids, hosts, ray[good], far.rho, far.sigma, far.like, far.common)
         self.looks = self.looks.join(looks.take(good))
 
     def _inverse_depths(self, frame: Frame, px: F32, ray: F64) -> Guess:
@@ -196,7 +196,7 @@ class Scene:
         asleep = self._memory.near(s, config.recall_m, config.recall_rad, config.recall)
         if asleep is None:
             return
-        ekf.add_features(s, asleep.ids, asleep.host, asleep.ray, asleep.rho, asleep.sigma, self._lasting)
+        ekf.add_features(s, asleep.ids, asleep.host, asleep.ray, asleep.rho, asleep.sigma)
         self.looks = self.looks.join(asleep.looks)
         good = self._recognised(frame, rate, fresh)
         self._memory.wake(s.ids[good][fresh:])
