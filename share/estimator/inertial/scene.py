@@ -49,16 +49,11 @@ class Scene:
         self._next_feature = self._next_keyframe = 0
         self._last: tuple[Sought, NDArray[np.bool_], I64] | None = None  # frame: sought, believed, their ids
 
-    def add_keyframe(self, rate: F64) -> None:
-        """The frame just tracked: its pose."""
+    def add_keyframe(self, rate: F64) -> int:
+        """The frame just tracked: its pose. Its id."""
         ekf.add_keyframe(self.state, self._next_keyframe, rate)
         self._next_keyframe += 1
-
-    def replenish(self, frame: Frame, rate: F64) -> None:
-        """The newest keyframe, made of `frame`: features seen from about here before, and new ones."""
-        self._wake(frame, rate)
-        self._add_features(frame, host=len(self.state.keyframes) - 1)
-        self._forget()
+        return self._next_keyframe - 1
 
     def step(self, seconds: float, measured: bool) -> None:
         """Since the frame before. measured: an IMU told how the body turned meanwhile."""
@@ -153,10 +148,27 @@ class Scene:
         out: NDArray[np.bool_] = self.state.rho_variance > _VAGUE**2
         return out
 
-    def _add_features(self, frame: Frame, host: int) -> None:
-        config, camera, s = self._config, self._rig.cam0, self.state
-        taken = np.concatenate([self.looks.px, *self._shunned])
-        px = corners.detect(frame.image0, taken, config.features - len(s.ids), config.spacing_px)
+    def taken(self) -> F32:
+        """px (M, 2) of the frame just tracked, near which nothing new is sought."""
+        return np.concatenate([self.looks.px, *self._shunned])
+
+    def room(self) -> int:
+        """For so many features more."""
+        return self._config.features - len(self.state.ids)
+
+    def corners(self, frame: Frame, taken: F32, room: int) -> F32:
+        """px (N, 2) of what may become features of a keyframe, away from those `taken` (M, 2)."""
+        return corners.detect(frame.image0, taken, room, self._config.spacing_px)
+
+    def admit(self, frame: Frame, keyframe: int, px: F32) -> None:
+        """New features at px (N, 2) of the frame that is keyframe number `keyframe`; the last frame may be a
+        later one. Keyframes that nothing is left of make room."""
+        host = int(np.flatnonzero(self.state.keyframes == keyframe)[0])
+        self._add_features(frame, host, px)
+        self._forget()
+
+    def _add_features(self, frame: Frame, host: int, px: F32) -> None:
+        camera, s = self._rig.cam0, self.state
         ray = camera.normalise(px.astype(np.float64))
         far = self._inverse_depths(frame, px, ray)
         looks = features.looks(frame.image0, camera, px, ray, np.nan_to_num(far.rho))
@@ -164,9 +176,11 @@ class Scene:
         ids = np.arange(self._next_feature, self._next_feature + int(good.sum()))
         self._next_feature += len(ids)
         far = far.take(good)
-        hosts = np.full(len(ids), host)
-        ekf.add_features(s, ids, hosts, ray[good], far.rho, far.sigma, far.like, far.common)
+        before = len(s.ids)
+        ekf.add_features(s, ids, np.full(len(ids), host), ray[good], far.rho, far.sigma, far.like, far.common)
         self.looks = self.looks.join(looks.take(good))
+        here = camera.distort(observe.predict(s, np.arange(before, before + len(ids))).uv)
+        self.looks.px[before:] = np.where(np.isnan(here), px[good], here)  # in the last frame
 
     def _inverse_depths(self, frame: Frame, px: F32, ray: F64) -> Guess:
         """Of new features, NaN unknown: measured, or else guessed."""
@@ -190,8 +204,9 @@ class Scene:
         off_px = np.abs(1 / z - 1 / about) * self._rig.cam0.focal * self._rig.baseline
         return np.where(off_px < _SAME_PLACE_PX, z, np.nan)
 
-    def _wake(self, frame: Frame, rate: F64) -> None:
-        """Features seen from about here before, where they lie as near as the filter knows."""
+    def wake(self, frame: Frame, rate: F64) -> None:
+        """Features seen from about here before, where the frame just tracked shows them as near as the filter
+        knows."""
         s, config, fresh = self.state, self._config, len(self.state.ids)
         asleep = self._memory.near(s, config.recall_m, config.recall_rad, config.recall)
         if asleep is None:

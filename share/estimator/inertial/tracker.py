@@ -72,6 +72,7 @@ class InertialTracker:
         self._window: Window | None = None  # of a single camera, until its scale is known
         self._image: U8 | None = None
         self._stamp_ns = 0
+        self._settled = True  # what there was to do after the last frame
         self._rate = np.zeros(3)
         self._straying = Straying(config.weak, config.blind)
         self._agreement, self._surprise = Agreement(), np.zeros(0)  # of the frame
@@ -111,25 +112,27 @@ class InertialTracker:
         self.settle()
         self._samples.add(frame.imu)
         result = self._begin(frame) if self._scene is None else self._follow(frame, self._scene)
-        self._image, self._stamp_ns = frame.image0, frame.stamp_ns
+        self._image, self._stamp_ns, self._settled = frame.image0, frame.stamp_ns, False
         return result
 
     def keyframe(self, frame: Frame) -> Candidate:
-        """Make the frame just tracked a keyframe; call it where `track` said so. What it shows to others."""
+        """What the frame just tracked shows to others; call it where `track` said that it is a keyframe."""
         scene = self._scene
         assert scene is not None
         new_stretch, self._new_stretch = self._new_stretch, False
-        view, T_last_body, cov = self._keyframes.show(frame, scene, self._rate, new_stretch)
+        view, T_last_body, cov = self._keyframes.show(frame, scene, new_stretch)
         s, unsure = scene.state, tilt(scene.state)
         up = s.T[2, :3] if self._knows_up and unsure < _LEVEL_RAD else np.zeros(3)
         return Candidate(self._pivot.told(s.T), T_last_body, cov, up, unsure / np.sqrt(2), view, new_stretch)
 
     def settle(self) -> None:
-        """What `keyframe` left to do, half its work, and nobody waits for: new features, and the place to
-        find oneself by. For when the candidate is on its way; else the next `track` does it first."""
-        if self._scene is None:
+        """A slice of what keyframes leave to do, and nobody waits for: new features, and places to find oneself
+        by. For when the pose, and the candidate if there is one, are on their way; else the next `track` does
+        it first."""
+        if self._scene is None or self._settled:
             return
-        s, done = self._scene.state, self._keyframes.settle(self._scene, self._rate)
+        self._settled = True
+        s, done = self._scene.state, self._keyframes.settle(self._scene)
         if done is not None and not self._straying.suspected:
             self._places.add_keyframe(done.frame.image0, s.T @ s.T_body_cam)
             self._places.set_view(done.view)
@@ -196,7 +199,7 @@ class InertialTracker:
             if not self._solved(frame, scene, wanted):
                 return self._initialising(scene.state)
             state, wanted = TrackState.OK, True
-        told = self._told(scene.state, state, wanted, count)
+        told = self._told(frame, scene, state, wanted, count)
         return replace(told, found=int((left.found | seen).sum()), surprise=typical(self._surprise))
 
     def _solved(self, frame: Frame, scene: Scene, anchored: bool) -> bool:
@@ -211,15 +214,21 @@ class InertialTracker:
             return False
         return window.solved(scene, imu, anchored) and converged(s)
 
-    def _told(self, s: State, state: TrackState, wanted: bool, count: int) -> TrackResult:
+    def _told(
+        self, frame: Frame, scene: Scene, state: TrackState, wanted: bool, count: int
+    ) -> TrackResult:
+        s = scene.state
         first, self._ready, self._window = not self._ready, True, None
         new_stretch = first and self._new_stretch
         if first:
             self._pivot.begin(s, self._begun_at, new_stretch)
         else:
             self._pivot.after(s)
-        sound = self._agreement.sound
-        return TrackResult(state, self._pose(s), wanted or first, count, new_stretch, ekf.pose_cov(s), sound)
+        pose, cov = self._pose(s), ekf.pose_cov(s)
+        shown = first or (wanted and self._keyframes.may_show(frame.stamp_ns))
+        if wanted or first:
+            self._keyframes.begin(frame, scene, self._rate, count < self._config.weak)
+        return TrackResult(state, pose, shown, count, new_stretch, cov, self._agreement.sound)
 
     def _look(self, frame: Frame, scene: Scene) -> tuple[find.Sought, NDArray[np.bool_]]:
         """Where cam0 shows the features, and which (N,) were seen and believed."""
@@ -395,7 +404,7 @@ class InertialTracker:
         self._lost_ns = None
         if self._window is not None or not self._worth_telling(state):
             return self._initialising(state)
-        return self._told(state, TrackState.OK, True, len(state.ids))
+        return self._told(frame, scene, TrackState.OK, True, len(state.ids))
 
     def _lose(self, frame: Frame) -> TrackResult:
         """What is left of the filter is worth nothing."""
