@@ -17,7 +17,7 @@ from share.estimator.inertial.state import State
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
 from share.types import F32, F64, I64, U8, Footing, Frame
-from share.vision import corners, epipolar
+from share.vision import corners, epipolar, patches
 from share.vision.depth import from_depth_camera, from_stereo
 from share.vision.view import measures_depth
 
@@ -71,7 +71,8 @@ class Scene:
         self._shun(left.px[left.astray])
         self._wary = _WARY_FRAMES if left.astray.sum() >= _CROWD else max(self._wary - 1, 0)
         now = np.flatnonzero(seen & (features.turn(self.looks) % _SLANT_EVERY == 0))
-        features.learn_slant(self.looks, now, left.error[now], left.along[now])
+        error = patches.unexplained(self.looks.patch.take(now), left.samples[now], left.shift[now])
+        features.learn_slant(self.looks, now, error, left.along[now])
         self._memory.sleep(self.state, self.looks, np.flatnonzero(~left.found))
         self.keep(seen)
         self._last = left, seen, self.state.ids
@@ -111,26 +112,46 @@ class Scene:
         """No new feature near px (N, 2) for a while: there goes somebody."""
         self._shunned = [*self._shunned[-_SHUN_FRAMES:], px]
 
-    def sight(
-        self, sought: Sought, rate: F64, T_right_left: F64 | None = None, anew: bool = False
-    ) -> ekf.Sight:
-        """Rows for the filter of the features that were found in cam0, or with T_right_left in cam1.
-        anew: the state has moved since they were sought."""
-        camera = self._rig.cam0 if T_right_left is None else self._rig.cam1
-        assert camera is not None
+    def off(self, sought: Sought) -> tuple[I64, F64]:
+        """Which features (M,) cam0 shows, and by how much (M, 2) they are from where they were expected."""
         which = np.flatnonzero(sought.found & ~sought.astray)
-        uv = camera.normalise(sought.px[which].astype(np.float64), sought.prediction.uv[which])
-        sigma = np.full(len(which), self._config.sigma_px / camera.focal)
-        lasting = np.full(len(which), self._config.lasting_px / camera.focal)
-        seen = observe.predict(self.state, which, T_right_left) if anew else sought.prediction.take(which)
-        return ekf.sight(self.state, which, seen, uv, sigma, lasting, rate)
+        return which, self._measured_at(sought, which) - sought.uv[which]
 
-    def heard(self, first: ekf.Sight, *others: ekf.Sight) -> ekf.Sight:
-        """What the filter hears of all that was seen in a frame's images, sorted by host."""
-        rows = self._with_doubt(first.join(*others))
+    def sight(self, sought: Sought, which: I64, rate: F64) -> ekf.Sight:
+        """Rows for the filter of features `which` (M,), which were found in cam0."""
+        return self._rows(which, self._measured_at(sought, which), None, rate)
+
+    def heard(self, sought: Sought, rate: F64) -> ekf.Sight:
+        """What the filter hears of all that was seen in a frame's images, sorted by host; as the state is now.
+        """
+        heard = sought.found & ~sought.astray
         if self._measured:  # else nothing but images leads from one to the next
-            rows = rows.take(features.heard(self.looks)[rows.which])
-        return rows.take(np.argsort(rows.host, kind="stable"))
+            heard &= features.heard(self.looks)
+        which = np.flatnonzero(heard)
+        uv, right = self._measured_at(sought, which), None
+        if (there := sought.right) is not None and self._rig.cam1 is not None:
+            both = heard[there.which]
+            more = there.which[both]
+            seen = self._rig.cam1.normalise(there.px[both].astype(np.float64), there.uv[both])
+            right = np.arange(len(which) + len(more)) >= len(which)
+            which, uv = np.concatenate([which, more]), np.concatenate([uv, seen])
+        order = np.argsort(self.state.host[which], kind="stable")
+        right = None if right is None else right[order]
+        return self._with_doubt(self._rows(which[order], uv[order], right, rate))
+
+    def _measured_at(self, sought: Sought, which: I64) -> F64:
+        """uv (M, 2) where cam0 shows features `which` (M,)."""
+        return self._rig.cam0.normalise(sought.px[which].astype(np.float64), sought.uv[which])
+
+    def _rows(self, which: I64, uv: F64, right: NDArray[np.bool_] | None, rate: F64) -> ekf.Sight:
+        """Of features `which` (M,) seen at uv (M, 2), in cam1 where `right` (M,) says so."""
+        T = None if right is None else self._rig.T_cam1_cam0
+        focal = np.full(len(which), self._rig.cam0.focal)
+        if right is not None and self._rig.cam1 is not None:
+            focal[right] = self._rig.cam1.focal
+        seen = observe.predict(self.state, which, T, right)
+        sigma, lasting = self._config.sigma_px / focal, self._config.lasting_px / focal
+        return ekf.sight(self.state, which, seen, uv, sigma, lasting, rate)
 
     def _with_doubt(self, rows: ekf.Sight) -> ekf.Sight:
         """While somebody moves in the view, what is new in it counts little."""
@@ -219,9 +240,9 @@ class Scene:
 
     def _recognised(self, frame: Frame, rate: F64, fresh: int) -> NDArray[np.bool_]:
         """Of features from number `fresh` on, those that are found where they should be; all others."""
-        sought = find.seek(frame.image0, self._rig.cam0, self.state, self.looks, self._config, fresh=fresh)
+        sought = find.seek(frame, self._rig, self.state, self.looks, self._config, fresh)
         self.looks.px[sought.found] = sought.px[sought.found]
-        rows = self.sight(sought, rate)
+        rows = self.sight(sought, np.flatnonzero(sought.found), rate)
         good = np.arange(len(self.state.ids)) < fresh
         if len(rows.which):
             _, S = ekf.gains(self.state, rows)

@@ -232,21 +232,21 @@ class InertialTracker:
 
     def _look(self, frame: Frame, scene: Scene) -> tuple[find.Sought, NDArray[np.bool_]]:
         """Where cam0 shows the features, and which (N,) were seen and believed."""
-        s, looks = scene.state, scene.looks
-        camera = self._rig.cam0
-        left = find.seek(frame.image0, camera, s, looks, self._config)
+        sought = find.seek(frame, self._rig, scene.state, scene.looks, self._config)
         if self._image is not None:
-            find.rescue(self._image, frame.image0, camera, looks, left, self._config)
-        rows = self._of_the_room(scene, left)
-        return left, self._update(frame, scene, left, rows)
+            find.rescue(self._image, frame.image0, self._rig.cam0, scene.looks, sought, self._config)
+        self._mark_movers(scene, sought)
+        return sought, self._update(frame, scene, sought)
 
-    def _of_the_room(self, scene: Scene, left: find.Sought) -> ekf.Sight:
-        """Rows of what cam0 shows of the room; what moves by itself is marked as astray."""
-        rows = scene.sight(left, self._rate)
-        px, proven = left.px[rows.which], scene.proven(rows.which)
-        fixed = parsac.of_the_room(scene.state, rows, px, proven, self._rig.cam0)
-        left.astray[rows.which[~fixed]] = True
-        return rows.take(fixed)
+    def _mark_movers(self, scene: Scene, sought: find.Sought) -> None:
+        """What moves by itself is astray; looked for only where the IMU alone does not explain the image."""
+        which, residual = scene.off(sought)
+        camera, config = self._rig.cam0, self._config
+        if len(which) == 0 or parsac.as_expected(residual * camera.focal, config.sigma_px, config.lasting_px):
+            return
+        rows = scene.sight(sought, which, self._rate)
+        fixed = parsac.of_the_room(scene.state, rows, sought.px[which], scene.proven(which), camera)
+        sought.astray[which[~fixed]] = True
 
     def _heard(self, frame: Frame, s: State) -> ImuBatch | None:
         """What the IMU said until the image was taken; None if it was silent."""
@@ -290,30 +290,22 @@ class InertialTracker:
         """When the image was taken, IMU time."""
         return frame.stamp_ns + round(s.offset_s * 1e9)
 
-    def _update(
-        self, frame: Frame, scene: Scene, left: find.Sought, left_rows: ekf.Sight
-    ) -> NDArray[np.bool_]:
-        """Which features (N,) were seen and believed. left_rows: of `left`, before the update."""
-        s, config = scene.state, self._config
-        sought: list[tuple[find.Sought, F64 | None]] = [(left, None)]
-        if frame.image1 is not None and self._rig.cam1 is not None:
-            T = self._rig.T_cam1_cam0
-            right = find.seek(frame.image1, self._rig.cam1, s, scene.looks, config, T, left=left)
-            sought.append((right, T))
+    def _update(self, frame: Frame, scene: Scene, sought: find.Sought) -> NDArray[np.bool_]:
+        """Which features (N,) were seen and believed."""
+        s = scene.state
 
         def rows_now() -> ekf.Sight:
-            return scene.heard(*(scene.sight(image, self._rate, T, anew=True) for image, T in sought))
+            return scene.heard(sought, self._rate)
 
-        seen, self._surprise = np.zeros(len(s.ids), bool), np.zeros(0)
-        rows = scene.heard(left_rows, *(scene.sight(image, self._rate, T) for image, T in sought[1:]))
-        seen[left_rows.which] = True
+        seen, self._surprise = sought.found & ~sought.astray, np.zeros(0)
+        rows = rows_now()
         if len(rows.which) == 0:
             return seen
         rows, good, HP, S = self._judged(s, rows, rows_now)
         gap = frame.stamp_ns - self._stamp_ns > _GAP_NS
         if (
             (gap and good.mean() < _MINORITY) or (self._samples.odd(s.stamp_ns) and good.mean() < _MAJORITY)
-        ) and self._agreed(s, left):
+        ) and self._agreed(s, sought):
             ekf.doubt(s, *_DOUBT)
             rows, good, HP, S = self._judged(s, rows, rows_now)
         if good.all():
