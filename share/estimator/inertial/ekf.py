@@ -28,8 +28,10 @@ from share.estimator.inertial.state import (
 )
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
-from share.types import F64, I64, ImuBatch
+from share.types import F32, F64, I64, ImuBatch
 
+_UNSURE = np.array([0, 1, 6, 7, 8])  # tilt and velocity,
+_LOOSE = np.array([3e-4, 3e-4, 1e-2, 1e-2, 1e-2])  # rad^2, (m/s)^2: where single precision is too little
 _MOVING = 15  # columns that propagation changes
 _LEAST_COV = 1e-10  # what differences of covariances lose
 AS_ONE = 4.0  # sights of an error that lasts
@@ -152,7 +154,7 @@ def relinearised(
         rows = rows_at()
         rows.residual[:] += times(state, rows, error)
         HP, S = gains(state, rows, common)
-        step = _gain(HP, S, rows.residual.ravel())[0] - error
+        step = _gain(HP, S, rows.residual.ravel(), exactly=True)[0] - error
         error += step
         state.restore(before)
         move(state, error)
@@ -181,7 +183,7 @@ def update(state: State, rows: Sight, HP: F64, S: F64) -> float:
 
 def apply(state: State, residual: F64, HP: F64, S: F64) -> float:
     """residual (m,), H cov (m, n), its covariance S (m, m)."""
-    error, W, white = _gain(HP, S, residual)
+    error, W, white = _gain(HP, S, residual, exactly=bool((np.diag(state.cov)[_UNSURE] > _LOOSE).any()))
     state.cov -= W.T @ W  # numpy makes this one symmetric to the last bit
     move(state, error)
     return float(white @ white)
@@ -212,14 +214,20 @@ def doubt(state: State, turn: float, shift: float, speed: float) -> None:
     state.cov[VELOCITY, VELOCITY] += speed**2 * np.eye(3)
 
 
-def _gain(HP: F64, S: F64, residual: F64) -> tuple[F64, F64, F64]:
-    """The error (n,) that the residual tells of, L^-1 H cov (m, n), L^-1 residual (m,) with L L' = S."""
+def _gain(HP: F64, S: F64, residual: F64, exactly: bool) -> tuple[F64, F64 | F32, F64]:
+    """The error (n,) that the residual tells of, L^-1 H cov (m, n), L^-1 residual (m,) with L L' = S. Half as
+    long where not `exactly`: what is taken from the covariance is then right to seven digits, which is too
+    little only where nearly all of a large variance goes at once."""
     L, failed = lapack.dpotrf(S, lower=1, clean=1)
     if failed:
         raise np.linalg.LinAlgError("innovation covariance is not positive definite")
-    W: F64 = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1).T  # as Fortran has it: no copy
     white: F64 = blas.dtrsm(1.0, L, residual[:, None], lower=1)[:, 0]
-    return W.T @ white, W, white
+    if exactly:
+        W: F64 = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1).T  # as Fortran has it: no copy
+        return W.T @ white, W, white
+    short: F32 = blas.strsm(1.0, L.astype(np.float32), HP.T.astype(np.float32), side=1, lower=1, trans_a=1).T
+    gain: F64 = blas.dtrsm(1.0, L, white[:, None], lower=1, trans_a=1)[:, 0]
+    return gain @ HP, short, white
 
 
 def move(state: State, error: F64) -> None:
@@ -286,7 +294,9 @@ def add_features(
 
 def keep_features(state: State, keep: NDArray[np.bool_]) -> None:
     """The others are forgotten; what they taught of the rest stays."""
-    _keep_columns(state, np.r_[np.ones(state.features_at, bool), keep])
+    if keep.all():
+        return
+    _keep_columns(state, np.concatenate([np.ones(state.features_at, bool), keep]))
     state.ids, state.host = state.ids[keep], state.host[keep]
     state.ray, state.rho = state.ray[keep], state.rho[keep]
 
@@ -294,16 +304,17 @@ def keep_features(state: State, keep: NDArray[np.bool_]) -> None:
 def drop_keyframes(state: State, keyframes: I64) -> None:
     """These ids, with the features that they host."""
     leave = np.isin(state.keyframes, keyframes)
-    keep_features(state, ~leave[state.host])
-    features = np.ones(len(state.ids), bool)
-    _keep_columns(state, np.r_[np.ones(CORE, bool), np.repeat(~leave, 6), features])
-    state.host = (np.cumsum(~leave) - 1)[state.host]
+    if not leave.any():
+        return
+    keep = ~leave[state.host]
+    _keep_columns(state, np.concatenate([np.ones(CORE, bool), np.repeat(~leave, 6), keep]))
+    state.ids, state.ray, state.rho = state.ids[keep], state.ray[keep], state.rho[keep]
+    state.host = (np.cumsum(~leave) - 1)[state.host[keep]]
     state.keyframes, state.poses = state.keyframes[~leave], state.poses[~leave]
 
 
 def _keep_columns(state: State, keep: NDArray[np.bool_]) -> None:
-    if not keep.all():
-        state.cov = square(state.cov, np.flatnonzero(keep))
+    state.cov = square(state.cov, np.flatnonzero(keep))
 
 
 def square(matrix: F64, which: I64) -> F64:

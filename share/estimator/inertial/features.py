@@ -68,12 +68,12 @@ def runaways(looks: Looks, which: I64, residual: F64) -> NDArray[np.bool_]:
     """
     if len(which) < _FEWEST:
         return np.zeros(len(which), bool)
-    far = np.linalg.norm(looks.lag[which], axis=1)
-    still = far <= np.quantile(far, 0.25)
+    lag, quarter = looks.lag[which], len(which) // 4
+    still = np.argpartition(np.hypot(lag[:, 0], lag[:, 1]), quarter)[: quarter + 1]
     own = residual - np.median(residual[still], axis=0)
-    looks.lag[which] += _LATELY * (own - looks.lag[which])
-    far = np.linalg.norm(looks.lag[which], axis=1)
-    out: NDArray[np.bool_] = far > max(_RUN_PX, _UNUSUAL * float(np.quantile(far, 0.25)))
+    looks.lag[which] = lag = lag + _LATELY * (own - lag)
+    far = np.hypot(lag[:, 0], lag[:, 1])
+    out: NDArray[np.bool_] = far > max(_RUN_PX, _UNUSUAL * float(np.partition(far, quarter)[quarter]))
     return out
 
 

@@ -13,6 +13,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
+
 from share.config import InertialConfig
 from share.estimator.inertial.scene import Scene
 from share.estimator.inertial.shown import Shown
@@ -23,7 +25,7 @@ from share.vision.view import make_view
 
 _SHOWN_GAP_NS = 400_000_000  # between keyframes that others are told of
 
-Slice = Callable[[], None]
+Slice = Callable[[Scene, Frame, F64], None]  # with the frame just tracked, and its rate
 
 
 class Showing(NamedTuple):
@@ -61,7 +63,7 @@ class Keyframes:
     def anchor(self, frame: Frame, scene: Scene, rate: F64) -> None:
         """Make the frame just tracked one, all at once: where no pose is told yet. rate (3,): rad/s."""
         self.begin(frame, scene, rate, urgent=True)
-        self._work()
+        self._work(scene, frame, rate)
 
     def begin(self, frame: Frame, scene: Scene, rate: F64, urgent: bool) -> None:
         """Make the frame just tracked one, if it is not: its pose; the rest is for `settle`. urgent: all of it
@@ -71,7 +73,7 @@ class Keyframes:
             return
         number = scene.add_keyframe(rate)
         self._newest.stamp_ns, self._newest.T = frame.stamp_ns, scene.state.T
-        self._slices = deque([partial(self._recall, frame, scene, rate, number)])
+        self._slices = deque([partial(self._recall, frame, number, scene.taken())])
 
     def is_newest(self, frame: Frame) -> bool:
         return frame.stamp_ns == self._newest.stamp_ns
@@ -87,12 +89,14 @@ class Keyframes:
         self._unsettled = Unsettled(frame, view)
         return Showing(view, *self._shown.motion(scene.state, new_stretch))
 
-    def settle(self, scene: Scene) -> Unsettled | None:
-        """A slice of what is left to do, once a frame. The keyframe that was shown, if there was one."""
+    def settle(self, scene: Scene, frame: Frame, rate: F64) -> Unsettled | None:
+        """A slice of what is left to do, once a frame, of which `frame` is the last. The keyframe that was
+        shown, if there was one."""
         done, self._unsettled = self._unsettled, None
         if done is not None:
             self._shown.told(scene.state)  # only now: before, making its candidate might have failed
-        self._work()
+        if done is None or self._urgent:  # a view is work enough for one frame
+            self._work(scene, frame, rate)
         return done
 
     def forget(self) -> None:
@@ -103,20 +107,21 @@ class Keyframes:
 
     # ------------------------------------------------------------------ slices
 
-    def _work(self) -> None:
+    def _work(self, scene: Scene, last: Frame, rate: F64) -> None:
         while self._slices:
-            self._slices.popleft()()
+            self._slices.popleft()(scene, last, rate)
             if not self._urgent:
                 break
 
-    def _recall(self, frame: Frame, scene: Scene, rate: F64, number: int) -> None:
-        scene.wake(frame, rate)
-        self._slices.append(partial(self._corners, frame, scene, number, scene.taken(), scene.room()))
+    def _recall(self, frame: Frame, number: int, taken: F32, scene: Scene, last: Frame, rate: F64) -> None:
+        woken = scene.wake(last, rate)
+        taken = np.concatenate([taken, woken])
+        self._slices.append(partial(self._corners, frame, number, taken))
 
-    def _corners(self, frame: Frame, scene: Scene, number: int, taken: F32, room: int) -> None:
-        px = scene.corners(frame, taken, room)
-        self._slices.append(partial(self._admit, frame, scene, number, px))
+    def _corners(self, frame: Frame, number: int, taken: F32, scene: Scene, last: Frame, rate: F64) -> None:
+        px = scene.corners(frame, taken)
+        self._slices.append(partial(self._admit, frame, number, px))
 
-    def _admit(self, frame: Frame, scene: Scene, number: int, px: F32) -> None:
+    def _admit(self, frame: Frame, number: int, px: F32, scene: Scene, last: Frame, rate: F64) -> None:
         scene.admit(frame, number, px)
         self._newest.features = len(scene.state.ids)

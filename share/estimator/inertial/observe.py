@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from share.columns import Columns
 from share.estimator.inertial.state import State
 from share.geometry import se3
-from share.geometry.camera import rays
+from share.geometry.camera import Camera, rays
 from share.types import F64, I64
 
 _NEAREST = 0.02  # homogeneous depth below which nothing is seen
@@ -99,6 +99,13 @@ def _in_camera(
     moved = (D @ by_rho[:, :, None])[:, :, 0]
     moved[right] += by
     return uv, D, moved
+
+
+def in_view(state: State, camera: Camera, keyframe: int, ray: F64, rho: F64) -> NDArray[np.bool_]:
+    """Which of what keyframe number `keyframe` sees on rays (N, 2), inverse depth rho (N,), cam0 has in view."""
+    T = se3.inverse(state.T @ state.T_body_cam) @ state.poses[keyframe] @ state.T_body_cam
+    uv, _ = _projected(rays(ray) @ T[:3, :3].T + rho[:, None] * T[:3, 3])
+    return np.asarray(camera.inside(np.nan_to_num(camera.distort(uv), nan=-1e6)), bool)
 
 
 def hosts_in_camera(state: State, which: I64 | slice = slice(None)) -> F64:

@@ -28,7 +28,7 @@ _SAME_PLACE_PX = 2.0  # of disparity
 _SHUN_FRAMES = 30  # for which nothing new is sought where something moved by itself
 _CROWD, _WARY_FRAMES = 5, 60  # features at a time that went astray: somebody moves in the view
 _PROBATION_S, _UNPROVEN = 0.34, 5.0  # in which a feature proves itself, and times its sigma until then
-_SLANT_EVERY = 2  # frames in which a feature's slant is learnt
+_SLANT_EVERY = 4  # frames in which a feature's slant is learnt
 _FARTHEST, _NEAREST_M = 0.03, 0.2  # 1/m; m
 _VAGUE = 0.05  # 1/m, sigma; half a pixel a frame of somebody who walks
 _SURE = 0.1  # relative sigma of an inverse depth that others are told
@@ -173,20 +173,22 @@ class Scene:
         """px (M, 2) of the frame just tracked, near which nothing new is sought."""
         return np.concatenate([self.looks.px, *self._shunned])
 
-    def room(self) -> int:
-        """For so many features more."""
-        return self._config.features - len(self.state.ids)
-
-    def corners(self, frame: Frame, taken: F32, room: int) -> F32:
-        """px (N, 2) of what may become features of a keyframe, away from those `taken` (M, 2)."""
-        return corners.detect(frame.image0, taken, room, self._config.spacing_px)
+    def corners(self, frame: Frame, taken: F32) -> F32:
+        """px (N, 2) of what may become features of a keyframe, away from those `taken` (M, 2), the most wanted
+        first."""
+        more = self._config.features if self._room() else 0
+        return corners.detect(frame.image0, taken, more, self._config.spacing_px)
 
     def admit(self, frame: Frame, keyframe: int, px: F32) -> None:
         """New features at px (N, 2) of the frame that is keyframe number `keyframe`; the last frame may be a
         later one. Keyframes that nothing is left of make room."""
-        host = int(np.flatnonzero(self.state.keyframes == keyframe)[0])
-        self._add_features(frame, host, px)
+        host, room = int(np.flatnonzero(self.state.keyframes == keyframe)[0]), self._room()
+        self._add_features(frame, host, px[:room])
         self._forget()
+
+    def _room(self) -> int:
+        """For so many features more."""
+        return max(self._config.features - len(self.state.ids), 0)
 
     def _add_features(self, frame: Frame, host: int, px: F32) -> None:
         camera, s = self._rig.cam0, self.state
@@ -221,22 +223,27 @@ class Scene:
         """m (N,), NaN where the pair does not agree on one: the clearest place on each line, then to a
         fraction of a pixel."""
         about = epipolar.search(image0, image1, self._rig, px, ray)
-        z = from_stereo(image0, image1, self._rig, px, ray, about)
-        off_px = np.abs(1 / z - 1 / about) * self._rig.cam0.focal * self._rig.baseline
-        return np.where(off_px < _SAME_PLACE_PX, z, np.nan)
+        out, clear = np.full(len(px), np.nan), np.flatnonzero(~np.isnan(about))
+        z = from_stereo(image0, image1, self._rig, px[clear], ray[clear], about[clear])
+        off_px = np.abs(1 / z - 1 / about[clear]) * self._rig.cam0.focal * self._rig.baseline
+        out[clear] = np.where(off_px < _SAME_PLACE_PX, z, np.nan)
+        return out
 
-    def wake(self, frame: Frame, rate: F64) -> None:
+    def wake(self, frame: Frame, rate: F64) -> F32:
         """Features seen from about here before, where the frame just tracked shows them as near as the filter
-        knows."""
+        knows: px (M, 2)."""
         s, config, fresh = self.state, self._config, len(self.state.ids)
-        asleep = self._memory.near(s, config.recall_m, config.recall_rad, config.recall)
+        asleep = self._memory.near(
+            s, self._rig.cam0, config.recall_m, config.recall_rad, config.recall
+        )
         if asleep is None:
-            return
+            return np.zeros((0, 2), np.float32)
         ekf.add_features(s, asleep.ids, asleep.host, asleep.ray, asleep.rho, asleep.sigma)
         self.looks = self.looks.join(asleep.looks)
         good = self._recognised(frame, rate, fresh)
         self._memory.wake(s.ids[good][fresh:])
         self.keep(good)
+        return self.looks.px[fresh:]
 
     def _recognised(self, frame: Frame, rate: F64, fresh: int) -> NDArray[np.bool_]:
         """Of features from number `fresh` on, those that are found where they should be; all others."""
@@ -251,8 +258,9 @@ class Scene:
 
     def keep(self, keep: NDArray[np.bool_]) -> None:
         """The other features (N,) are forgotten."""
-        ekf.keep_features(self.state, keep)
-        self.looks = self.looks.take(keep)
+        if not keep.all():
+            ekf.keep_features(self.state, keep)
+            self.looks = self.looks.take(keep)
 
     def forget_asleep(self) -> None:
         """What is out of sight was remembered for nothing."""
@@ -263,7 +271,7 @@ class Scene:
         Never the newest two: others are told of the motion between them."""
         s = self.state
         busy = np.isin(np.arange(len(s.keyframes)), s.host)
-        leave = ~busy & ~np.array([self._memory.has(int(k)) for k in s.keyframes], bool)
+        leave = ~busy & ~self._memory.has(s.keyframes)
         leave[-2:] = False
         while len(s.keyframes) - leave.sum() > self._config.max_keyframes:
             left = np.flatnonzero(~leave)
@@ -273,6 +281,8 @@ class Scene:
             nearest = cost.min(axis=1) + _FAR * busy[left]
             nearest[-2:] = np.inf
             leave[left[np.argmin(nearest)]] = True
+        if not leave.any():
+            return
         self._memory.forget(s.keyframes[leave])
         self.looks = self.looks.take(~leave[s.host])
         ekf.drop_keyframes(s, s.keyframes[leave])

@@ -33,7 +33,7 @@ from share.estimator.localmap import LocalMap
 from share.estimator.result import TrackResult, typical
 from share.geometry import se3
 from share.geometry.camera import ImuBias, ImuNoise, Rig
-from share.types import F64, U8, Candidate, Footing, Frame, ImuBatch, TrackState, Wait
+from share.types import F64, Candidate, Footing, Frame, ImuBatch, TrackState, Wait
 from share.vision import corners
 from share.vision.view import measures_depth
 
@@ -44,6 +44,7 @@ _DOUBT = 0.02, 0.1, 0.3  # rad, m, m/s: how wrong the filter may be after it tha
 _REST_RATE, _REST_M_S = 0.03, 0.02  # rad/s of a body at rest; m/s of its velocity
 _SLOW_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to a filter that knows it moves
 _LEARNT = 0.3  # of the sigma that a bias has which nobody knows
+_LITTLE = 0.5  # of the features that there may be: then a keyframe's come at once
 _PATIENCE = 10  # frames without a sample of the IMU, after which we begin without
 _LEVEL_RAD = np.radians(3.0)  # sigma of tilt up to which others are told what is up
 
@@ -70,7 +71,7 @@ class InertialTracker:
         self._samples = Samples()
         self._scene: Scene | None = None
         self._window: Window | None = None  # of a single camera, until its scale is known
-        self._image: U8 | None = None
+        self._last: Frame | None = None
         self._stamp_ns = 0
         self._settled = True  # what there was to do after the last frame
         self._rate = np.zeros(3)
@@ -112,7 +113,7 @@ class InertialTracker:
         self.settle()
         self._samples.add(frame.imu)
         result = self._begin(frame) if self._scene is None else self._follow(frame, self._scene)
-        self._image, self._stamp_ns, self._settled = frame.image0, frame.stamp_ns, False
+        self._last, self._stamp_ns, self._settled = frame, frame.stamp_ns, False
         return result
 
     def keyframe(self, frame: Frame) -> Candidate:
@@ -129,10 +130,10 @@ class InertialTracker:
         """A slice of what keyframes leave to do, and nobody waits for: new features, and places to find oneself
         by. For when the pose, and the candidate if there is one, are on their way; else the next `track` does
         it first."""
-        if self._scene is None or self._settled:
+        if self._scene is None or self._last is None or self._settled:
             return
         self._settled = True
-        s, done = self._scene.state, self._keyframes.settle(self._scene)
+        s, done = self._scene.state, self._keyframes.settle(self._scene, self._last, self._rate)
         if done is not None and not self._straying.suspected:
             self._places.add_keyframe(done.frame.image0, s.T @ s.T_body_cam)
             self._places.set_view(done.view)
@@ -146,7 +147,7 @@ class InertialTracker:
         """Something failed in or after `frame`, the last: the filter may be in any state."""
         self._window = None
         self._lose(frame)
-        self._image, self._stamp_ns = frame.image0, frame.stamp_ns
+        self._last, self._stamp_ns = frame, frame.stamp_ns
 
     @property
     def doubted(self) -> int:
@@ -227,14 +228,14 @@ class InertialTracker:
         pose, cov = self._pose(s), ekf.pose_cov(s)
         shown = first or (wanted and self._keyframes.may_show(frame.stamp_ns))
         if wanted or first:
-            self._keyframes.begin(frame, scene, self._rate, count < self._config.weak)
+            self._keyframes.begin(frame, scene, self._rate, count < _LITTLE * self._config.features)
         return TrackResult(state, pose, shown, count, new_stretch, cov, self._agreement.sound)
 
     def _look(self, frame: Frame, scene: Scene) -> tuple[find.Sought, NDArray[np.bool_]]:
         """Where cam0 shows the features, and which (N,) were seen and believed."""
         sought = find.seek(frame, self._rig, scene.state, scene.looks, self._config)
-        if self._image is not None:
-            find.rescue(self._image, frame.image0, self._rig.cam0, scene.looks, sought, self._config)
+        if self._last is not None:
+            find.rescue(self._last.image0, frame.image0, self._rig.cam0, scene.looks, sought, self._config)
         self._mark_movers(scene, sought)
         return sought, self._update(frame, scene, sought)
 
