@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from functools import cache
 from typing import Any, Self
 
 import numpy as np
@@ -26,9 +25,13 @@ class Columns:
         return type(self)(*[_joined([getattr(t, name) for t in tables]) for name in _names(type(self))])
 
 
-@cache
+_NAMES: dict[type[Columns], tuple[str, ...]] = {}  # looked up once
+
+
 def _names(table: type[Columns]) -> tuple[str, ...]:
-    return tuple(f.name for f in fields(table))
+    if table not in _NAMES:
+        _NAMES[table] = tuple(f.name for f in fields(table))
+    return _NAMES[table]
 
 
 def _rows(value: Any, rows: NDArray[np.bool_] | I64) -> Any:

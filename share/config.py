@@ -79,7 +79,7 @@ class InertialConfig:
     gravity: float = 9.81  # m/s^2
     keyframe_m: float = 0.25  # a keyframe after this much motion since the last one,
     keyframe_rad: float = 0.35  # or this much turning,
-    keyframe_seen: float = 0.7  # or when fewer than this part of its features are seen
+    keyframe_seen: float = 0.8  # or when fewer than this part of its features are seen
     keyframe_gap_s: float = 0.1  # but never sooner
     max_keyframes: int = 20  # in the state
     recall: int = 80  # features of earlier keyframes looked for again at a keyframe,

@@ -58,7 +58,7 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (observe, "aim", "expect"),
     (patches, "align", "align"),
     (find, "rescue", "rescue"),
-    (InertialTracker, "_mark_movers", "movers"),
+    (Scene, "mark_movers", "movers"),
     (Scene, "heard", "rows"),
     (ekf, "relinearised", "anew where far off"),
     (ekf, "gains", "gains"),

@@ -47,8 +47,8 @@ class GuardedTracker:
             return None
 
     def finish(self, frame: Frame, keyframe: bool) -> None:
-        """What is left to do for the frame just tracked, where nobody else is to have what it shows. keyframe:
-        whether it is one."""
+        """What is left to do for the frame just tracked, where nobody else is to have what it shows.
+        keyframe: whether it is one."""
         if keyframe:
             self.attempt("making a keyframe", frame, partial(self._tracker.keyframe, frame))
         self.attempt("settling a frame", frame, self._tracker.settle)

@@ -34,7 +34,7 @@ _UNSURE = np.array([0, 1, 6, 7, 8])  # tilt and velocity,
 _LOOSE = np.array([3e-4, 3e-4, 1e-2, 1e-2, 1e-2])  # rad^2, (m/s)^2: where single precision is too little
 _MOVING = 15  # columns that propagation changes
 _LEAST_COV = 1e-10  # what differences of covariances lose
-AS_ONE = 4.0  # sights of an error that lasts
+AS_ONE = 8.0  # sights of an error that lasts
 _SETTLED = 1e-4  # rad, m, 1/m: a correction that changes no derivative
 
 
@@ -74,17 +74,13 @@ def twist(state: State, rate: F64) -> F64:
     return np.concatenate([turning, state.v - np.cross(turning, state.T[:3, 3])])
 
 
-def sight(
-    state: State, which: I64, seen: Prediction, uv: F64, sigma: F64, lasting: F64, rate: F64
-) -> Sight:
+def sight(state: State, which: I64, seen: Prediction, uv: F64, sigma: F64, lasting: F64, rate: F64) -> Sight:
     """What was seen at uv (M, 2), sigma and lasting (M,), of features number `which` (M,), where `seen` was
     predicted."""
     core = np.zeros((len(which), 2, CORE))
     core[:, :, POSE], core[:, :, EXTRINSIC] = seen.by_pose, seen.by_extrinsic
     core[:, :, OFFSET] = seen.by_pose @ twist(state, rate)
-    return Sight(
-        which, state.host[which], uv - seen.uv, core, -seen.by_pose, seen.by_rho, sigma, lasting
-    )
+    return Sight(which, state.host[which], uv - seen.uv, core, -seen.by_pose, seen.by_rho, sigma, lasting)
 
 
 def gains(state: State, rows: Sight, common: F64 | None = None) -> tuple[F64, F64]:

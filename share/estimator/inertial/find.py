@@ -53,7 +53,9 @@ class Sought:
         return int(camera.inside(np.nan_to_num(self.expected, nan=-1e6), 0.0).sum())
 
 
-def seek(frame: Frame, rig: Rig, state: State, looks: Looks, config: InertialConfig, fresh: int = 0) -> Sought:
+def seek(
+    frame: Frame, rig: Rig, state: State, looks: Looks, config: InertialConfig, fresh: int = 0
+) -> Sought:
     """Those from number `fresh` on in the images of a frame, both in one pass; in cam1 only those whose turn
     it is."""
     n = len(state.ids)
@@ -130,8 +132,9 @@ def _along(aim: Aim) -> F64:
 def _good(found: patches.Found, px: F64, config: InertialConfig, reach_px: float) -> NDArray[np.bool_]:
     """Which are what was looked for, near px (N, 2)."""
     strayed = np.hypot(*(found.px - px).T)
-    out: NDArray[np.bool_] = found.alike > config.alike
-    return out & (found.step < config.settled_px) & (strayed < reach_px)
+    near = (found.step < config.settled_px) & (strayed < reach_px)
+    out: NDArray[np.bool_] = near & (found.alike > config.alike)
+    return out
 
 
 def _put(out: Sought, which: I64, found: patches.Found, good: NDArray[np.bool_], part: slice) -> None:

@@ -1,9 +1,10 @@
 """Keyframes of a headset's own odometry: when it wants one, what that shows to others, and the work that one
 brings, in slices.
 
-A keyframe's pose joins the filter's state at once. All else is done after the poses of this frame and the next
-ones are out, one slice a frame, so that no frame waits for the whole of it: features seen from about here
-before, free corners, their depth. What is new is sought from a fixed frame on, however long a slice takes.
+A keyframe's pose joins the filter's state at once. All else is done after the poses of this frame and the
+next ones are out, one slice a frame, so that no frame waits for the whole of it: features seen from about
+here before, free corners, their depth. What is new is sought from a fixed frame on, however long a slice
+takes.
 """
 
 from __future__ import annotations
@@ -66,8 +67,8 @@ class Keyframes:
         self._work(scene, frame, rate)
 
     def begin(self, frame: Frame, scene: Scene, rate: F64, urgent: bool) -> None:
-        """Make the frame just tracked one, if it is not: its pose; the rest is for `settle`. urgent: all of it
-        at once, for there is little to go by."""
+        """Make the frame just tracked one, if it is not: its pose; the rest is for `settle`. urgent: all of
+        it at once, for there is little to go by."""
         self._urgent = urgent
         if self.is_newest(frame):
             return

@@ -47,9 +47,7 @@ class Memory:
         part = which[known]
         if len(part):
             hosts, looked = state.host[part], looks.take(part)
-            asleep = Asleep(
-                state.ids[part], hosts, state.ray[part], state.rho[part], sigma[known], looked
-            )
+            asleep = Asleep(state.ids[part], hosts, state.ray[part], state.rho[part], sigma[known], looked)
             self._new.append((state.keyframes[hosts], asleep))
 
     def _sort(self) -> None:
@@ -77,9 +75,7 @@ class Memory:
         for keyframe in keyframes.tolist():
             self._of.pop(keyframe, None)
 
-    def near(
-        self, state: State, camera: Camera, max_m: float, max_rad: float, most: int
-    ) -> Asleep | None:
+    def near(self, state: State, camera: Camera, max_m: float, max_rad: float, most: int) -> Asleep | None:
         """Those that the camera should see of the keyframes that look from about here, the nearest ones first
         until there are `most`; their hosts are numbers in the state. None where there are none."""
         self._sort()

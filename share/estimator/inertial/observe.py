@@ -70,7 +70,8 @@ def aim(
     T_right_left: F64 | None = None,
     right: NDArray[np.bool_] | None = None,
 ) -> Aim:
-    """As `predict`. spread (N, 2, 2): d ray / d px of the host. slant (N, 2): d rho / d px, of the surface."""
+    """As `predict`. spread (N, 2, 2): d ray / d px of the host. slant (N, 2): d rho / d px, of the
+    surface."""
     rho, T = state.rho[which], hosts_in_camera(state, which)
     R, t = T[:, :3, :3], T[:, :3, 3]
     q = (R @ rays(state.ray[which])[:, :, None])[:, :, 0] + rho[:, None] * t
@@ -102,7 +103,8 @@ def _in_camera(
 
 
 def in_view(state: State, camera: Camera, keyframe: int, ray: F64, rho: F64) -> NDArray[np.bool_]:
-    """Which of what keyframe number `keyframe` sees on rays (N, 2), inverse depth rho (N,), cam0 has in view."""
+    """Which of what keyframe number `keyframe` sees on rays (N, 2), inverse depth rho (N,), cam0 has in
+    view."""
     T = se3.inverse(state.T @ state.T_body_cam) @ state.poses[keyframe] @ state.T_body_cam
     uv, _ = _projected(rays(ray) @ T[:3, :3].T + rho[:, None] * T[:3, 3])
     return np.asarray(camera.inside(np.nan_to_num(camera.distort(uv), nan=-1e6)), bool)

@@ -36,8 +36,8 @@ _FLOOR = np.repeat([1e-4, 2e-4], 3) ** 2  # rad^2, m^2
 
 
 def as_expected(residual: F64, sigma: float, lasting: float) -> bool:
-    """Whether nearly all features are where the IMU alone has them, so that nobody needs to be asked. residual
-    (M, 2), sigma and lasting of each coordinate."""
+    """Whether nearly all features are where the IMU alone has them, so that nobody needs to be asked.
+    residual (M, 2), sigma and lasting of each coordinate."""
     off = (residual**2).sum(axis=1) / (sigma**2 + lasting**2)
     return bool((off < _AGREES**2).mean() > 1 - _SPLIT)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.config import InertialConfig
-from share.estimator.inertial import ekf, features, find, observe
+from share.estimator.inertial import ekf, features, find, observe, parsac
 from share.estimator.inertial.features import Looks
 from share.estimator.inertial.find import Sought
 from share.estimator.inertial.guess import Guess, guess
@@ -43,7 +43,6 @@ class Scene:
         self.looks: Looks = features.none()
         self._memory = Memory()
         self._shunned: list[F32] = []
-        self._measured = True
         self._probation = 0  # frames that _PROBATION_S are
         self._wary = 0  # frames for which new features have to prove themselves
         self._next_feature = self._next_keyframe = 0
@@ -55,9 +54,8 @@ class Scene:
         self._next_keyframe += 1
         return self._next_keyframe - 1
 
-    def step(self, seconds: float, measured: bool) -> None:
-        """Since the frame before. measured: an IMU told how the body turned meanwhile."""
-        self._measured = measured
+    def step(self, seconds: float) -> None:
+        """Since the frame before."""
         self._probation = int(_PROBATION_S / max(seconds, 1e-3))
 
     def seen(self, left: Sought, seen: NDArray[np.bool_]) -> None:
@@ -112,36 +110,43 @@ class Scene:
         """No new feature near px (N, 2) for a while: there goes somebody."""
         self._shunned = [*self._shunned[-_SHUN_FRAMES:], px]
 
-    def off(self, sought: Sought) -> tuple[I64, F64]:
-        """Which features (M,) cam0 shows, and by how much (M, 2) they are from where they were expected."""
-        which = np.flatnonzero(sought.found & ~sought.astray)
-        return which, self._measured_at(sought, which) - sought.uv[which]
+    def measured(self, sought: Sought) -> F64:
+        """uv (N, 2) where cam0 shows the features; NaN where they were not found."""
+        out, found = np.full((len(sought.found), 2), np.nan), sought.found
+        out[found] = self._rig.cam0.normalise(sought.px[found].astype(np.float64), sought.uv[found])
+        return out
 
-    def sight(self, sought: Sought, which: I64, rate: F64) -> ekf.Sight:
-        """Rows for the filter of features `which` (M,), which were found in cam0."""
-        return self._rows(which, self._measured_at(sought, which), None, rate)
+    def mark_movers(self, sought: Sought, uv: F64, rate: F64) -> None:
+        """What moves by itself is astray; looked for only where the IMU alone does not explain the image. uv
+        (N, 2): of `measured`."""
+        which = np.flatnonzero(sought.found)
+        residual = uv[which] - sought.uv[which]
+        camera, config = self._rig.cam0, self._config
+        if len(which) == 0 or parsac.as_expected(residual * camera.focal, config.sigma_px, config.lasting_px):
+            return
+        rows = self.sight(uv, which, rate)
+        fixed = parsac.of_the_room(self.state, rows, sought.px[which], self.proven(which), camera)
+        sought.astray[which[~fixed]] = True
 
-    def heard(self, sought: Sought, rate: F64) -> ekf.Sight:
-        """What the filter hears of all that was seen in a frame's images, sorted by host; as the state is now.
-        """
+    def sight(self, uv: F64, which: I64, rate: F64) -> ekf.Sight:
+        """Rows for the filter of features `which` (M,) of those at uv (N, 2) in cam0."""
+        return self._rows(which, uv[which], None, rate)
+
+    def heard(self, sought: Sought, uv: F64, rate: F64) -> ekf.Sight:
+        """Rows of all that was seen in a frame's images, sorted by host; as the state is now. uv (N, 2): of
+        `measured`."""
         heard = sought.found & ~sought.astray
-        if self._measured:  # else nothing but images leads from one to the next
-            heard &= features.heard(self.looks)
-        which = np.flatnonzero(heard)
-        uv, right = self._measured_at(sought, which), None
+        which, right = np.flatnonzero(heard), None
+        at = uv[which]
         if (there := sought.right) is not None and self._rig.cam1 is not None:
             both = heard[there.which]
             more = there.which[both]
             seen = self._rig.cam1.normalise(there.px[both].astype(np.float64), there.uv[both])
             right = np.arange(len(which) + len(more)) >= len(which)
-            which, uv = np.concatenate([which, more]), np.concatenate([uv, seen])
+            which, at = np.concatenate([which, more]), np.concatenate([at, seen])
         order = np.argsort(self.state.host[which], kind="stable")
         right = None if right is None else right[order]
-        return self._with_doubt(self._rows(which[order], uv[order], right, rate))
-
-    def _measured_at(self, sought: Sought, which: I64) -> F64:
-        """uv (M, 2) where cam0 shows features `which` (M,)."""
-        return self._rig.cam0.normalise(sought.px[which].astype(np.float64), sought.uv[which])
+        return self._with_doubt(self._rows(which[order], at[order], right, rate))
 
     def _rows(self, which: I64, uv: F64, right: NDArray[np.bool_] | None, rate: F64) -> ekf.Sight:
         """Of features `which` (M,) seen at uv (M, 2), in cam1 where `right` (M,) says so."""
@@ -174,8 +179,8 @@ class Scene:
         return np.concatenate([self.looks.px, *self._shunned])
 
     def corners(self, frame: Frame, taken: F32) -> F32:
-        """px (N, 2) of what may become features of a keyframe, away from those `taken` (M, 2), the most wanted
-        first."""
+        """px (N, 2) of what may become features of a keyframe, away from those `taken` (M, 2), the most
+        wanted first."""
         more = self._config.features if self._room() else 0
         return corners.detect(frame.image0, taken, more, self._config.spacing_px)
 
@@ -233,9 +238,7 @@ class Scene:
         """Features seen from about here before, where the frame just tracked shows them as near as the filter
         knows: px (M, 2)."""
         s, config, fresh = self.state, self._config, len(self.state.ids)
-        asleep = self._memory.near(
-            s, self._rig.cam0, config.recall_m, config.recall_rad, config.recall
-        )
+        asleep = self._memory.near(s, self._rig.cam0, config.recall_m, config.recall_rad, config.recall)
         if asleep is None:
             return np.zeros((0, 2), np.float32)
         ekf.add_features(s, asleep.ids, asleep.host, asleep.ray, asleep.rho, asleep.sigma)
@@ -249,7 +252,7 @@ class Scene:
         """Of features from number `fresh` on, those that are found where they should be; all others."""
         sought = find.seek(frame, self._rig, self.state, self.looks, self._config, fresh)
         self.looks.px[sought.found] = sought.px[sought.found]
-        rows = self.sight(sought, np.flatnonzero(sought.found), rate)
+        rows = self.sight(self.measured(sought), np.flatnonzero(sought.found), rate)
         good = np.arange(len(self.state.ids)) < fresh
         if len(rows.which):
             _, S = ekf.gains(self.state, rows)

@@ -19,7 +19,7 @@ from share.estimator.inertial import ekf, find, parsac
 from share.estimator.inertial.beginning import first_state, state_by_camera, unknown_bias
 from share.estimator.inertial.breaks import Doubt
 from share.estimator.inertial.features import Looks
-from share.estimator.inertial.health import Agreement, Straying
+from share.estimator.inertial.health import Agreement, Straying, trusted
 from share.estimator.inertial.imu import integrate
 from share.estimator.inertial.keyframes import Keyframes
 from share.estimator.inertial.noise import louder, shaken, without
@@ -127,9 +127,9 @@ class InertialTracker:
         return Candidate(self._pivot.told(s.T), T_last_body, cov, up, unsure / np.sqrt(2), view, new_stretch)
 
     def settle(self) -> None:
-        """A slice of what keyframes leave to do, and nobody waits for: new features, and places to find oneself
-        by. For when the pose, and the candidate if there is one, are on their way; else the next `track` does
-        it first."""
+        """A slice of what keyframes leave to do, and nobody waits for: new features, and places to find
+        oneself by. For when the pose, and the candidate if there is one, are on their way; else the next
+        `track` does it first."""
         if self._scene is None or self._last is None or self._settled:
             return
         self._settled = True
@@ -177,7 +177,7 @@ class InertialTracker:
         doubted = doubt is not None and bool(doubt.axes.any())
         since_s = (frame.stamp_ns - self._stamp_ns) * 1e-9
         measured = self._propagate(frame, scene.state, imu)
-        scene.step(since_s, measured)
+        scene.step(since_s)
         left, seen = self._look(frame, scene)
         heard = imu is not None and not (doubted and self._ready)
         if measured and self._window is None:
@@ -189,7 +189,7 @@ class InertialTracker:
         textured = count >= self._config.blind or corners.count(frame.image0) >= self._config.weak
         self._straying.add(textured, left.due(self._rig.cam0), int(left.found.sum()), count, since_s)
         state = self._judge(scene.state, count, heard)
-        if not self._trusted(scene.state) or self._straying.certain:
+        if not trusted(scene.state, self._config) or self._straying.certain:
             return self._lose(frame)
         if state is TrackState.LOST:
             return TrackResult(state, None)
@@ -215,9 +215,7 @@ class InertialTracker:
             return False
         return window.solved(scene, imu, anchored) and converged(s)
 
-    def _told(
-        self, frame: Frame, scene: Scene, state: TrackState, wanted: bool, count: int
-    ) -> TrackResult:
+    def _told(self, frame: Frame, scene: Scene, state: TrackState, wanted: bool, count: int) -> TrackResult:
         s = scene.state
         first, self._ready, self._window = not self._ready, True, None
         new_stretch = first and self._new_stretch
@@ -236,18 +234,9 @@ class InertialTracker:
         sought = find.seek(frame, self._rig, scene.state, scene.looks, self._config)
         if self._last is not None:
             find.rescue(self._last.image0, frame.image0, self._rig.cam0, scene.looks, sought, self._config)
-        self._mark_movers(scene, sought)
-        return sought, self._update(frame, scene, sought)
-
-    def _mark_movers(self, scene: Scene, sought: find.Sought) -> None:
-        """What moves by itself is astray; looked for only where the IMU alone does not explain the image."""
-        which, residual = scene.off(sought)
-        camera, config = self._rig.cam0, self._config
-        if len(which) == 0 or parsac.as_expected(residual * camera.focal, config.sigma_px, config.lasting_px):
-            return
-        rows = scene.sight(sought, which, self._rate)
-        fixed = parsac.of_the_room(scene.state, rows, sought.px[which], scene.proven(which), camera)
-        sought.astray[which[~fixed]] = True
+        uv = scene.measured(sought)
+        scene.mark_movers(sought, uv, self._rate)
+        return sought, self._update(frame, scene, sought, uv)
 
     def _heard(self, frame: Frame, s: State) -> ImuBatch | None:
         """What the IMU said until the image was taken; None if it was silent."""
@@ -291,12 +280,12 @@ class InertialTracker:
         """When the image was taken, IMU time."""
         return frame.stamp_ns + round(s.offset_s * 1e9)
 
-    def _update(self, frame: Frame, scene: Scene, sought: find.Sought) -> NDArray[np.bool_]:
-        """Which features (N,) were seen and believed."""
+    def _update(self, frame: Frame, scene: Scene, sought: find.Sought, uv: F64) -> NDArray[np.bool_]:
+        """Which features (N,) were seen and believed. uv (N, 2): where cam0 shows them."""
         s = scene.state
 
         def rows_now() -> ekf.Sight:
-            return scene.heard(sought, self._rate)
+            return scene.heard(sought, uv, self._rate)
 
         seen, self._surprise = sought.found & ~sought.astray, np.zeros(0)
         rows = rows_now()
@@ -344,15 +333,6 @@ class InertialTracker:
         if not heard:
             return TrackState.VISION_ONLY
         return TrackState.OK if count >= config.weak else TrackState.WEAK
-
-    def _trusted(self, s: State) -> bool:
-        """Finite, no faster than a person or robot can be, and not gone too far unseen."""
-        finite = np.isfinite(s.T).all() and np.isfinite(s.v).all() and np.isfinite(s.cov).all()
-        return bool(
-            finite
-            and np.linalg.norm(s.v) < self._config.max_speed_m_s
-            and ekf.drift_m(s) < self._config.lost_m
-        )
 
     def _worth_telling(self, s: State) -> bool:
         return worth_telling(s, (s.stamp_ns - self._begun_ns) * 1e-9, self._new_stretch)
