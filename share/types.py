@@ -31,6 +31,7 @@ MAX_M = 1e5  # m, of a position or a landmark
 MAX_ODOM_M = 1e4  # m, of odometry from its origin: poses in maps, which are made of several, stay below MAX_M
 MAX_UV = 1e3  # of normalised image coordinates: 89.9 degrees off the axis
 MAX_ID = 2**31 - 1  # of keyframes, frames and revisions: 13 years at 5 Hz
+MAX_RAD_S, MAX_M_S2 = 1e3, 1e4  # of an IMU's samples: twenty times what the widest usual sensor can measure
 MAX_SIGMA = 1e6  # of anything, in its unit
 MAX_STAMP_NS = 2**62  # either way of 0: 146 years; differences fit 64 bits
 

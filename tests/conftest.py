@@ -4,6 +4,7 @@ from share import process
 
 process.prepare()
 
+import itertools  # noqa: E402
 import signal  # noqa: E402
 import time  # noqa: E402
 from collections.abc import Callable, Iterator  # noqa: E402
@@ -19,6 +20,16 @@ from share.cli.main import main  # noqa: E402
 # with nohup.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
+_tests = itertools.count()
+
+
+@pytest.fixture(autouse=True)
+def no_memory(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No test knows what another has learnt of a camera, nor tells it to whoever runs them."""
+    state = tmp_path_factory.getbasetemp() / f"state-{next(_tests)}"  # is made by who writes there
+    monkeypatch.setenv("XDG_STATE_HOME", str(state))
 
 
 @pytest.fixture

@@ -18,8 +18,9 @@ def pose(i: int) -> F64:
 
 
 def run(key: str) -> KeepRun:
+    """Keys speak for all runs, but not for Bob's."""
     name, _, number = key.rpartition("-")
-    return KeepRun(key, hello_of(name, int(number, 16), T=pose(3)))
+    return KeepRun(key, hello_of(name, int(number, 16), T=pose(3)), "" if key == BOB else f"key of {name}")
 
 
 def keyframe(key: str, i: int, points: int = 40, first: bool = False) -> KeepKeyframe:
@@ -61,7 +62,10 @@ def small_map(count: int = 20, points: int = 40) -> list[Change]:
 def told(kept: Kept) -> dict[str, object]:
     """All of it in a form that can be compared to the last bit."""
     return {
-        "runs": [(r.key, r.hello.name, r.hello.run_id, r.hello.rig.T_body_cam0.tobytes()) for r in kept.runs],
+        "runs": [
+            (r.key, r.hello.name, r.hello.run_id, r.hello.rig.T_body_cam0.tobytes(), r.voice)
+            for r in kept.runs
+        ],
         "stretches": kept.stretches,
         "keyframes": [_keyframe(k) for k in kept.keyframes],
         "links": {k: (x.reference, x.T_ref_body.tobytes(), x.cov.tobytes()) for k, x in kept.links.items()},

@@ -139,4 +139,7 @@ def summary(report: dict[str, Any]) -> list[str]:
     told = report["camera"]
     streams = told["streams"].values()
     counts = [f"{name} {sum(one[name] for one in streams)}" for name in ("missing", "dropped", "backward")]
-    return [f"camera: {', '.join([*counts, *filter(None, [met(told)])])} (docs/capture.md)"]
+    lines = [f"camera: {', '.join([*counts, *filter(None, [met(told)])])} (docs/capture.md)"]
+    if (known := report.get("imu_bias", {}).get("from")) is not None:
+        lines.append(f"imu bias: from the run of {known}")
+    return lines

@@ -12,30 +12,38 @@ from share.core.rate import Buckets, TokenBucket, seconds
 from share.wire.messages import Hello, public_tag
 
 # New runs that are taken in: each stays in the report, and in the map once it has a keyframe. Of one name as
-# many as somebody starts who tries things out; of all names, two full rooms at once.
+# many as somebody starts who tries things out; of all names of a key, one full room at once; of all, two.
 _NAME_BURST, _NAME_HZ = 8.0, 0.1
+_VOICE_BURST, _VOICE_HZ = 32.0, 0.25
 _EDGE_BURST, _EDGE_HZ = 128.0, 2.0
 
 
 class Newcomers:
-    """How often new runs may come, of each name and of the whole edge."""
+    """How often new runs may come, of each name, of all names of a key, and of the whole edge.
+
+    voice: of the key that says hello (`Received`); "" where no keys are used."""
 
     def __init__(self) -> None:
         self._all = TokenBucket(_EDGE_BURST, _EDGE_HZ)
         self._of_name = Buckets(_NAME_BURST, _NAME_HZ)
+        self._of_voice = Buckets(_VOICE_BURST, _VOICE_HZ)
 
-    def objection(self, name: str, now_ns: int) -> str | None:
+    def objection(self, name: str, voice: str, now_ns: int) -> str | None:
         """Why no new run of this name may come now, and when one may; None if one may."""
         if wait_s := self._of_name.of(name, now_ns).wait_s(now_ns):
             return f"too many new runs of '{name}': try again in {ceil(wait_s)} s"
+        if voice and (wait_s := self._of_voice.of(voice, now_ns).wait_s(now_ns)):
+            return f"too many new runs of the key of '{name}': try again in {ceil(wait_s)} s"
         if wait_s := self._all.wait_s(now_ns):
             return f"too many new runs of all agents: try again in {ceil(wait_s)} s"
         return None
 
-    def came(self, name: str, now_ns: int) -> None:
+    def came(self, name: str, voice: str, now_ns: int) -> None:
         """A new run of this name, to which there was no objection."""
-        for bucket in (self._all, self._of_name.of(name, now_ns)):
-            bucket.take(now_ns)
+        self._all.take(now_ns)
+        self._of_name.of(name, now_ns).take(now_ns)
+        if voice:
+            self._of_voice.of(voice, now_ns).take(now_ns)
 
 
 class Admission:
@@ -50,7 +58,7 @@ class Admission:
     ) -> str | None:
         """Why this run cannot be taken in, for a person; None if it can. event: brought `hello`."""
         if not event.speaks_for(hello.name):
-            return _other_name(hello.name, event.names or ())
+            return other_name(hello.name, event.names or ())
         if hello.streams and not self._tracks:
             return "this edge tracks nobody: start it with --policy streamed, or the agent without --streamed"
         if self._tracks and not hello.streams:
@@ -58,11 +66,12 @@ class Admission:
         if (known := peers.get(event.peer)) is not None:
             same = known.hello.name == hello.name
             return None if same else f"this run's number is in use by '{known.hello.name}'; start again"
-        return self.no_room(hello, peers, now_ns) or self._newcomers.objection(hello.name, now_ns)
+        crowd = self.no_room(hello, peers, now_ns)
+        return crowd or self._newcomers.objection(hello.name, event.voice, now_ns)
 
-    def came(self, hello: Hello, now_ns: int) -> None:
+    def came(self, event: Received, hello: Hello, now_ns: int) -> None:
         """This new run was taken in."""
-        self._newcomers.came(hello.name, now_ns)
+        self._newcomers.came(hello.name, event.voice, now_ns)
 
     def no_room(self, hello: Hello, peers: Mapping[bytes, Peer], now_ns: int) -> str | None:
         """Why a run that is not present cannot be, beside those that are; None if it can."""
@@ -83,6 +92,7 @@ def new_key(hello: Hello, taken: Collection[str]) -> str:
     return key
 
 
-def _other_name(name: str, names: Collection[str]) -> str:
+def other_name(name: str, names: Collection[str]) -> str:
+    """Why who may speak for `names` is refused as `name`."""
     own = ", ".join(f"'{one}'" for one in sorted(names)) or "nobody"
     return f"its key speaks for {own}, not for '{name}'; at the edge: share keys authorize … --agent {name}"

@@ -7,7 +7,6 @@ own and answers with findings; what must survive a crash goes to the keeper, whi
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -15,11 +14,11 @@ from typing import Any, ClassVar
 from share import __version__
 from share.config import Config
 from share.core import edge_events as ed
-from share.core.admission import Admission, new_key
+from share.core.admission import Admission, new_key, other_name
 from share.core.allowance import Allowance
 from share.core.finding import Finding
-from share.core.keeping import Change, ForgetRun, KeepKeyframe, KeepRun
-from share.core.peer import Known, Peer, Refusals, refused_lines
+from share.core.keeping import Change, ForgetRun, KeepKeyframe, KeepRun, KeepVoice
+from share.core.peer import Known, Peer, Strangers, refused_lines
 from share.core.rate import seconds
 from share.core.records import Records
 from share.core.runs import Runs
@@ -53,8 +52,7 @@ class Edge:
         self._config, self._session = config, session
         self._runs = Runs()
         self._schedule = Schedule(config.control, config.edge.policy)
-        self._strangers: Counter[str] = Counter()
-        self._strangers_refused = Refusals()
+        self._strangers = Strangers()
         self._admission = Admission(config.edge, self.tracks)
         self._allowance = Allowance(self._schedule.most_hz)
         self._records, self._versions = Records(began_ns), OtherVersions()
@@ -104,7 +102,7 @@ class Edge:
 
     def _receive(self, event: ed.Received, now_ns: int) -> None:
         peer = self._runs.get(event.peer)
-        counts = self._counts(peer)
+        counts = self._of(peer).counts
         counts["bytes_up"] += sum(len(frame) for frame in event.frames)
         try:
             message = decode(event.frames)
@@ -115,10 +113,12 @@ class Edge:
             self._complain(peer, str(error), now_ns)
             return
         if peer is not None and not event.speaks_for(peer.hello.name):
-            self._complain(None, f"a key that does not speak for '{peer.hello.name}' used its run", now_ns)
+            self._not_its_run(event, peer.hello.name, message, now_ns)
             return
         if peer is not None and not self._heard(event.peer, peer, message, now_ns):
             return
+        if peer is not None and peer.voice != event.voice:
+            self._spoken_for(peer, event.voice)
         match message:
             case wire.Hello():
                 self._greet(event, message, now_ns)
@@ -132,6 +132,14 @@ class Edge:
                 self._told(event.peer, peer, message, now_ns)
             case _:  # from a stranger
                 self._unexpected(None, message, now_ns)
+
+    def _not_its_run(self, event: ed.Received, name: str, message: wire.Message, now_ns: int) -> None:
+        """A key speaks for a run whose name is not its own, or was taken from it. It is answered who asks."""
+        self._complain(None, f"a key that does not speak for '{name}' used its run", now_ns)
+        if isinstance(message, wire.Hello):
+            reason = other_name(name, event.names or ())
+            self._send(event.peer, wire.Refused(reason))
+            self._record_seldom(now_ns, "refused", None, reason)
 
     def _told(self, peer_id: bytes, peer: Peer, message: wire.Message, now_ns: int) -> None:
         """What an agent says of itself."""
@@ -149,20 +157,20 @@ class Edge:
                 self._unexpected(peer, message, now_ns)
 
     def _unexpected(self, peer: Peer | None, message: wire.Message, now_ns: int) -> None:
-        self._counts(peer)["unexpected"] += 1
+        self._of(peer).counts["unexpected"] += 1
         what = "before its hello" if peer is None else "which is not an agent's to send"
-        self._refusals(peer).add(f"a {type(message).__name__} {what}", now_ns)
+        self._of(peer).refusals.add(f"a {type(message).__name__} {what}", now_ns)
 
     def _other_version(self, peer_id: bytes, error: VersionError, now_ns: int) -> None:
-        self._strangers["other_version"] += 1
+        self._strangers.counts["other_version"] += 1
         if (reason := self._versions.refusal(peer_id, error, now_ns)) is not None:
             self._refuse(peer_id, reason, now_ns, error.version)
 
     def _complain(self, peer: Peer | None, reason: str, now_ns: int) -> None:
         """Counts a bad message; says the first of each peer."""
-        counts = self._counts(peer)
+        counts = self._of(peer).counts
         counts["bad_messages"] += 1
-        self._refusals(peer).add(reason, now_ns)
+        self._of(peer).refusals.add(reason, now_ns)
         if counts["bad_messages"] == 1:
             self._record(now_ns, "bad message", peer, reason)
 
@@ -172,7 +180,10 @@ class Edge:
             if isinstance(message, wire.Bye):  # said again, or late
                 return False
             if (reason := self._no_room(peer, now_ns)) is not None:
-                self._refuse(peer_id, reason, now_ns)
+                if isinstance(message, wire.Hello | wire.Ping):  # not each of many keyframes is answered
+                    self._refuse(peer_id, reason, now_ns)
+                else:
+                    peer.refusals.add(reason, now_ns)
                 return False
             self._come_back(peer, now_ns)
         peer.heard_ns, peer.was_heard = now_ns, True
@@ -217,9 +228,10 @@ class Edge:
         if peer_id not in self._runs:
             if (idle := self._runs.forget_idle()) is not None:
                 self._forget(*idle)
-            self._admission.came(hello, now_ns)
+            self._admission.came(event, hello, now_ns)
             self._supersede(hello.name, now_ns)
-            self._enter(peer_id, Peer(hello, new_key(hello, self._runs.by_key), now_ns), event.voice)
+            key = new_key(hello, self._runs.by_key)
+            self._enter(peer_id, Peer(hello, key, now_ns, voice=event.voice))
             self._schedule.begin(hello.name)
             joined = f"{hello.kind} '{hello.name}'"
             self._record_seldom(now_ns, "joined the edge", self._runs[peer_id], joined)
@@ -232,7 +244,7 @@ class Edge:
 
     def _refuse(self, peer_id: bytes, reason: str, now_ns: int, version: int = VERSION) -> None:
         self._send(peer_id, wire.Refused(reason), version)
-        self._refusals(self._runs.get(peer_id)).add(reason, now_ns)
+        self._of(self._runs.get(peer_id)).refusals.add(reason, now_ns)
         self._record_seldom(now_ns, "refused", None, reason)
 
     def _welcome(self, peer_id: bytes, peer: Peer, now_ns: int) -> None:
@@ -242,9 +254,16 @@ class Edge:
         if peer.newest is not None:
             self._correct(peer_id, peer, peer.newest, now_ns, again=True)
 
-    def _enter(self, peer_id: bytes, peer: Peer, voice: str) -> None:
+    def _enter(self, peer_id: bytes, peer: Peer) -> None:
         self._runs.add(peer_id, peer)
-        self._effects.append(ed.Join(peer.key, peer.hello, voice))
+        self._effects.append(ed.Join(peer.key, peer.hello, peer.voice or ""))
+
+    def _spoken_for(self, peer: Peer, voice: str) -> None:
+        """By another key than before, or by one that was not known."""
+        peer.voice = voice
+        self._effects.append(ed.Speaks(peer.key, voice))
+        if peer.foot is not None:
+            self._keep(KeepVoice(peer.key, voice))
 
     def _forget_emptied(self, now_ns: int) -> None:
         for peer in self._runs.forgettable():
@@ -286,17 +305,17 @@ class Edge:
             return []
 
     def _apply(self, peer: Peer, keyframe: Keyframe, now_ns: int) -> None:
-        begins = peer.foot is None
+        # no run without a keyframe is kept
+        run = (KeepRun(peer.key, peer.hello, peer.voice),) if peer.foot is None else ()
         try:
             keyframe, complaint = peer.place(keyframe)
         except ValueError as error:
             self._complain(peer, str(error), now_ns)
             return
         if complaint:
-            peer.refusals.add(complaint, now_ns)
+            peer.doubts.add(complaint, now_ns)
             self._record_seldom(now_ns, "odometry doubted", peer, complaint)
         assert peer.foot is not None
-        run = (KeepRun(peer.key, peer.hello),) if begins else ()  # no run without a keyframe is kept
         self._keep(*run, KeepKeyframe(peer.key, keyframe))
         extra = self._allowance.is_extra(peer.hello.name, now_ns)
         self._effects.append(ed.Add(peer.key, keyframe, extra))
@@ -349,11 +368,11 @@ class Edge:
 
     def _send(self, peer_id: bytes, message: wire.Down, version: int = VERSION) -> None:
         frames = encode(message, version)
-        self._counts(self._runs.get(peer_id))["bytes_down"] += sum(len(frame) for frame in frames)
+        self._of(self._runs.get(peer_id)).counts["bytes_down"] += sum(len(frame) for frame in frames)
         self._effects.append(ed.Send(peer_id, frames))
 
-    def _counts(self, peer: Peer | None) -> Counter[str]:
-        return peer.counts if peer else self._strangers
+    def _of(self, peer: Peer | None) -> Peer | Strangers:
+        return peer or self._strangers
 
     def _record(self, now_ns: int, what: str, peer: Peer | None, reason: str, **fields: Any) -> None:
         agent = peer.hello.name if peer else None
@@ -364,9 +383,6 @@ class Edge:
         agent = peer.hello.name if peer else None
         if (record := self._records.seldom(now_ns, what, agent, reason, **fields)) is not None:
             self._effects.append(record)
-
-    def _refusals(self, peer: Peer | None) -> Refusals:
-        return peer.refusals if peer else self._strangers_refused
 
     def series(self) -> dict[str, Any]:
         """Of every agent, its evaluations and what came of them (`share.core.schedule`)."""
@@ -379,21 +395,20 @@ class Edge:
 
     def report(self, mapped: dict[str, Any]) -> dict[str, Any]:
         """edge.json: per agent and in all, but for `series`. mapped: the mapper's report, whose `agents` are
-        by run. An agent's earlier runs stand under their run's own key.
-        """
+        by run. An agent stands under its name, its earlier runs as `Runs.label` has them."""
         of_agents, now_ns = mapped.get("agents", {}), self._now_ns
         return {
             "session": self._session,
             "policy": self._config.edge.policy,
             **mapped,
             "agents": {
-                peer.hello.name if self._runs.is_latest(peer) else peer.key: peer.report(now_ns)
+                self._runs.label(peer): peer.report(now_ns)
                 | self._report_of(peer)
                 | of_agents.get(peer.key, {})
                 for peer in self._runs.values()
             },
-            "strangers": dict(self._strangers),
-            "refused": refused_lines(self._runs.values(), self._strangers_refused, now_ns),
+            "strangers": dict(self._strangers.counts),
+            "refused": refused_lines(self._runs.values(), self._strangers, now_ns),
             "internal_errors": self._internal_errors,
             "forgotten_runs": self._runs.forgotten,
             "version": __version__,

@@ -22,19 +22,16 @@ from share.wire.codec import Bytes
 class Received:
     """A message, still bytes, from the peer that the transport knows by this id.
 
-    names: of the agents that its key may speak for; None where no keys are used."""
+    names: of the agents that its key may speak for; None where no keys are used. voice: that key; ""
+    without."""
 
     peer: bytes
     frames: Sequence[Bytes]
     names: frozenset[str] | None = None
+    voice: str = ""
 
     def speaks_for(self, name: str) -> bool:
         return self.names is None or name in self.names
-
-    @property
-    def voice(self) -> str:
-        """See `Join`."""
-        return min(self.names, default="") if self.names else ""
 
 
 @dataclass(frozen=True)
@@ -97,12 +94,20 @@ class Send:
 
 @dataclass(frozen=True)
 class Join:
-    """To the mapper: a run of an agent, before its first keyframe. voice: the same for all names that one key
-    speaks for, where agents vote; empty: the name's own."""
+    """To the mapper: a run of an agent, before its first keyframe. voice: the key that speaks for it, and has
+    one vote with all its names; "": the name has a vote of its own."""
 
     key: str
     hello: wire.Hello
     voice: str = ""
+
+
+@dataclass(frozen=True)
+class Speaks:
+    """To the mapper: who speaks for a run from now on; voice: as of `Join`."""
+
+    key: str
+    voice: str
 
 
 @dataclass(frozen=True)
@@ -173,4 +178,4 @@ class EndTracking:
 
 
 ToTracker = BeginTracking | Track | EndTracking
-Effect = Send | Join | Present | Add | Forget | Keep | Record | ToTracker
+Effect = Send | Join | Speaks | Present | Add | Forget | Keep | Record | ToTracker

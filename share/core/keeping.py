@@ -8,7 +8,7 @@ that lead to them, loops, the newest solution.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,10 +20,20 @@ from share.wire.messages import Hello
 
 @dataclass(frozen=True, eq=False)
 class KeepRun:
-    """One run of one agent. key: names it everywhere here. Comes before its keyframes."""
+    """One run of one agent. key: names it everywhere here. Comes before its keyframes. voice: the public key
+    that speaks for it; "": none did; None: it may be any."""
 
     key: str
     hello: Hello
+    voice: str | None = ""
+
+
+@dataclass(frozen=True)
+class KeepVoice:
+    """Who speaks for a run that is kept, from now on: a public key; "": no key."""
+
+    key: str
+    voice: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +126,7 @@ class KeepPoses:
         object.__setattr__(self, "T_map_body", checked("T_map_body", self.T_map_body, (n, 4, 4), np.float64))
 
 
-Change = KeepRun | KeepKeyframe | KeepLink | KeepLoop | DropLoop | Retire | ForgetRun | KeepPoses
+Change = KeepRun | KeepVoice | KeepKeyframe | KeepLink | KeepLoop | DropLoop | Retire | ForgetRun | KeepPoses
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +147,11 @@ class Kept:
     poses: KeepPoses | None = None
     next_keyframe: Mapping[str, int] = field(default_factory=dict)
     complaints: tuple[str, ...] = ()
+
+
+def with_keys(kept: Kept) -> Kept:
+    """For an edge that uses keys: a run for which none spoke may be anybody's."""
+    return replace(kept, runs=tuple(replace(run, voice=run.voice or None) for run in kept.runs))
 
 
 def edge_to(keyframe: KeepKeyframe, links: Mapping[Key, KeepLink]) -> KeepLink:

@@ -75,11 +75,15 @@ class Mapper:
         self._ms = {kind: deque[float](maxlen=_TIMES) for kind in ("place", "verify", "solve")}
         self._counts: Counter[str] = Counter()
 
-    def join(self, agent: str, hello: Hello, voice: str = "") -> None:
-        """A run of an agent, before its first keyframe. voice: see `Join`."""
+    def join(self, agent: str, hello: Hello, voice: str | None = "") -> None:
+        """A run of an agent, before its first keyframe. voice: see `KeepRun`."""
         self._hellos[agent] = hello
         self._accounts[agent] = _Account()
         self._atlas.enter(agent, hello.name, voice)
+
+    def speaks(self, agent: str, voice: str) -> None:
+        """See `Speaks`."""
+        self._atlas.enter(agent, self.name(agent), voice)
 
     def name(self, agent: str) -> str:
         """Of the agent whose run it is."""
@@ -117,7 +121,7 @@ class Mapper:
         """What an earlier life of the edge knew, before anything else comes. Maps keep their founders, also
         before headsets that come now. The views are gone through when one is first looked up."""
         for run in kept.runs:
-            self.join(run.key, run.hello)
+            self.join(run.key, run.hello, run.voice)
             self.present(run.key, False)
         poses = {} if kept.poses is None else dict(zip(kept.poses.keys, kept.poses.T_map_body, strict=True))
         founders = set[str]() if kept.poses is None else set(kept.poses.maps)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -62,13 +62,15 @@ class Foot:
 @dataclass(frozen=True, eq=False)
 class Known:
     """A run that an earlier life of the edge kept. foot: its last keyframe, None without any.
-    next_keyframe: the number that is asked for. finding: where it is in the map, to be told at once."""
+    next_keyframe: the number that is asked for. finding: where it is in the map, to be told at once.
+    voice: as of `KeepRun`."""
 
     key: str
     hello: Hello
     foot: Foot | None
     next_keyframe: int
     finding: Finding | None = None
+    voice: str | None = ""
 
 
 @dataclass
@@ -78,15 +80,22 @@ class Refusals:
     n: int = 0
     reason: str = ""
     at_ns: int = 0
+    what: ClassVar[str] = "messages refused"
 
     def add(self, reason: str, now_ns: int) -> None:
         self.n, self.reason, self.at_ns = self.n + 1, reason, now_ns
 
     def line(self, now_ns: int) -> str | None:
-        """For a person, while messages are refused again and again."""
+        """For a person, while it happens again and again."""
         if self.n < _AGAIN or now_ns - self.at_ns > _RECENT_S * SECOND_NS:
             return None
-        return f"{self.n} messages refused, the last: {self.reason}"
+        return f"{self.n} {self.what}, the last: {self.reason}"
+
+
+class Doubts(Refusals):
+    """Keyframes that were taken in, but not as they came."""
+
+    what = "keyframes doubted"
 
 
 @dataclass
@@ -109,7 +118,7 @@ class HeldBack:
 @dataclass
 class Peer:
     """safe: all its keyframes below this number will be there after a crash, and so are acknowledged.
-    unsafe: how many are applied and not safe yet."""
+    unsafe: how many are applied and not safe yet. voice: as of `KeepRun`."""
 
     hello: Hello
     key: str  # names this run: the name, and some of the run id
@@ -120,6 +129,7 @@ class Peer:
     status: PeerStatus = field(default_factory=PeerStatus)
     counts: Counter[str] = field(default_factory=Counter)
     refusals: Refusals = field(default_factory=Refusals)
+    doubts: Doubts = field(default_factory=Doubts)
     held_back: HeldBack = field(default_factory=HeldBack)
     revision: int = 0
     gone: bool = False
@@ -127,6 +137,7 @@ class Peer:
     greeted: bool = True  # in this life of the edge
     was_heard: bool = True  # likewise
     unsafe: int = 0
+    voice: str | None = ""
 
     @property
     def is_idle(self) -> bool:
@@ -174,7 +185,17 @@ class Peer:
             **{name: self.counts[name] for name in _COUNTS},
             "refused_messages": self.refusals.n,
             "last_refusal": self.refusals.reason or None,
+            "doubted_keyframes": self.doubts.n,
+            "last_doubt": self.doubts.reason or None,
         }
+
+
+@dataclass
+class Strangers:
+    """Peers that have not joined, all as one."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    refusals: Refusals = field(default_factory=Refusals)
 
 
 _COUNTS = (
@@ -189,12 +210,14 @@ _COUNTS = (
 )
 
 
-def refused_lines(peers: Iterable[Peer], strangers: Refusals, now_ns: int) -> list[str]:
-    """Who sends messages that are refused again and again: a line each."""
-    found = {f"agent '{peer.hello.name}'": peer.refusals for peer in peers}
-    found["peers that have not joined"] = strangers
-    lines = {who: refusals.line(now_ns) for who, refusals in found.items()}
-    return [f"{who}: {line}" for who, line in lines.items() if line]
+def refused_lines(peers: Iterable[Peer], strangers: Strangers, now_ns: int) -> list[str]:
+    """Who sends again and again what is refused or doubted: a line each."""
+    found: dict[str, list[Refusals]] = {}
+    for peer in peers:
+        found.setdefault(f"agent '{peer.hello.name}'", []).extend((peer.refusals, peer.doubts))
+    found["peers that have not joined"] = [strangers.refusals]
+    lines = ((who, one.line(now_ns)) for who, several in found.items() for one in several)
+    return [f"{who}: {line}" for who, line in lines if line]
 
 
 def known_runs(kept: Kept, known_m: float) -> list[Known]:
@@ -210,17 +233,17 @@ def known_runs(kept: Kept, known_m: float) -> list[Known]:
     out = []
     for run in kept.runs:
         if (found := last.get(run.key)) is None:
-            out.append(Known(run.key, run.hello, None, 0))
+            out.append(Known(run.key, run.hello, None, 0, voice=run.voice))
             continue
         map_id, T_map_body = there[Key(run.key, found.id)]
         if map_id in joined:
-            out.append(Known(run.key, run.hello, Foot.of(found), found.id + 1))
+            out.append(Known(run.key, run.hello, Foot.of(found), found.id + 1, voice=run.voice))
             continue
         T_map_odom = se3.orthonormal(T_map_body @ se3.inverse(found.T_odom_body))
         at_body = None if map_id.startswith(f"{run.key}/") else cov
         at_odom = None if at_body is None else se3.inverse_cov(found.T_odom_body, at_body)
         finding = in_map(run.key, map_id, T_map_odom, found.id, at_odom)
-        out.append(Known(run.key, run.hello, Foot.of(found), found.id + 1, finding))
+        out.append(Known(run.key, run.hello, Foot.of(found), found.id + 1, finding, run.voice))
     return out
 
 

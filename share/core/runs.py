@@ -46,6 +46,12 @@ class Runs(Mapping[bytes, Peer]):
         """Whether no other run of that name came, or came back, after it."""
         return next(reversed(self._of_name[peer.hello.name])) == peer.key
 
+    def label(self, peer: Peer) -> str:
+        """Of this run in reports: its name, if it is the latest of that; else also the end of its key, behind
+        a character that is in no name, so that no name can be taken for it."""
+        name = peer.hello.name
+        return name if self.is_latest(peer) else f"{name}/{peer.key.removeprefix(f'{name}-')}"
+
     def add(self, peer_id: bytes, peer: Peer) -> None:
         """It is its name's present one from now on."""
         self._peers[peer_id] = peer
@@ -62,7 +68,7 @@ class Runs(Mapping[bytes, Peer]):
         """One of an earlier life: it is not here, but may go on where it was."""
         asked = run.next_keyframe
         peer = Peer(run.hello, run.key, 0, InOrder(asked), asked, run.foot, gone=True, greeted=False)
-        peer.newest, peer.was_heard = run.finding, False
+        peer.newest, peer.was_heard, peer.voice = run.finding, False, run.voice
         self.add(peer_id(run.hello.run_id), peer)
         if run.foot is None:
             self._emptied[run.key] = -1

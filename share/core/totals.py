@@ -18,6 +18,7 @@ _OF_AGENT = (
     *_MERGES,
     *((name,) for name in ("keyframes", "poses", "evaluations", "corrections", "bytes_up", "bytes_down")),
     *((name,) for name in ("bad_messages", "unexpected", "queries_skipped", "refused_messages")),
+    ("doubted_keyframes",),
 )
 _MOST_RUNS = 4096  # that are remembered
 

@@ -112,7 +112,7 @@ class TrackingEdge(Edge):
         running = [afar.rig for other, afar in self._afar.items() if afar.is_running and other != key]
         return None if self._room is None else self._room.objection(running, rig)
 
-    def _enter(self, peer_id: bytes, peer: Peer, voice: str) -> None:
+    def _enter(self, peer_id: bytes, peer: Peer) -> None:
         self._runs.add(peer_id, peer)
         window = Window(self._config.stream.window)
         self._afar[peer.key] = Afar(peer.key, peer.hello.rig, window)

@@ -21,7 +21,7 @@ from share.estimator.pose import PoseEstimate, consensus, refine
 from share.estimator.result import TrackResult, typical
 from share.estimator.spacing import Spacing
 from share.geometry import se3
-from share.geometry.camera import Rig, rays
+from share.geometry.camera import ImuBias, Rig, rays
 from share.types import F32, F64, I64, U8, Candidate, Footing, Frame, TrackState, View, Wait
 from share.vision import corners, klt
 from share.vision.view import depth_at, make_view
@@ -115,6 +115,11 @@ class VisualTracker:
     def doubted(self) -> int:
         """How many samples of an IMU were not believed: none is used."""
         return 0
+
+    @property
+    def bias(self) -> ImuBias | None:
+        """Of an IMU: none is used."""
+        return None
 
     def footing(self) -> Footing:
         """Of the frame just tracked, one with a pose."""

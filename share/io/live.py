@@ -39,6 +39,8 @@ class LiveSource(Source):
     Raises UsageError, ShareError or DataError where it cannot be opened, or not with that calibration.
     """
 
+    tells_silence = True
+
     def __init__(
         self,
         feed: Feed,

@@ -29,6 +29,7 @@ class Source(ABC):
     notes: tuple[str, ...]
     serial: str | None = None
     imu_range = ImuRange()  # of the widest usual sensor, where nobody says which it is
+    tells_silence = False  # whether a person is told by it that a stream has stopped
 
     @abstractmethod
     def stamps(self) -> dict[str, I64]:

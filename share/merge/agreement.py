@@ -9,8 +9,8 @@ wrong, and they keep a map each. An agent is a subject here, all runs of a name 
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Collection, Container, Iterable, Mapping
+from collections import deque
+from collections.abc import Collection, Container, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -32,6 +32,7 @@ from share.merge.consistency import (
 from share.merge.held import by_gravity, severity_of, told, worst
 from share.merge.subjects import Subjects
 from share.merge.sureness import Meeting, Sureness
+from share.merge.votes import outvoted
 from share.place.scale import Scale
 from share.types import F64
 
@@ -114,9 +115,9 @@ class Agreement:
         self._walked: dict[int, Walked] = {}
         self._pairs: dict[Names, _Pair] = {}
 
-    def enter(self, run: str, name: str, voice: str = "") -> None:
+    def enter(self, run: str, name: str, voice: str | None = "") -> None:
         """A run of the agent of this name comes; what is held against the name is held against the run.
-        voice: whose names count once; "": the name's own."""
+        voice: see `Subjects.speaks`."""
         self.subjects.enter(run, name, self.apart.union(*self.disputed), voice)
 
     def walk(self, run: str, number: int, before: int | None, T_ref_body: F64, cov: F64) -> None:
@@ -304,32 +305,21 @@ class Agreement:
     # ------------------------------------------------------------ all agents
 
     def _decide(self) -> bool:
-        """Who is apart, from who disagrees with whom; of those with whom as many disagree, who is of a name
-        that was set apart before. Whether that has changed."""
-        left = {frozenset(names) for names, pair in self._pairs.items() if pair.disagrees}
-        friends = self._votes(names for names, pair in self._pairs.items() if self._agrees(pair))
-        apart = set[str]()
-        while left:
-            against = self._votes(tuple(names) for names in left)
-            rank = {
-                name: (count, self.subjects.follows_one_apart(name, self.apart), -friends[name])
-                for name, count in against.items()
-            }
-            who = {agent for agent in rank if rank[agent] == max(rank.values())}
-            if len({self.subjects.voice(agent) for agent in who}) > 1:
-                break
-            apart |= who
-            left = {names for names in left if not names & who}
+        """Who is apart: whoever is outvoted by every voice that those may have whose voice is not known; one
+        of a name that was set apart before is a suspect. Whether that has changed."""
+        disagree = {frozenset(names) for names, pair in self._pairs.items() if pair.disagrees}
+        agree = [names for names, pair in self._pairs.items() if self._agrees(pair)]
+        agents = {name for names in self._pairs for name in names}
+        suspects = {name for name in agents if self.subjects.follows_one_apart(name, self.apart)}
+        apart = frozenset(agents)
+        for voices in self.subjects.voicings(agents):
+            if apart:  # else no other way can change that
+                apart &= outvoted(disagree, agree, voices, suspects)
         was = self.apart, self.disputed
-        self.apart, self.disputed = frozenset(apart), frozenset(left)
+        self.apart = apart
+        self.disputed = frozenset(names for names in disagree if not names & apart)
         self._sureness.forget(apart)
         return was != (self.apart, self.disputed)
-
-    def _votes(self, pairs: Iterable[tuple[str, ...]]) -> Counter[str]:
-        """With how many others each is paired: voices, but for its own."""
-        voice = self.subjects.voice
-        others = {(a, voice(b)) for pair in pairs for a, b in (pair, pair[::-1]) if voice(a) != voice(b)}
-        return Counter(one for one, _ in others)
 
     def _gauge(self) -> None:
         """What is sure of everybody's scale; nothing of those kept apart, for their maps are theirs."""

@@ -140,8 +140,8 @@ class Atlas:
 
     # ------------------------------------------------------------ what arrives
 
-    def enter(self, agent: str, name: str, voice: str = "") -> None:
-        """A run of the agent of this name comes. voice: of names that count once; "": the name's own."""
+    def enter(self, agent: str, name: str, voice: str | None = "") -> None:
+        """A run of the agent of this name comes. voice: see `Subjects.speaks`."""
         self._owners.join(agent, name)
         self._parting.enter(agent, name, voice)
 

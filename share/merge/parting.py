@@ -43,7 +43,7 @@ class Parting:
         self._chart, self._judge, self._sights = chart, judge, sights
         self._taken_back: list[Loop] = []
 
-    def enter(self, run: str, name: str, voice: str = "") -> None:
+    def enter(self, run: str, name: str, voice: str | None = "") -> None:
         """A run of the agent of this name comes: what is known of the name holds for it."""
         self.agreement.enter(run, name, voice)
 

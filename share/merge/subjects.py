@@ -13,23 +13,23 @@ from collections.abc import Collection, Iterable
 class Subjects:
     """Of runs. A subject is called as its first run is; one that nobody announced is its own, of its own
     name. unproven: subjects that are yet to be compared with others before they come into a map with them;
-    suspected: those of them whose name was under suspicion. A name's voice is its key's, where keys are used:
-    one key counts once."""
+    suspected: those of them whose name was under suspicion. A name's voice is the key that spoke for its
+    newest run, where keys are used: one key counts once."""
 
     def __init__(self) -> None:
         self.unproven: set[str] = set()
         self.suspected: set[str] = set()
-        self._voices: dict[str, str] = {}  # of each name
+        self._voices: dict[str, str | None] = {}  # of each name for which a key speaks
         self._of: dict[str, str] = {}
         self._names: dict[str, str] = {}
         self._runs: dict[str, list[str]] = {}
         self._newest: dict[str, str] = {}  # of each name
         self._held: dict[str, bool] = {}  # names of suspects that are gone, and whether one was set apart
 
-    def enter(self, run: str, name: str, suspects: Iterable[str], voice: str = "") -> None:
-        """A run of this name; suspects: subjects that are. What is known already changes nothing."""
-        if voice:
-            self._voices[name] = voice
+    def enter(self, run: str, name: str, suspects: Iterable[str], voice: str | None = "") -> None:
+        """A run of this name; suspects: subjects that are; voice: see `speaks`. What is known already changes
+        nothing else."""
+        self.speaks(name, voice)
         if run in self._of:
             return
         before = self._newest.get(name)
@@ -42,6 +42,13 @@ class Subjects:
         if before is not None or name in self._held:
             self.unproven.add(run)
             self.suspected.add(run)
+
+    def speaks(self, name: str, voice: str | None) -> None:
+        """Which key speaks for a name from now on; "": none, it has a voice of its own; None: not known."""
+        if voice == "":
+            self._voices.pop(name, None)
+        else:
+            self._voices[name] = voice
 
     def prove(self, subject: str) -> None:
         """It has been compared, and agrees."""
@@ -98,9 +105,21 @@ class Subjects:
         subject = self.of(run)
         return self._names.get(subject, subject)
 
-    def voice(self, subject: str) -> str:
-        """Whose it is: names of one key have one."""
-        return self._voices.get(self.name(subject), self.name(subject))
+    def voice(self, subject: str) -> str | None:
+        """Whose it is: names of one key have one. None: not known."""
+        name = self.name(subject)
+        return self._voices.get(name, f"of {name}")  # no key has a space
+
+    def voicings(self, subjects: Iterable[str]) -> list[dict[str, str | None]]:
+        """Voices of these subjects, in every way that matters where some are not known: each its own, all the
+        same one, and all that of a subject whose voice is known."""
+        voices = {subject: self.voice(subject) for subject in sorted(subjects)}
+        unknown = [subject for subject, voice in voices.items() if voice is None]
+        if not unknown:
+            return [voices]
+        known = sorted({voice for voice in voices.values() if voice is not None})
+        together = [voices | dict.fromkeys(unknown, voice) for voice in (None, *known)]
+        return [voices | {subject: f"of {subject}" for subject in unknown}, *together]
 
     def newest(self, subject: str) -> str:
         """Its newest run."""

@@ -30,6 +30,7 @@ from share.core.agent import Agent
 from share.core.lines import Lasting
 from share.core.sequencer import SequencerCounters
 from share.errors import DataError
+from share.estimator.result import TrackResult
 from share.io.live import LiveSource
 from share.io.pose_feed import PoseFeed
 from share.io.source import Source
@@ -41,6 +42,7 @@ from share.run.arrivals import Arrivals, Played, Seen
 from share.run.errors import Errors, Unknown
 from share.run.guard import Guard
 from share.run.guarded_tracker import GuardedTracker
+from share.run.imu_memory import ImuMemory
 from share.run.late import Late
 from share.run.lateness import Lateness
 from share.run.pipeline import check_trackable, frames_of
@@ -100,6 +102,7 @@ class AgentRun:
         self._say, self._show, self._verbose = say, show, verbose
         self._guard = Guard(say)
         self._machine = Agent(hello, settings)
+        self._memory: ImuMemory | None = None  # of who tracks itself
         self._prepare()
         self._files, self._scribe = AgentFiles(out, say), Scribe(out, say)
         self._log = RunLog(Written(self._files.frames, self._scribe))
@@ -122,7 +125,8 @@ class AgentRun:
     def _prepare(self) -> None:
         """Raises what is wrong with the source before there is a link."""
         check_trackable(self._source.name, self._source.rig)
-        self._tracker = GuardedTracker(self._source.rig, self._settings, self._guard)
+        self._memory = ImuMemory(self._source, self._settings.inertial, self._say)
+        self._tracker = GuardedTracker(self._source.rig, self._settings, self._guard, self._memory.bias)
 
     def stop(self) -> None:
         """End early, in good order: no more frames, but what was sent is still waited for."""
@@ -145,6 +149,8 @@ class AgentRun:
             if self._poses is not None:
                 self._poses.close()
             tracker.join(timeout=4)
+            if self._memory is not None:
+                self._scribe.do(partial(self._memory.keep, self._tracker.bias))
             self._errors.close()
             self._scribe.end()
         self._scribe.check()
@@ -190,7 +196,7 @@ class AgentRun:
             T_odom_body=result.T_odom_body,
             keyframe=result.keyframe,
             new_stretch=result.new_stretch,
-            error_cm=self._errors.after(frame, result),
+            error_cm=self._error_cm(frame, result),
             waits=result.waits,
         )
         self._post(tracked)  # the pose goes out before others are served
@@ -200,6 +206,12 @@ class AgentRun:
         self._tracker.attempt("settling a frame", frame, self._tracker.settle)
         self._log.imu_doubted = self._tracker.doubted
         self._log.cpu_s += time.thread_time() - cpu
+
+    def _error_cm(self, frame: Frame, result: TrackResult) -> float | None:
+        error_cm: float | None = None
+        with self._guard.step("estimating the error"):
+            error_cm = self._errors.after(frame, result)
+        return error_cm
 
     def _keyframe(self, frame: Frame, tracked: ev.FrameTracked) -> None:
         make = partial(self._errors.keyframe, frame, self._tracker)
@@ -331,6 +343,7 @@ class AgentRun:
             "drop_late": self._late.dropped,
             **self._lateness.report(),
             **self._source.report(),
+            **({} if self._memory is None else self._memory.report()),
             **self._errors.report(),
             "sequencer": dataclasses.asdict(self._counters),
             "clock": self._machine.clock(time.monotonic_ns()).report(),

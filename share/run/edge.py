@@ -42,6 +42,7 @@ from share.core.edge_events import (
     Received,
     Record,
     Send,
+    Speaks,
     Tick,
     Track,
 )
@@ -101,7 +102,9 @@ class EdgeRun:
         store: MapStore | None = None,
     ) -> None:
         self._settings, self._link, self._tell = settings, link, tell
-        self._restarts = Restarts(store, settings.merge.enter_m, lambda text: self._say("map", text))
+        has_keys = link.names("") is not None
+        said = partial(self._say, "map")
+        self._restarts = Restarts(store, settings.merge.enter_m, said, has_keys)
         self._begin_at: float | None = None  # a life that waits for the disk
         self._waits_for = ""
         self._inbox: queue.SimpleQueue[object] = queue.SimpleQueue()
@@ -185,7 +188,7 @@ class EdgeRun:
         self._report_at = now + _REPORT_S
         self._heap.tidy(now)
         disks = [writer.trouble for writer in (self._keeper, self._scribe) if writer is not None]
-        standing = [*disks, self._standstill(now)]
+        standing = [*disks, self._standstill(now), self._link.trouble()]
         self._trouble = {text: until for text, until in self._trouble.items() if now < until}
         self._of_agents = {text: until for text, until in self._of_agents.items() if now < until}
         report = self._totals.added(self._machine.report(self._mapped))
@@ -261,7 +264,8 @@ class EdgeRun:
             message = self._link.receive(0 if i else TICK_MS)
             if message is None:
                 break
-            self._handle(Received(message.peer, message.frames, self._link.names(message.key)))
+            names = self._link.names(message.key)
+            self._handle(Received(message.peer, message.frames, names, message.key))
         for line in self._link.refusals():
             self._refuse(line)
         self._take_answers()
@@ -332,7 +336,7 @@ class EdgeRun:
         match effect:
             case Send():
                 self._link.send(effect.peer, effect.frames)
-            case Join() | Present() | Add() | Forget() if self._mapping is not None:
+            case Join() | Speaks() | Present() | Add() | Forget() if self._mapping is not None:
                 self._mapping.send(effect)
             case BeginTracking() | Track() | EndTracking():
                 self._trackers.do(effect)

@@ -9,7 +9,7 @@ from typing import TypeVar
 from share.config import Config
 from share.errors import ShareError
 from share.estimator.result import TrackResult
-from share.geometry.camera import Rig
+from share.geometry.camera import ImuBias, Rig
 from share.run.guard import Guard
 from share.run.pipeline import tracker_of
 from share.types import Candidate, Footing, Frame, TrackState
@@ -22,9 +22,11 @@ class GuardedTracker:
     a library that refuses its numbers, is counted and said by `guard`. The frame is LOST, and the next one
     looks for itself among the places that the tracker knows; if that fails too, a new one begins."""
 
-    def __init__(self, rig: Rig, config: Config, guard: Guard) -> None:
-        self._make = partial(tracker_of, rig, config)
+    def __init__(self, rig: Rig, config: Config, guard: Guard, bias: ImuBias | None = None) -> None:
+        """bias: of the rig's IMU, where that is known."""
+        self._make = partial(tracker_of, rig, config, bias)
         self._tracker, self._guard = self._make(), guard
+        self.bias: ImuBias | None = None  # as was learnt by the last keyframe by which any was
         self._has_posed = False  # since it failed last
         self._doubted = 0  # by trackers before this one
 
@@ -50,12 +52,14 @@ class GuardedTracker:
         """What is left to do for the frame just tracked, where nobody else is to have what it shows.
         keyframe: whether it is one."""
         if keyframe:
-            self.attempt("making a keyframe", frame, partial(self._tracker.keyframe, frame))
+            self.attempt("making a keyframe", frame, partial(self.keyframe, frame))
         self.attempt("settling a frame", frame, self._tracker.settle)
 
     def keyframe(self, frame: Frame) -> Candidate:
         """Within `attempt`; so `settle` and `footing`."""
-        return self._tracker.keyframe(frame)
+        candidate = self._tracker.keyframe(frame)
+        self.bias = self._tracker.bias or self.bias
+        return candidate
 
     def settle(self) -> None:
         self._tracker.settle()

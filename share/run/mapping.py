@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from share.config import Config, GraphConfig
 from share.core.backoff import Backoff
-from share.core.edge_events import Add, Forget, Found, Join, Present
+from share.core.edge_events import Add, Forget, Found, Join, Present, Speaks
 from share.core.finding import Finding
 from share.core.keeping import Kept
 from share.core.mapper import Mapper
@@ -69,8 +69,8 @@ class _Solved:
 
 
 def map_all(inbox: Inbox, answer: Callable[[Any], None], settings: Config) -> None:
-    """For a `Companion`: takes Restore, Join, Present, Add and Forget, until END; answers Found, Mapped,
-    Restored and SolverLost."""
+    """For a `Companion`: takes Restore, Join, Speaks, Present, Add and Forget, until END; answers Found,
+    Mapped, Restored and SolverLost."""
     _Mapping(inbox, answer, settings).go()
 
 
@@ -129,6 +129,8 @@ class _Mapping:
                 self._is_restoring = True
             case Join():
                 self._mapper.join(message.key, message.hello, message.voice)
+            case Speaks():
+                self._mapper.speaks(message.key, message.voice)
             case Present():
                 self._mapper.present(message.key, message.here)
             case Forget():

@@ -14,12 +14,13 @@ from share.errors import DataError, MisfitError, UsageError
 from share.estimator.inertial.tracker import InertialTracker
 from share.estimator.visual import VisualTracker
 from share.geometry import trackable
-from share.geometry.camera import Rig
+from share.geometry.camera import ImuBias, Rig
 from share.io.images import load
 from share.io.source import Source
 from share.types import Frame, ImuBatch
 
 _MISFITS = 10  # images of a wrong size before any of the right one: the calibration is another recording's
+_SILENT_NS = 1_000_000_000  # as long as a camera may be silent before it is said
 _REMEMBERED = 600  # frames that are left out one after the other, whose IMU samples are kept
 
 _NO_MEASUREMENTS = {
@@ -42,8 +43,8 @@ def frames_of(
     and `on_bad` is told, or the source's losses are. Raises MisfitError where the first ten images, or all of
     them, are of another size than the calibration's.
 
-    `spent` is told the CPU time of each frame's decoding on this thread; `say`, once, that the IMU gave what
-    is no measurement.
+    `spent` is told the CPU time of each frame's decoding on this thread; `say`, once each, that the IMU gave
+    what is no measurement, and that the IMU of a recording has stopped; a camera's feed says that itself.
     """
     rig = source.rig
     bundles = sequence(
@@ -56,7 +57,10 @@ def frames_of(
         source.imu_range,
     )
     left_out, silent = _LeftOut(on_bad or partial(_lose, source)), set(_NO_MEASUREMENTS)
+    stopped = None if rig.imu is None or source.tells_silence else _Stopped(say)
     for bundle in bundles:
+        if stopped is not None:
+            stopped.look(bundle)
         for name in [name for name in silent if getattr(counters, name)]:
             silent.remove(name)
             say(_NO_MEASUREMENTS[name].format(source.imu_range))
@@ -74,6 +78,28 @@ def frames_of(
 
 def _lose(source: Source, error: DataError) -> None:
     source.losses.add("frames", str(error), str(error))
+
+
+class _Stopped:
+    """Says once that the IMU gives nothing any more."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._first_ns = self._heard_ns = -1  # of frames: the first, the last with samples
+        self._said = False
+
+    def look(self, bundle: Bundle) -> None:
+        if len(bundle.imu) or bundle.index == 0:
+            self._heard_ns = bundle.stamp_ns
+        if bundle.index == 0:
+            self._first_ns = bundle.stamp_ns
+        if not self._said and bundle.stamp_ns - self._heard_ns >= _SILENT_NS:
+            self._said = True
+            since_s = (self._heard_ns - self._first_ns) * 1e-9
+            self._say(
+                f"no IMU sample comes from {since_s:.1f} s on, for 1 s at least; poses are by images alone "
+                "meanwhile (sequencer.imu_silent in the report)"
+            )
 
 
 class _LeftOut:
@@ -132,8 +158,9 @@ def check_trackable(name: str, rig: Rig) -> None:
         raise UsageError(f"{name}: {why}")
 
 
-def tracker_of(rig: Rig, config: Config) -> VisualTracker | InertialTracker:
-    """The estimator that fits a rig. Raises ValueError where there is none."""
+def tracker_of(rig: Rig, config: Config, bias: ImuBias | None = None) -> VisualTracker | InertialTracker:
+    """The estimator that fits a rig. bias: of its IMU, where that is known. Raises ValueError where there is
+    none."""
     if rig.imu is not None:
-        return InertialTracker(rig, config.inertial, config.tracker)
+        return InertialTracker(rig, config.inertial, config.tracker, bias=bias)
     return VisualTracker(rig, config.tracker)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 from share.core.backoff import Backoff
-from share.core.keeping import Kept
+from share.core.keeping import Kept, with_keys
 from share.core.peer import Known, known_runs
 from share.errors import ShareError
 from share.io.map_store import MapStore
@@ -21,10 +21,12 @@ class Restarts:
     set aside under another name, never deleted; the edge goes on with a fresh one.
     """
 
-    def __init__(self, store: MapStore | None, known_m: float, said: Callable[[str], None]) -> None:
-        """known_m: as `share.core.peer.known_runs`."""
+    def __init__(
+        self, store: MapStore | None, known_m: float, said: Callable[[str], None], has_keys: bool = False
+    ) -> None:
+        """known_m: as `share.core.peer.known_runs`. has_keys: whether agents of this edge have keys."""
         self.store = store  # None also once a map that may not be written is no longer used
-        self._known_m, self._said = known_m, said
+        self._known_m, self._said, self._has_keys = known_m, said, has_keys
         self._backoff = Backoff(time.monotonic_ns())
         self._is_restoring = False
         self._tries = 0
@@ -50,7 +52,7 @@ class Restarts:
         if self.store is None:
             return None, []
         try:
-            kept = self.store.load()
+            kept = with_keys(self.store.load()) if self._has_keys else self.store.load()
             known = known_runs(kept, self._known_m)
         except ShareError:
             raise

@@ -20,6 +20,7 @@ from share.metrics.ate import Ate, ate
 from share.metrics.runlog import RunLog
 from share.run.guard import Guard
 from share.run.guarded_tracker import GuardedTracker
+from share.run.imu_memory import ImuMemory
 from share.run.pipeline import check_trackable, frames_of
 from share.strict import to_mapping
 
@@ -41,10 +42,11 @@ def track(
     """Track every frame in turn, of a live camera the newest. `told` is what came of each; `say` is for a
     person. Raises UsageError where no tracker can use the rig."""
     check_trackable(source.name, source.rig)
-    guard = Guard(say)
-    tracker, log, counters = GuardedTracker(source.rig, settings, guard), RunLog(), SequencerCounters()
+    guard, memory = Guard(say), ImuMemory(source, settings.inertial, say)
+    tracker = GuardedTracker(source.rig, settings, guard, memory.bias)
+    log, counters = RunLog(), SequencerCounters()
     stamps, poses = [], []
-    for frame in frames_of(source, settings, counters, spent=log.add_decode):
+    for frame in frames_of(source, settings, counters, spent=log.add_decode, say=say):
         began, cpu = time.perf_counter(), time.process_time()
         result = tracker.track(frame)
         track_ms = 1e3 * (time.perf_counter() - began)
@@ -56,11 +58,12 @@ def track(
             stamps.append(frame.stamp_ns)
             poses.append(result.T_odom_body)
         told(result)
+    memory.keep(tracker.bias)
     log.imu_doubted = tracker.doubted
     trajectory = Trajectory(np.array(stamps, np.int64), np.array(poses).reshape(-1, 4, 4))
     report = report_of(log, counters, settings) | {"left_out": source.losses.counts}
     report["failed_steps"] = guard.failed
-    return TrackRun(trajectory, report | source.report())
+    return TrackRun(trajectory, report | source.report() | memory.report())
 
 
 def report_of(log: RunLog, counters: SequencerCounters, settings: config.Config) -> dict[str, Any]:

@@ -28,8 +28,10 @@ from share.types import (
     F64,
     I64,
     MAX_KEYPOINTS,
+    MAX_M_S2,
     MAX_MAP_ID,
     MAX_NAME,
+    MAX_RAD_S,
     MAX_STAMP_NS,
     AgentKind,
     Correction,
@@ -175,10 +177,16 @@ def _frame(*, stamps_ns: I64, gyro: F64, accel: F64, **fields: Any) -> Frame:
         checked_stamp(name, fields[name])
     if len(stamps_ns) and not -MAX_STAMP_NS <= stamps_ns.min() <= stamps_ns.max() <= MAX_STAMP_NS:
         raise ValueError("stamps_ns: are beyond any clock")
+    imu = ImuBatch(stamps_ns, gyro, accel)
+    if not (stamps_ns[1:] > stamps_ns[:-1]).all():
+        raise ValueError("stamps_ns: do not rise")
+    for name, samples, most in (("gyro", gyro, MAX_RAD_S), ("accel", accel, MAX_M_S2)):
+        if np.abs(samples).max(initial=0.0) > most:
+            raise ValueError(f"{name}: has values beyond {most:g}, which no IMU measures")
     depth: F32 | None = fields["depth"]
     if depth is not None and not (np.isfinite(depth) & (depth >= 0)).all():
         raise ValueError("depth: has values that are negative or not finite")
-    return Frame(**fields, imu=ImuBatch(stamps_ns, gyro, accel))
+    return Frame(**fields, imu=imu)
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,7 @@ def test_a_restarted_agent_is_a_new_run_and_finds_its_old_map():
     assert any(r["event"] == "silent" and r["agent"] == "bob" for r in first.records)
     assert {name: a["keyframes"] for name, a in report["agents"].items()} == {
         "ann": 32,
-        f"bob-{m.public_tag(22)[:4]}": 16,
+        f"bob/{m.public_tag(22)[:4]}": 16,
         "bob": 16,
     }
 

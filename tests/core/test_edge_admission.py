@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -29,9 +30,13 @@ def keyframe(id: int) -> Keyframe:
     return Keyframe(id, id - 1, 200 * id, np.eye(4), cov, np.eye(4), np.zeros(3), 0.0, EMPTY)
 
 
-def tell(edge: Edge, run_id: int, message: m.Message, now_s: float = 0) -> list[ed.Effect]:
-    frames = [bytes(frame) for frame in encode(message)]
-    return edge.handle(ed.Received(m.peer_id(run_id), frames), round(now_s * S))
+def tell(
+    edge: Edge, run_id: int, message: m.Message, now_s: float = 0, names: Iterable[str] | None = None
+) -> list[ed.Effect]:
+    """names: of its key; None: no keys are used."""
+    frames, owned = [bytes(frame) for frame in encode(message)], None if names is None else frozenset(names)
+    key = "" if names is None else "its key"
+    return edge.handle(ed.Received(m.peer_id(run_id), frames, owned, key), round(now_s * S))
 
 
 def come(edge: Edge, name: str, run_id: int, now_s: float = 0) -> list[ed.Effect]:
@@ -84,11 +89,36 @@ def test_new_runs_of_all_names_are_bounded_too() -> None:
     assert refusal(come(edge, "ann", -1, 0.6)) is None
 
 
+def test_new_runs_of_all_names_of_one_key_do_not_keep_others_out() -> None:
+    """100 names come 50 times a second and say bye, for a minute."""
+    edge, names, taken = Edge(Config(), 7), [f"eve{k}" for k in range(100)], 0
+    for k in range(3000):
+        came = tell(edge, k, hello_of(names[k % 100], k), k / 50, names)
+        reason = refusal(came)
+        taken += reason is None
+        tell(edge, k, m.Bye(), k / 50, names)
+    assert 46 <= taken <= 32 + 60 // 4
+    assert str(reason).startswith("too many new runs of the key of 'eve99': try again in ")
+    assert refusal(tell(edge, -1, hello_of("ann", -1), 60, ["ann"])) is None
+
+
+def test_a_run_whose_name_was_taken_from_its_key_is_refused() -> None:
+    edge = Edge(Config(), 7)
+    assert refusal(tell(edge, 1, hello_of("zoe", 1), 0, ["zoe"])) is None
+    assert not of(tell(edge, 1, keyframe(0), 1, ["yan"]), ed.Send)  # so it is silent, and says hello
+    why = "its key speaks for 'yan', not for 'zoe'; at the edge: share keys authorize … --agent zoe"
+    assert refusal(tell(edge, 1, hello_of("zoe", 1), 2, ["yan"])) == why
+    zoe = edge.report({})["agents"]["zoe"]
+    assert (zoe["keyframes"], zoe["refused_messages"]) == (0, 0)  # whoever it was, it was not zoe
+    assert refusal(tell(edge, 1, hello_of("zoe", 1), 3, ["yan", "zoe"])) is None
+
+
 def test_names_that_came_long_ago_take_no_memory() -> None:
     newcomers = Newcomers()
     for k in range(2000):
-        newcomers.came(f"eve{k}", k * S // 2)
+        newcomers.came(f"eve{k}", f"eve{k}", k * S // 2)
     assert len(newcomers._of_name) <= 2 * 10 + 1
+    assert len(newcomers._of_voice) <= 2 * 4 + 1
 
 
 def test_who_is_known_comes_again_as_often_as_it_likes() -> None:
@@ -138,10 +168,12 @@ def test_an_old_run_does_not_come_back_beside_the_present_one(message: m.Message
     tell(edge, 1, m.Bye())
     come(edge, "hope", 2)
     effects = tell(edge, 1, message, 1)
-    assert "in use" in str(refusal(effects))
+    asks = isinstance(message, m.Ping | m.Hello)  # what it may send many of is not answered
+    assert ("in use" in str(refusal(effects))) == asks
     assert not of(effects, ed.Present) + of(effects, ed.Add)
-    assert len(of(effects, ed.Send)) == 1
+    assert len(of(effects, ed.Send)) == asks
     assert present(edge) == 1
+    assert sum(agent["refused_messages"] for agent in edge.report({})["agents"].values()) == 1
     assert sum(agent["evaluations"] for agent in edge.report({})["agents"].values()) == 0
     tell(edge, 2, m.Bye(), 2)
     assert refusal(tell(edge, 1, m.Ping(1, 1), 2)) is None
@@ -167,7 +199,7 @@ def test_who_was_silent_for_too_long_has_lost_its_name() -> None:
     come(edge, "ann", 1)
     effects = come(edge, "ann", 2, 3.5)
     assert [(e.key, e.here) for e in of(effects, ed.Present)] == [(f"ann-{m.public_tag(1)[:4]}", False)]
-    assert "in use" in str(refusal(tell(edge, 1, m.Evaluation(0, 1.0, 1.0), 3.6)))
+    assert "in use" in str(refusal(tell(edge, 1, m.Ping(1, 1), 3.6)))
     assert present(edge) == 1
 
 

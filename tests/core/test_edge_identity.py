@@ -6,11 +6,15 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hellos import hello_of
 
 from share.config import Config
 from share.core import edge_events as ed
 from share.core.edge import Edge
+from share.core.keeping import KeepVoice
+from share.core.peer import Foot, Known
+from share.names import checked_name
 from share.types import Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -27,10 +31,15 @@ def keyframe(id: int) -> Keyframe:
 
 
 def tell(
-    edge: Edge, message: m.Message, names: frozenset[str] | None, peer: int = SECRET, now_ns: int = 0
+    edge: Edge,
+    message: m.Message,
+    names: frozenset[str] | None,
+    peer: int = SECRET,
+    now_ns: int = 0,
+    key: str = "",
 ) -> list[ed.Effect]:
     frames = [bytes(frame) for frame in encode(message)]
-    return edge.handle(ed.Received(m.peer_id(peer), frames, names), now_ns)
+    return edge.handle(ed.Received(m.peer_id(peer), frames, names, key), now_ns)
 
 
 def sent(effects: list[ed.Effect]) -> list[m.Message]:
@@ -59,7 +68,7 @@ def test_a_run_is_not_taken_over_by_another_key() -> None:
     for message in (keyframe(1), m.Bye(), hello_of("ann", SECRET), m.Evaluation(0, 1.0, 1.0), m.Ping(1, 0)):
         effects = tell(edge, message, EVE)
         assert not of(effects, ed.Add), message
-        assert not sent(effects), message
+        assert not [answer for answer in sent(effects) if not isinstance(answer, m.Refused)], message
     assert not edge.report({})["agents"]["ann"]["gone"]
     assert of(tell(edge, keyframe(1), ANN), ed.Add)
 
@@ -93,3 +102,65 @@ def test_an_id_that_leaps_costs_its_own_message() -> None:
     assert sent(effects) == [m.Ack(1)]
     assert of(tell(edge, keyframe(1), None), ed.Add)
     assert edge.report({})["agents"]["ann"]["refused_messages"] == 1
+
+
+def test_the_voice_of_a_run_is_the_key_that_speaks_for_it_also_where_the_list_changes() -> None:
+    edge = Edge(Config(), 7, keeps=True)
+    (join,) = of(tell(edge, hello_of("eve", SECRET), EVE, key="E"), ed.Join)
+    (other,) = of(tell(edge, hello_of("mallory", 5), frozenset({"bob", "mallory"}), 5, key="E"), ed.Join)
+    assert join.voice == other.voice == "E"
+    (same,) = of(tell(edge, hello_of("mallory", 6), EVE, 6, 10**10, key="F"), ed.Join)
+    assert same.voice == "F"
+    (keep,) = of(tell(edge, keyframe(0), EVE, key="E"), ed.Keep)
+    assert keep.changes[0].voice == "E"
+    assert "'E'" not in str(edge.report({}))
+
+
+@pytest.mark.parametrize("message", [hello_of("eve", SECRET), keyframe(3), m.Ping(1, 0)])
+@pytest.mark.parametrize("kept", [None, "", "E", "F"])
+def test_a_run_of_an_earlier_life_has_the_voice_of_whoever_speaks_for_it_now(
+    kept: str | None, message: m.Message
+) -> None:
+    known = Known("eve-1234", hello_of("eve", SECRET), Foot.of(keyframe(2)), 3, voice=kept)
+    edge = Edge(Config(), 7, keeps=True, known=[known])
+    effects = tell(edge, message, EVE, now_ns=1, key="E")
+    changes = [change for keep in of(effects, ed.Keep) for change in keep.changes]
+    if kept == "E":
+        assert not of(effects, ed.Speaks)
+    else:
+        assert of(effects, ed.Speaks) == [ed.Speaks("eve-1234", "E")]
+        assert KeepVoice("eve-1234", "E") in changes
+    again = tell(edge, m.Ping(2, 0), EVE, now_ns=2, key="E")
+    assert not of(again, ed.Speaks)
+    assert not of(again, ed.Keep)
+
+
+def test_no_name_is_taken_for_an_earlier_run_of_another() -> None:
+    """Eve's first run has the honest agent's name for a key, as she chose its number."""
+    edge, number = Edge(Config(), 7), next(n for n in range(10**6) if m.public_tag(n).startswith("0001"))
+    tell(edge, hello_of("eve-0001", SECRET), None)
+    for run, now_ns in ((number, 1), (5, 2)):
+        tell(edge, hello_of("eve", run), None, run, now_ns)
+        tell(edge, m.Bye(), None, run, now_ns)
+    assert of(tell(edge, keyframe(0), None, now_ns=3), ed.Add)
+    own = edge.report({})["agents"]["eve-0001"]["run"]
+    agents = edge.report({"agents": {"eve-0001": {"map_id": "hers"}, own: {"map_id": "own"}}})["agents"]
+    assert agents.keys() == {"eve-0001", "eve", "eve/0001"}
+    assert (agents["eve-0001"]["gone"], agents["eve-0001"]["keyframes"]) == (False, 1)
+    assert (agents["eve-0001"]["map_id"], agents["eve/0001"]["map_id"]) == ("own", "hers")
+    assert agents["eve/0001"]["run"] == "eve-0001"
+    with pytest.raises(ValueError, match="name"):
+        checked_name("eve/0001")
+
+
+def test_earlier_runs_of_two_names_are_never_one_entry() -> None:
+    """Whatever comes after whatever."""
+    edge, run = Edge(Config(), 7), 0
+    for name in ("a", "a-b", "a-b.c", "a"):
+        for _ in range(3):
+            run += 1
+            tell(edge, hello_of(name, run), None, run, run * 10**10)
+            tell(edge, m.Bye(), None, run, run * 10**10)
+    agents = edge.report({})["agents"]
+    assert len(agents) == 12
+    assert len({agent["run"] for agent in agents.values()}) == 12

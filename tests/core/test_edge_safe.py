@@ -125,7 +125,24 @@ def test_a_step_that_is_not_between_its_two_poses_is_not_believed(bad: dict[str,
     assert record.fields["event"] == "odometry doubted"
     assert off in record.fields["reason"]
     assert "\n" not in record.fields["reason"]
-    assert edge.report({})["agents"]["ann"]["refused_messages"] == 1
+    ann = edge.report({})["agents"]["ann"]
+    assert ann["doubted_keyframes"] == 1
+    assert off in ann["last_doubt"]
+    assert ann["refused_messages"] == 0  # it is taken in
+
+
+def test_what_is_taken_in_with_a_bounded_variance_is_not_refused() -> None:
+    edge = Edge(Config(), 7)
+    tell(edge, HELLO)
+    for id in range(12):
+        sure = keyframe(id, id - 1)
+        (add,) = of(tell(edge, replace(sure, cov=1e12 * np.eye(6))), ed.Add)
+        assert add.keyframe.cov.max() == pytest.approx(100.0)
+    report = edge.report({})
+    ann = report["agents"]["ann"]
+    assert (ann["keyframes"], ann["doubted_keyframes"], ann["refused_messages"]) == (12, 12, 0)
+    (line,) = report["refused"]
+    assert line.startswith("agent 'ann': 12 keyframes doubted, the last: keyframe 11 has a variance of 1e+12")
 
 
 def test_what_a_filter_learns_of_its_past_is_no_contradiction() -> None:

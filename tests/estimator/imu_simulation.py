@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from imu_world import CAMERA, GRAVITY, NOISE, Path, imu_of, rig
 
 from share.config import InertialConfig
+from share.emulate.sensor.vibration import turning, vibration
 from share.estimator.inertial import ekf, observe
 from share.estimator.inertial.guess import guess
+from share.estimator.inertial.noise import shaken
+from share.estimator.inertial.samples import Samples
 from share.estimator.inertial.state import CORE, State, begin
 from share.geometry import se3
+from share.types import ImuBatch
 
-FRAME_HZ, IMU_HZ = 20, 200
+FRAME_HZ = 20
 SHIPPED = InertialConfig()
 LASTING_PX, LASTING_S = SHIPPED.lasting_px, 1.0  # a Gauss-Markov process of the world's
 
@@ -39,6 +43,10 @@ class Setup:
     offset_error: float | None = None
     path: dict[str, float] = field(default_factory=dict)
     sigma_px: float = 0.5  # white; more than is shipped
+    imu_hz: float = 200.0
+    phase: float = 0.0  # of an IMU's period, by which images come after a sample
+    white: float = 0.0  # m/s^2, of each sample, beside the IMU's noise; turning goes with it
+    machine: float = 0.0  # m/s^2, rms of a vibration as emulated
 
 
 @dataclass
@@ -54,8 +62,10 @@ class Run:
 def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
     rng = np.random.default_rng((seed, 9))
     path, sensors = Path(seed, **setup.path), rig()
-    t_imu = np.arange(0, setup.seconds + 0.5, 1 / IMU_HZ)
-    imu, bg, ba = imu_of(path, t_imu, rng.normal(0, setup.bg, 3), rng.normal(0, setup.ba, 3), rng)
+    t_imu, noise = np.arange(0, setup.seconds + 0.5, 1 / setup.imu_hz), replace(NOISE, rate_hz=setup.imu_hz)
+    imu, bg, ba = imu_of(path, t_imu, rng.normal(0, setup.bg, 3), rng.normal(0, setup.ba, 3), rng, noise)
+    imu = _shaken(imu, t_imu, seed, setup, rng)
+    samples = Samples()
     sigma = _sigmas(setup)
     world = _World(path, sensors, rng, setup)
     extrinsic = (
@@ -71,11 +81,12 @@ def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
     state.T_body_cam = sensors.T_body_cam0 @ se3.exp(extrinsic)
     log, next_id, keyframe_at = [], 0, -np.inf
     for k in range(1, int(setup.seconds * FRAME_HZ)):
-        stamp = k / FRAME_HZ
+        stamp = k / FRAME_HZ + setup.phase / setup.imu_hz
         to_ns = round((stamp + state.offset_s) * 1e9)
         near = slice(*np.searchsorted(imu.stamps_ns, (state.stamp_ns - 10**7, to_ns + 10**7)))
         part = imu.take(near)
-        rate = ekf.propagate(state, part, to_ns, NOISE, GRAVITY)
+        samples.all = imu.take(slice(int(np.searchsorted(imu.stamps_ns, to_ns)) + 1))
+        rate = ekf.propagate(state, part, to_ns, shaken(noise, samples.latest(to_ns)), GRAVITY)
         taken = stamp + offset
         level = world.see(state, taken, rate)
         if len(state.ids) < 0.7 * setup.features or stamp - keyframe_at > 1.0:
@@ -91,6 +102,15 @@ def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
         log.append((stamp, *nees, *error, *calib, state.offset_s - offset, level))
     out = np.array(log)
     return Run(out[:, 0], out[:, 1:3], out[:, 3:9], state, out[:, 9:16], out[:, 16])
+
+
+def _shaken(imu: ImuBatch, t: np.ndarray, seed: int, setup: Setup, rng) -> ImuBatch:
+    extra = np.zeros((len(t), 3))
+    if setup.white:
+        extra += rng.normal(0, setup.white, extra.shape)
+    if setup.machine:
+        extra += vibration(t, setup.machine, (seed, 3))
+    return ImuBatch(imu.stamps_ns, imu.gyro + turning(extra), imu.accel + extra)
 
 
 def _sigmas(setup: Setup) -> np.ndarray:

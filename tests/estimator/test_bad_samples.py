@@ -91,6 +91,41 @@ def test_a_wrong_sample_after_the_image_is_held_against_the_next_frame_only(
     assert max(apart_m(results, clean)) < 0.02
 
 
+def with_gap(walk: tuple[Frame, ...]) -> tuple[Frame, ...]:
+    """Without the samples from 30 ms on before the fourth last of frame AT."""
+    imu = walk[AT].imu
+    last = imu.stamps_ns[-4]
+    there = (imu.stamps_ns <= last - 30_000_000) | (imu.stamps_ns >= last)
+    return (*walk[:AT], replace(walk[AT], imu=imu.take(there)), *walk[AT + 1 :])
+
+
+@pytest.mark.parametrize(("axis", "by"), [(0, 34.0), (1, 5.0), (2, -20.0), (3, 150.0), (5, -60.0)])
+@pytest.mark.parametrize("after", [0, 1, 3])  # right ones in the frame
+def test_a_wrong_sample_after_a_gap_moves_no_pose(
+    walk: tuple[Frame, ...], clean: list[TrackResult], after: int, axis: int, by: float
+) -> None:
+    frames = with_gap(walk)
+    first = len(frames[AT].imu) - 4
+    cut = replace(frames[AT], imu=frames[AT].imu.take(slice(0, first + 1 + after)))
+    later = frames[AT].imu.take(slice(first + 1 + after, None)).join(frames[AT + 1].imu)
+    frames = (*frames[:AT], cut, replace(frames[AT + 1], imu=later), *frames[AT + 2 :])
+    results, tracker = tracked(spoiled(frames, first, 1, axis, by))
+    assert tracker.doubted == 1
+    assert max(apart_m(results, clean)) < 0.02
+    assert results[-1].state is TrackState.OK
+
+
+@pytest.mark.parametrize(("axis", "by"), [(1, 30.0), (3, 150.0), (4, 20.0)])
+def test_nor_does_the_first_of_all(walk: tuple[Frame, ...], axis: int, by: float) -> None:
+    values = np.hstack([walk[0].imu.gyro, walk[0].imu.accel])
+    values[0, axis] += by
+    first = replace(walk[0], imu=ImuBatch(walk[0].imu.stamps_ns, values[:, :3], values[:, 3:]))
+    without = replace(walk[0], imu=walk[0].imu.take(slice(1, None)))
+    results, tracker = tracked((first, *walk[1:]))
+    assert tracker.doubted == 1
+    assert apart_m(results, tracked((without, *walk[1:]))[0]) == [0.0] * len(walk)
+
+
 @pytest.mark.parametrize(("axis", "by"), [(1, 0.5), (4, 8.0)])
 def test_what_is_too_small_for_that_is_outvoted_by_the_images(
     walk: tuple[Frame, ...], clean: list[TrackResult], axis: int, by: float

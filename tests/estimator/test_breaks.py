@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -128,6 +130,127 @@ def test_looking_ahead_changes_nothing() -> None:
     assert samples.doubted == 4
 
 
+# ---------------------------------------------------------------- beginnings: the first, and after a gap
+
+GAP = 30_000_000
+
+
+def begun(values: np.ndarray, cuts: list[int], gap_at: int | None) -> tuple[list[int], Breaks, Samples]:
+    """Numbers of the samples that are not believed in the end; frames end before the numbers `cuts`. A gap
+    before number `gap_at`."""
+    stamps = np.arange(len(values)) * STEP
+    if gap_at is not None:
+        stamps[gap_at:] += GAP
+    breaks, samples, good = Breaks(), Samples(), dict.fromkeys(range(len(values)), True)
+    for first, past in zip([0, *cuts], [*cuts, len(values)], strict=True):
+        part = slice(first, past)
+        said = breaks.believed(stamps[part], values[part])
+        good |= {} if said is None else dict(zip(range(first, past), said.tolist(), strict=True))
+        good |= dict.fromkeys(np.searchsorted(stamps, breaks.taken_back).tolist(), False)
+        samples.add(ImuBatch(stamps[part], values[part, :3], values[part, 3:]))
+    out = [k for k, is_good in good.items() if not is_good]
+    assert samples.doubted == breaks.count == len(out)
+    assert set(samples.all.stamps_ns.tolist()) == set(np.delete(stamps, out).tolist())
+    return out, breaks, samples
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+@pytest.mark.parametrize("gap_at", [None, 100])
+@pytest.mark.parametrize(("axis", "by"), [(0, 1.5), (1, -30.0), (3, 20.0), (4, 150.0), (5, -60.0)])
+def test_the_first_samples_are_left_out_where_those_after_them_disagree(
+    axis: int, by: float, gap_at: int | None, count: int
+) -> None:
+    values, first = walking(130), gap_at or 0
+    values[first : first + count, axis] += by
+    assert begun(values, [first + 12, first + 24], gap_at)[0] == list(range(first, first + count))
+
+
+@pytest.mark.parametrize("gap_at", [None, 100])
+def test_so_is_a_wrong_one_among_them_and_anything(gap_at: int | None) -> None:
+    rng, first = np.random.default_rng(4), gap_at or 0
+    for length in (1, 3, 6):
+        values = walking(130)
+        at = first + int(rng.integers(3))
+        values[at : at + length] = rng.uniform(-1, 1, (length, 6)) * np.repeat([34.0, 150.0], 3)
+        assert begun(values, [first + 12], gap_at)[0] == list(range(at, at + length))
+
+
+@pytest.mark.parametrize(("gap_at", "count", "by"), [(None, 1, 80.0), (None, 8, 80.0), (100, 8, 20.0)])
+def test_what_the_next_frame_outvotes_is_taken_back(gap_at: int | None, count: int, by: float) -> None:
+    values, first, right = walking(130), gap_at or 0, 2 if count > 1 else 0
+    values[first : first + count, [1, 5]] += [-by / 4, by]
+    past = first + count + right  # the frame ends with them, or with two that are right
+    believed_in_it = begun(values[:past], [], gap_at)[0]
+    assert believed_in_it == list(range(first + count, past))
+    out, breaks, samples = begun(values, [past, past + 13], gap_at)
+    assert out == list(range(first, past))
+    from_ns = past * STEP + (GAP if gap_at else 0)
+    told = breaks.doubt(from_ns, from_ns + STEP)  # whoever has heard it is unsure from now on
+    assert told is not None and not told.axes.any()
+    off = np.array([by / 4, by]) * (count * STEP + (GAP if gap_at else 0)) * 1e-9
+    assert told.turn == pytest.approx(min(off[0], 0.3), rel=0.2)
+    assert told.speed == pytest.approx(min(off[1], 3.0), rel=0.2)
+    assert samples._most.max() < 20  # nor is it the end of a scale
+
+
+@pytest.mark.parametrize(("count", "by"), [(1, 5.0), (1, 30.0), (8, 10.0)])
+def test_those_that_alone_came_after_a_gap_are_held_against_what_was_before(count: int, by: float) -> None:
+    values = walking(130)
+    assert begun(values, [100, 100 + count], 100)[0] == []
+    values[100 : 100 + count, 2] += by
+    out, breaks, _ = begun(values, [100, 100 + count], 100)
+    assert out == list(range(100, 100 + count)) and breaks.taken_back == []
+    told = breaks.doubt(100 * STEP + GAP, (100 + count) * STEP + GAP)
+    assert told is not None and told.axes.tolist() == [False, False, True, False, False, False]
+
+
+def test_where_they_may_be_right_the_filter_is_unsure_of_the_gap() -> None:
+    values = walking(104)
+    values[100:, 2] += 4.0
+    out, breaks, _ = begun(values, [100], 100)
+    assert out == []
+    told = breaks.doubt(99 * STEP, 99 * STEP + GAP)
+    assert told is not None and not told.axes.any()
+    assert told.turn == pytest.approx(4.0 * (GAP + STEP) * 1e-9, rel=0.2)
+
+
+def test_an_imu_slower_than_that_is_believed() -> None:
+    values = walking(4000, quickly=3.0)[::8]  # 25 Hz
+    assert doubted(values, 3, 8 * STEP) == []
+
+
+@pytest.mark.parametrize("gap_at", [None, 100])
+def test_of_a_beginning_under_vibration_nothing_is_left_out(gap_at: int | None) -> None:
+    for seed in range(10):
+        values = walking(140, seed)
+        values[:, 3:] += np.random.default_rng(seed).normal(size=(140, 3)) * 5.0
+        assert begun(values, [5, 18, 31, 100, 104], gap_at)[0] == []
+
+
+def test_looking_ahead_does_not_take_back() -> None:
+    samples, values = Samples(), walking(60)
+    values[0, 3] += 80.0
+    samples.add(batch(values[:1]))
+    assert samples.with_more(batch(values[1:10], 1)).doubted == 1
+    assert (samples.doubted, len(samples.all)) == (0, 1)
+    samples.add(batch(values[1:10], 1))
+    assert (samples.doubted, samples.all.stamps_ns[0]) == (1, STEP)
+
+
+def test_time_is_linear_in_the_samples_of_a_frame() -> None:
+    rng, spent = np.random.default_rng(0), []
+    for count in (2_000, 16_000):
+        wild = rng.normal(size=(count, 6)) * np.repeat([30.0, 150.0], 3)
+        stamps = np.sort(rng.choice(66_000_000, count, replace=False)) + 10**9
+        breaks = Breaks()
+        breaks.believed(stamps[0] + np.arange(-20, 0) * STEP, np.zeros((20, 6)))
+        began = time.process_time()
+        breaks.believed(stamps, wild)
+        spent.append(time.process_time() - began)
+        assert breaks.doubt(0, 2**62) is not None
+    assert spent[1] < 24 * spent[0]  # 8 times as many; it would be 64
+
+
 RECORDED = sorted(MOTION.glob("*/*/imu0.csv"))
 
 
@@ -140,3 +263,19 @@ def test_of_what_was_recorded_nothing_is(path: Path) -> None:
     for k in range(0, len(values), 10):
         breaks.believed(stamps[k : k + 10], values[k : k + 10])
     assert breaks.count == 0
+
+
+@pytest.mark.skipif(not RECORDED, reason="the recorded motions are not here")
+@pytest.mark.parametrize("path", RECORDED, ids=lambda path: path.parent.name)
+def test_of_what_was_recorded_nothing_is_wherever_it_begins_or_has_gaps(path: Path) -> None:
+    table = np.loadtxt(path, delimiter=",")
+    stamps, values, rng = table[:, 0].astype(np.int64), table[:, 1:7], np.random.default_rng(7)
+    for first in rng.integers(len(stamps) - 100, size=40).tolist():
+        breaks, lost = Breaks(), np.zeros(100, np.bool_)
+        gap = int(rng.integers(5, 12))
+        lost[40 : 40 + gap] = True
+        at, of = stamps[first : first + 100][~lost], values[first : first + 100][~lost]
+        cuts = [0, *range(int(rng.integers(1, 14)), len(at), 13), len(at)]
+        for k, past in pairwise(cuts):
+            breaks.believed(at[k:past], of[k:past])
+        assert breaks.count == 0

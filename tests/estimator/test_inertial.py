@@ -146,7 +146,7 @@ class Late:
     """A source whose IMU has a clock of its own, as its calibration says."""
 
     def __init__(self, source, shift_s):
-        self.imu_range = source.imu_range
+        self.imu_range, self.tells_silence = source.imu_range, source.tells_silence
         self.rig, self.rate_hz = dataclasses.replace(source.rig, timeshift_s=shift_s), source.rate_hz
         self._source = source
 

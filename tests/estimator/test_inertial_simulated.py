@@ -34,6 +34,31 @@ def test_it_is_as_sure_as_it_should_be_in_fifty_runs(mono):
         assert low < position < high
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("phase", "white"), [(0.37, 0.0), (0.37, 1.0), (0.8, 3.0)])
+def test_it_is_as_sure_as_it_should_be_between_samples_and_shaken(phase, white):
+    """Images between samples of the IMU; white shaking, m/s^2 and 0.03 rad/s for each of it."""
+    runs = [run(seed, Setup(phase=phase, white=white)) for seed in range(50)]
+    low, high = BANDS[50]
+    for k in (40, 100, 200, 398):
+        orientation, position = np.mean([r.nees[k] for r in runs], axis=0)
+        print(k / 20, orientation, position)
+        assert low < position < high
+        assert orientation < high
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("machine", [1.0, 4.0])
+def test_beside_a_machine_it_is_no_surer_than_it_should_be(machine):
+    """Of a vibration that its samples follow, an integral loses more than `shaken` knows: it is less sure
+    than it could be, of its orientation."""
+    runs = [run(seed, Setup(phase=0.37, imu_hz=400.0, machine=machine)) for seed in range(50)]
+    for k in (40, 100, 200, 398):
+        orientation, position = np.mean([r.nees[k] for r in runs], axis=0)
+        print(k / 20, orientation, position)
+        assert max(orientation, position) < BANDS[50][1]
+
+
 def wrong(seed, sigma):
     """3 degrees, 3 cm and 10 ms in some direction; the filter expects `sigma` times as much."""
     rng = np.random.default_rng(seed)

@@ -39,9 +39,9 @@ def test_who_rests_or_drives_slowly_is_told_at_once():
 
 def test_a_runner_waits_until_what_is_up_is_known_but_not_for_ever():
     assert converged(state(2.5, 1.5))
-    assert not worth_telling(state(2.5, 1.5), 2.9, anew=True)
+    assert not worth_telling(state(2.5, 1.5), 0.8, anew=True)
     assert worth_telling(state(1.1, 1.5), 0.5, anew=True)
-    assert worth_telling(state(2.5, 1.5), 3.0, anew=True)
+    assert worth_telling(state(2.5, 1.5), 0.9, anew=True)
 
 
 def test_who_was_found_again_in_his_map_does_not_wait():

@@ -322,7 +322,14 @@ def test_a_list_that_was_damaged_meanwhile_is_said(house: House) -> None:
     path = house.folder / "authorized"
     path.write_text(text(path) + "bob\n")
     said = house.refusals(house.agent(1, house.ann))
-    assert set(said) == {f"nobody is let in: {path}, line 2: is not `share-public-key NAME KEY`"}
+    why = f"nobody is let in: {path}, line 2: is not `share-public-key NAME KEY`"
+    assert set(said) == {why}
+    assert house.edge.trouble() == why
+    keys_before = text(path).removesuffix("bob\n")
+    path.write_text(keys_before)
+    time.sleep(0.12)
+    assert house.edge.receive(0) is None
+    assert house.edge.trouble() is None
 
 
 def test_the_key_of_another_edge(house: House) -> None:
@@ -357,6 +364,7 @@ def test_a_revoked_key_is_thrown_out_and_the_others_are_back(house: House) -> No
     house.greets(ann, 1)
     house.greets(bad, 2)
     keys.revoke(house.folder, "bob")
+    time.sleep(0.12)  # the edge looks ten times a second
     assert bad.send([b"too late"])
     assert house.edge.receive(50) is None
     assert not house.edge.send(peer_id(2), [b"for bob"])
@@ -370,6 +378,7 @@ def test_a_change_that_revokes_nobody_here_breaks_no_connection(house: House) ->
     house.greets(agent, 1)
     keys.authorize(house.folder, "bob", key(9))
     keys.revoke(house.folder, "bob")
+    time.sleep(0.12)
     assert house.edge.receive(0) is None
     assert house.edge.send(peer_id(1), [b"still here"])
     assert agent.receive(2000) == [b"still here"]

@@ -9,6 +9,8 @@ import subprocess
 import sys
 import tempfile
 import threading
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,16 @@ import pytest
 from map_changes import ANN, BOB, keyframe, loop, pose, run, small_map, solution, told
 from special_files import KINDS, special
 
-from share.core.keeping import DropLoop, KeepLink, KeepLoop, Retire
+from share.core.keeping import (
+    DropLoop,
+    ForgetRun,
+    KeepLink,
+    KeepLoop,
+    KeepRun,
+    KeepVoice,
+    Retire,
+    with_keys,
+)
 from share.errors import StoreError, UsageError
 from share.io.map_store import MapStore, is_map, schema
 from share.io.map_store.rows import insert
@@ -110,6 +121,41 @@ def test_the_order_of_stretches_outlives_their_keyframes(path):
     assert kept.stretches == (f"{ANN}/0", f"{BOB}/0", f"{ANN}/1", f"{ANN}/2")
     places = [(k.at.id, k.stretch, k.ordinal) for k in kept.keyframes if k.key == ANN]
     assert places == [(1, f"{ANN}/1", 0), (3, f"{ANN}/1", 2), (4, f"{ANN}/1", 3), (5, f"{ANN}/2", 0)]
+
+
+def voices(path):
+    return {run.key: run.voice for run in again(path).runs}
+
+
+def test_who_speaks_for_a_run_is_kept_and_may_change(path):
+    with MapStore.open(path) as store:
+        store.write(small_map())
+    assert voices(path) == {ANN: f"key of {ANN[:3]}", BOB: ""}
+    for voice in ("E", "F", ""):
+        with MapStore.open(path) as store:
+            store.write([KeepVoice(BOB, voice), KeepVoice(ANN, voice), KeepVoice("eve-0003", "E")])
+        assert voices(path) == {ANN: voice, BOB: voice}
+    with MapStore.open(path) as store:
+        store.write([KeepVoice(BOB, "B"), KeepVoice(ANN, "A"), ForgetRun(BOB)])
+        store.write([run(BOB)])
+    assert voices(path) == {ANN: "A", BOB: ""}
+
+
+def test_a_map_of_share_0_1_says_of_no_run_who_speaks_for_it_and_is_not_changed_by_opening(path):
+    """It has only the rows that `about` begins with; whose number and schema are the same as now."""
+    with MapStore.open(path) as store:
+        store.write([replace(one, voice="") if isinstance(one, KeepRun) else one for one in small_map()])
+        assert schema.SCHEMA == 3
+    with closing(sqlite3.connect(path)) as connection:
+        assert {name for (name,) in connection.execute("SELECT name FROM about")} == {"schema", "made by"}
+    kept = again(path)
+    assert {run.voice for run in kept.runs} == {""}
+    assert {run.voice for run in with_keys(kept).runs} == {None}  # may be anybody
+    assert kept.complaints == ()
+    assert files(path) == ["room.sqlite", "room.sqlite.lock"]
+    with MapStore.open(path) as store:
+        store.write([KeepVoice(ANN, "A")])
+    assert {run.key: run.voice for run in with_keys(again(path)).runs} == {ANN: "A", BOB: None}
 
 
 def test_two_loops_may_tie_one_pair(path):

@@ -14,6 +14,7 @@ from share.merge.atlas import Atlas
 from share.merge.join import Key, Loop
 from share.merge.judge import Decision
 from share.merge.subjects import Subjects
+from share.merge.votes import outvoted
 from share.place.scale import Scale
 
 STEP = np.diag([2e-4**2] * 3 + [2e-3**2] * 3)
@@ -31,6 +32,9 @@ class Town:
     def enter(self, run: str) -> None:
         """`eve-1` is a run of eve."""
         self.agreement.enter(run, run.partition("-")[0])
+        self.walk(run)
+
+    def walk(self, run: str) -> None:
         self.numbers[run] = first = 1000 * len(self.numbers)
         step = se3.exp(np.array([0, 0, 0, 0.3, 0, 0]))
         for k in range(12):
@@ -308,13 +312,62 @@ def test_names_of_one_key_have_one_voice():
             town.enter(run)
         for run in ("e1-1", "e2-1", "e3-1"):
             town.agreement.enter(run, run[:2], voice)
-            town.enter(run)
+            town.walk(run)
         town.meet("ann-1", "bob-1", 1.0, 12)
         for run in ("e1-1", "e2-1", "e3-1"):
             for honest in ("ann-1", "bob-1"):
                 town.meet(honest, run, 1.05, 12)
         assert apart is None or town.agreement.apart == apart
         assert not apart or not town.agreement.forbids(["ann-1"], ["bob-1"])
+
+
+def quarrel(known: dict[str, str], honest: tuple[str, ...] = ("ann",)) -> Town:
+    """Eve speaks for e1 and e2, whose metres are too long, and that agree. known: voices, of the others
+    nobody knows which they have."""
+    town = Town()
+    names = (*honest, "e1", "e2")
+    for name in names:
+        town.agreement.enter(f"{name}-1", name, known.get(name))
+        town.walk(f"{name}-1")
+    for k, one in enumerate(names):
+        for other in names[k + 1 :]:
+            scale = 1.05 if (one in honest) != (other in honest) else 1.0
+            town.meet(f"{one}-1", f"{other}-1", scale, 12)
+    return town
+
+
+@pytest.mark.parametrize(
+    "known", [{}, {"ann": "A"}, {"ann": "A", "e1": "E"}, {"e1": "E"}, {"ann": "A", "e1": "E", "e2": "E"}]
+)
+def test_voices_that_are_not_known_may_be_one_and_the_same(known):
+    """Ann stands against one key, also while it is not known yet that it is one."""
+    town = quarrel(known)
+    assert not town.agreement.apart
+    assert town.agreement.standing("ann-1").state == "disputed"
+
+
+def test_who_is_outvoted_whoever_the_unknown_are_is_set_apart_at_once():
+    known = {"ann": "A", "bob": "B", "e1": "E", "e2": "E"}
+    assert quarrel(known, ("ann", "bob", "cat")).agreement.apart == {"e1-1", "e2-1"}
+    town = quarrel({"e1": "E"}, ("ann", "bob"))  # who may both be Eve
+    assert not town.agreement.apart
+
+
+def test_a_voice_that_becomes_known_counts_from_then_on():
+    town = quarrel({"ann": "A"})
+    town.agreement.enter("e1-1", "e1", "E")
+    town.agreement.enter("e2-1", "e2", "F")
+    town.meet("ann-1", "e1-1", 1.05, 12)
+    assert town.agreement.apart == {"ann-1"}  # against two
+    town.agreement.enter("e2-1", "e2", "E")
+    town.meet("ann-1", "e1-1", 1.05, 12)
+    assert not town.agreement.apart
+
+
+def test_names_of_one_key_that_disagree_are_disputed():
+    """Nobody else has a vote: this is decided, and ends."""
+    assert outvoted([frozenset("ab")], [], dict.fromkeys("ab", "E"), ()) == frozenset()
+    assert outvoted([frozenset("ab"), frozenset("ac")], [], {"a": "E", "b": "E", "c": "C"}, "a") == {"a"}
 
 
 def pair_that_met(decide=None) -> tuple[Atlas, list[Loop]]:

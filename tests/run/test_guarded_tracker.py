@@ -15,7 +15,7 @@ from share.estimator.inertial import ekf
 from share.estimator.inertial.tracker import InertialTracker
 from share.estimator.result import TrackResult
 from share.geometry import se3, trackable
-from share.geometry.camera import Rig
+from share.geometry.camera import ImuBias, Rig
 from share.run.guard import Guard
 from share.run.guarded_tracker import GuardedTracker
 from share.types import TrackState
@@ -81,6 +81,29 @@ def test_one_that_fails_twice_begins_anew(walk: rig_fuzzer.Walk) -> None:
     assert [result.state for result in results[:1]] == [TrackState.LOST]
     assert results[-1].state is TrackState.OK and guard.failed == 2
     assert tracker.doubted == 7  # by the first
+
+
+def test_what_a_lost_tracker_had_learnt_of_the_bias_is_not_lost(
+    walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learnt = ImuBias([0.01, 0.0, 0.0], [0.1, 0.2, 0.3], 1e-3, 1e-2)
+    told = iter([None, learnt, None])
+    monkeypatch.setattr(InertialTracker, "bias", property(lambda self: next(told)))
+    tracker = GuardedTracker(RIG, Config(), Guard(lambda text: None), learnt)
+    assert tracker.bias is None  # what it was told is not what it has learnt
+    tracker.track(walk.frames[0])
+    biases = []
+    for frame in walk.frames[:3]:
+        tracker.keep(frame)
+        biases.append(tracker.bias)
+    assert biases == [None, learnt, learnt]
+
+
+def test_one_of_cameras_alone_knows_no_bias(walk: rig_fuzzer.Walk) -> None:
+    tracker = GuardedTracker(RIG.without_imu(), Config(), Guard(lambda text: None))
+    assert tracker.track(walk.frames[0]).keyframe
+    tracker.keep(walk.frames[0])
+    assert tracker.bias is None
 
 
 def test_a_keyframe_that_fails_is_none(walk: rig_fuzzer.Walk, monkeypatch: pytest.MonkeyPatch) -> None:

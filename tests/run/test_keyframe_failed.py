@@ -15,6 +15,7 @@ from hellos import hello_of
 from share.config import Config
 from share.estimator.result import TrackResult
 from share.run.agent import AgentRun
+from share.run.errors import Unknown
 from share.types import Candidate, Frame, ImuBatch, TrackState, View
 
 FRAME = Frame(10**9, 0, np.zeros((480, 640), np.uint8), None, None, ImuBatch.empty())
@@ -24,7 +25,7 @@ VIEW = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
 class Tracker:
     """Wants every frame as a keyframe; `fails`: what it cannot do."""
 
-    doubted = 0
+    doubted, bias = 0, None
 
     def __init__(self, fails: str = "") -> None:
         self._fails = fails
@@ -103,3 +104,16 @@ def test_what_fails_in_posting_a_keyframe_is_no_failure_of_the_tracker() -> None
         with pytest.raises(OSError, match="no such socket"):
             run._track_one(FRAME, 0)
     assert tracker.calls == ["keyframe"]
+
+
+def test_an_error_model_that_fails_costs_its_estimate() -> None:
+    class Broken(Unknown):
+        def after(self, frame: Frame, result: TrackResult) -> float | None:
+            raise FloatingPointError("overflow")
+
+    said, tracker = list[str](), Tracker()
+    with run_of(tracker, said) as run:
+        run._errors = Broken()
+        assert tracked(run) == [(True, True)]
+    assert tracker.calls == ["keyframe", "settle"]
+    assert sum("FloatingPointError" in line for line in said) == 1

@@ -17,12 +17,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from share.geometry.camera import ImuBias
+from share.io.imu_memory import Remembered, remember
 from share.io.trajectory import read_tum
 
 pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 
 CHILD = Path(__file__).with_name("live_child.py")
-ENV = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, CHILD.parents[1:3]))}  # tests, and the checkout
+PYTHONPATH = os.pathsep.join(map(str, CHILD.parents[1:3]))  # tests, and the checkout
 MODE = ("--mode", "640x480@15")
 
 
@@ -31,7 +33,8 @@ def running(seen: Path, *arguments: object) -> Iterator[tuple[subprocess.Popen[s
     """The process, whose stderr is a terminal, and the end of that terminal that can be read."""
     here, there = pty.openpty()
     command = [sys.executable, str(CHILD), str(seen), *map(str, arguments)]
-    child = subprocess.Popen(command, env=ENV, text=True, stdout=subprocess.PIPE, stderr=there)
+    env = {**os.environ, "PYTHONPATH": PYTHONPATH}
+    child = subprocess.Popen(command, env=env, text=True, stdout=subprocess.PIPE, stderr=there)
     os.close(there)
     try:
         yield child, here
@@ -83,6 +86,7 @@ def test_a_person_ends_tracking_and_finds_the_poses_and_what_the_camera_did(
 
 def test_a_person_ends_an_agent_and_its_files_are_whole(tmp_path: Path, plain_session: Path) -> None:
     who = ("agent", "realsense", *MODE, "--name", "ann", "--profile", "d435i-n100-headset")
+    remember("0123", Remembered(10**9 * int(time.time() - 60), ImuBias([0.0] * 3, [0.0] * 3, 1e-3, 1e-2)))
     with running(plain_session / "ar1", *who, "--edge", "tcp://127.0.0.1:9", "--out", tmp_path) as (child, t):
         live = shown(t)
         told, after = ended(child, t)
@@ -92,5 +96,6 @@ def test_a_person_ends_an_agent_and_its_files_are_whole(tmp_path: Path, plain_se
     assert "camera: missing " in told
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["camera"]["streams"]["accel"]["dropped"] == 0
+    assert f"imu bias: from the run of {report['imu_bias']['from']}\n" in told
     assert report["track_ms"]["p50"] > 0  # from the image's arrival
     assert len(read_tum(tmp_path / "odom.tum").stamps_ns) == report["tracked"] > 10

@@ -15,10 +15,14 @@ import pytest
 from capture_bench import quick
 from room_camera import BEGIN_US, HZ, RGBD, STEREO, RoomCamera
 
+from share.cli import live
 from share.config import Config
+from share.estimator.inertial import tracker
 from share.estimator.result import TrackResult
+from share.geometry.camera import ImuBias
 from share.io.calibration import Calibration
 from share.io.handover import Handover, KeepNewest
+from share.io.imu_memory import Remembered, recall, remember
 from share.io.live import WAITING, LiveSource
 from share.io.source import Source, open_source
 from share.run.capture import Capture
@@ -83,6 +87,33 @@ def test_a_live_camera_is_tracked_as_the_original(room: RoomCamera, original: Tr
         "dropped": 0,
     }
     assert said == []
+
+
+def test_a_live_camera_begins_with_the_bias_of_the_run_before_and_keeps_its_own(
+    room: RoomCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, after = (ImuBias([0.0, x, 0.0], [0.0, 0.0, x], 1e-3, 2e-2) for x in (0.001, 0.002))
+    remember("0123", Remembered(time.time_ns() - 3600 * 10**9, before))
+    begun: list[ImuBias] = []
+    first_state = tracker.first_state
+    monkeypatch.setattr(tracker, "first_state", lambda *a: begun.append(a[-1]) or first_state(*a))
+    monkeypatch.setattr(tracker, "learnt_bias", lambda *a: after)
+    source = LiveSource(room.feed(STEREO, KeepNewest(2 * WAITING), []), HZ)
+    room.begin(source.feed)
+    run = tracked(source)
+    assert (begun[0].gyro[1], begun[0].accel[2]) == (0.001, 0.001)
+    assert 0.1 < begun[0].accel_sigma < 0.11
+    assert run.report["imu_bias"]["from"] is not None
+    assert f"imu bias: from the run of {run.report['imu_bias']['from']}" in live.summary(run.report)
+    assert run.report["tracked"] > 40
+    kept = recall("0123")
+    assert kept is not None
+    assert kept.bias.gyro[1] == 0.002
+    assert 0 <= time.time_ns() - kept.at_ns < 60 * 10**9
+    begun.clear()
+    assert "imu_bias" not in tracked(room.source).report  # a recording: as if nothing were known
+    assert begun[0].accel_sigma == Config().inertial.accel_bias
+    assert recall("0123").at_ns == kept.at_ns  # type: ignore[union-attr]
 
 
 def test_a_calibration_of_another_camera_is_noted_and_used(room: RoomCamera) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from map_changes import small_map
+from map_changes import ANN, BOB, small_map
 
 from share.config import Config, EdgeConfig
 from share.core.edge_events import Lost
@@ -33,6 +33,8 @@ class Link:
     def refusals(self):
         return []
 
+    def names(self, key): ...
+    def trouble(self): ...
     def wake(self): ...
     def close(self): ...
 
@@ -162,6 +164,15 @@ def test_a_map_that_may_not_be_written_is_no_longer_used():
     assert restarts.found() == (None, [])
     assert restarts.store is None
     assert said == ["the map is not used any more: ValueError: x; nothing is kept"]
+
+
+def test_who_speaks_for_a_run_is_not_known_where_no_key_did_before_and_keys_are_used(path):
+    """Of the map of `small_map`, a key speaks for Ann."""
+    for has_keys, bob in ((True, None), (False, "")):
+        store = MapStore.read(path)
+        kept, known = Restarts(store, 0.05, print, has_keys).found()
+        voices = {run.key: run.voice for run in kept.runs}
+        assert voices == {run.key: run.voice for run in known} == {ANN: "key of ann", BOB: bob}
 
 
 def test_a_disk_that_fails_is_not_the_maps_fault():

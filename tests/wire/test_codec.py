@@ -399,6 +399,26 @@ def injured_frame(at: int, entry: tuple[str, tuple[int, ...]], data: bytes) -> l
         (3, ("<i8", (4,)), b"\0" * 32, "gyro: shape (5, 3), expected (4, 3)"),
         (3, ("<i8", (20_001,)), b"\0" * 160_008, "imu.stamps_ns: <i8 of shape (20001,)"),
         (4, ("<f8", (5, 3)), np.full(15, np.inf).tobytes(), "gyro: has values that are not finite"),
+        (
+            4,
+            ("<f8", (5, 3)),
+            np.array([0.0, 1e300] + [0.0] * 13).tobytes(),
+            "gyro: has values beyond 1000, which no IMU measures",
+        ),
+        (
+            4,
+            ("<f8", (5, 3)),
+            np.full(15, -1001.0).tobytes(),
+            "gyro: has values beyond 1000, which no IMU measures",
+        ),
+        (
+            5,
+            ("<f8", (5, 3)),
+            np.full(15, 1.1e4).tobytes(),
+            "accel: has values beyond 10000, which no IMU measures",
+        ),
+        (3, ("<i8", (5,)), np.array([1, 2, 2, 3, 4]).tobytes(), "stamps_ns: do not rise"),
+        (3, ("<i8", (5,)), np.array([1, 2, 1, 3, 4]).tobytes(), "stamps_ns: do not rise"),
     ],
 )
 def test_a_frame_that_is_none_is_refused(

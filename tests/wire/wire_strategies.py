@@ -94,7 +94,8 @@ def frames(draw: st.DrawFn) -> Frame:
     (h, w, n), deep = draw(st.tuples(*[st.integers(0, 40)] * 3)), draw(st.integers(0, 2))
     image0, image1 = rng.integers(0, 256, (2, h, w)).astype(np.uint8)
     depth = rng.uniform(0, 9, (w, h)).astype(np.float32)
-    stamps_ns = rng.integers(-MAX_STAMP_NS, MAX_STAMP_NS, n)
+    stamps_ns = np.unique(rng.integers(-MAX_STAMP_NS, MAX_STAMP_NS, n))
+    n = len(stamps_ns)
     imu = ImuBatch(stamps_ns, rng.normal(size=(n, 3)), rng.normal(size=(n, 3)))
     seen = [(None, None), (image1, None), (None, depth)][deep]
     return Frame(draw(stamps), draw(ids), image0, *seen, imu, draw(stamps))

@@ -33,19 +33,22 @@ _STILL_M_S, _WALKING_M_S = 0.1, 1.0  # velocity that is not there, or may be
 _STILL_SHAKE, _STILL_TURN = 0.15, 0.05  # m/s^2, rad/s: standard deviation and mean of a body at rest
 _SHAKE, _WALKING = 0.03, 1.5  # m/s^2, what a mean force has beside gravity and bias
 _TREMOR = 0.005  # rad/s, the same of a mean rate
+_TURN_GATE, _FORCE_GATE = 16.3, 10.8  # chi-square, 3 and 1 degrees of freedom, 0.1 %
 
 
 def first_state(
     stamp_ns: int, imu: ImuBatch, rig: Rig, config: InertialConfig, bias: ImuBias
 ) -> State | None:
     """Body at odom's origin, z up, at the time of the last samples; None before there are enough. bias: as it
-    is known before."""
+    is known before; it is left aside where samples at rest contradict it."""
     if len(imu) < 2 or (imu.stamps_ns[-1] - imu.stamps_ns[0]) < SHORTEST_S * 1e9:
         return None
     recent = imu.stamps_ns >= imu.stamps_ns[-1] - round(_AVERAGED_S * 1e9)
     gyro, accel = imu.gyro[recent], imu.accel[recent]
     force, rate = accel.mean(axis=0), gyro.mean(axis=0)
     still = _still(gyro, accel)
+    if still and _contradicted(bias, force, rate, config.gravity):
+        bias = unknown_bias(config)
     T = gravity.level(force - bias.accel, rig.T_body_cam0[:3, 2])
     state = _begun(stamp_ns, T, rig, bias, _sigmas(still, bias, config))
     _learn_force(state, force, _SHAKE if still else _WALKING, config.gravity)
@@ -79,6 +82,14 @@ def _begun(stamp_ns: int, T: F64, rig: Rig, bias: ImuBias, sigma: F64) -> State:
 def _still(gyro: F64, accel: F64) -> bool:
     turn = np.linalg.norm(gyro.mean(axis=0)) + np.linalg.norm(gyro.std(axis=0))
     return bool(turn < _STILL_TURN and np.linalg.norm(accel.std(axis=0)) < _STILL_SHAKE)
+
+
+def _contradicted(bias: ImuBias, force: F64, rate: F64, g: float) -> bool:
+    """Whether the mean force and rate (3,) of a body at rest cannot come of this bias: the IMU is another by
+    now, or was calibrated since."""
+    turn = ((rate - bias.gyro) ** 2).sum() / (bias.gyro_sigma**2 + _TREMOR**2)
+    weight = (np.linalg.norm(force - bias.accel) - g) ** 2 / (bias.accel_sigma**2 + _SHAKE**2)
+    return bool(turn > _TURN_GATE or weight > _FORCE_GATE)
 
 
 def _sigmas(still: bool, bias: ImuBias, config: InertialConfig) -> F64:

@@ -15,7 +15,7 @@ from share.types import F64, ImuBatch
 _KEPT = 600
 _REST_S, _FEWEST = 0.5, 20  # samples of so long, and so many, tell rest
 _REST_SHAKE, _REST_TURN = 0.12, 0.02  # m/s^2 and rad/s, standard deviations: about twice a D435i's noise
-_SHAKEN_S = 0.15  # samples of so long tell how much it is shaken
+_SHAKEN_S = 0.2  # samples of so long tell how much it is shaken
 _REPEATED = 4  # samples at the end of the scale,
 _MUCH = np.repeat([0.5, 11.0], 3)  # rad/s and m/s^2, which no scale ends below
 
@@ -36,6 +36,8 @@ class Samples:
         good = self._breaks.believed(imu.stamps_ns, values)
         if good is not None:
             imu, values = imu.take(good), values[good]
+        if self._breaks.taken_back:
+            self._take_back(self._breaks.taken_back)
         self._most = np.abs(values).max(axis=0, initial=0.0).clip(self._most)
         self.all = self.all.take(slice(-_KEPT, None)).join(imu)
 
@@ -45,6 +47,10 @@ class Samples:
         out.all, out._most, out._breaks = self.all, self._most, self._breaks.copy()
         out.add(imu)
         return out
+
+    def _take_back(self, stamps_ns: list[int]) -> None:
+        self.all = self.all.take(~np.isin(self.all.stamps_ns, stamps_ns))
+        self._most = np.abs(np.hstack([self.all.gyro, self.all.accel])).max(axis=0, initial=0.0)
 
     @property
     def doubted(self) -> int:

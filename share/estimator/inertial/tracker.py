@@ -24,10 +24,10 @@ from share.estimator.inertial.imu import integrate
 from share.estimator.inertial.keyframes import Keyframes
 from share.estimator.inertial.noise import louder, shaken, without
 from share.estimator.inertial.pivot import Pivot
-from share.estimator.inertial.readiness import converged, tilt, waits_for, worth_telling
+from share.estimator.inertial.readiness import converged, learnt_bias, tilt, waits_for, worth_telling
 from share.estimator.inertial.samples import Samples, coasting, mean_rate, unclipped
 from share.estimator.inertial.scene import Scene
-from share.estimator.inertial.state import ACCEL_BIAS, GYRO_BIAS, State
+from share.estimator.inertial.state import State
 from share.estimator.inertial.window import Window, window_for, without_force
 from share.estimator.localmap import LocalMap
 from share.estimator.result import TrackResult, typical
@@ -43,7 +43,6 @@ _GAP_NS = 250_000_000  # between frames: more than an IMU of this sort is modell
 _DOUBT = 0.02, 0.1, 0.3  # rad, m, m/s: how wrong the filter may be after it that believes nobody
 _REST_RATE, _REST_M_S = 0.03, 0.02  # rad/s of a body at rest; m/s of its velocity
 _SLOW_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to a filter that knows it moves
-_LEARNT = 0.3  # of the sigma that a bias has which nobody knows
 _LITTLE = 0.5  # of the features that there may be: then a keyframe's come at once
 _PATIENCE = 10  # frames without a sample of the IMU, after which we begin without
 _LEVEL_RAD = np.radians(3.0)  # sigma of tilt up to which others are told what is up
@@ -60,7 +59,7 @@ class InertialTracker:
         seed: int = 0,
         bias: ImuBias | None = None,
     ) -> None:
-        """bias: of the IMU, where something is known of it."""
+        """bias: of the IMU, where a run before has learnt it."""
         if rig.imu is None:
             raise ValueError("without an IMU there is VisualTracker")
         self._rig, self._config = rig, config
@@ -95,13 +94,10 @@ class InertialTracker:
 
     @property
     def bias(self) -> ImuBias | None:
-        """Of the IMU, as the filter knows it now; None where it knows no more than at the beginning."""
-        if self._scene is None or not self._ready or not self._knows_up:
+        """Of the IMU, as the filter knows it now; None where that is not worth remembering."""
+        if self._scene is None or not (self._ready and self._knows_up and self._agreement.sound):
             return None
-        s, diagonal = self._scene.state, np.diag(self._scene.state.cov)
-        gyro, accel = (float(np.sqrt(diagonal[at].max())) for at in (GYRO_BIAS, ACCEL_BIAS))
-        surer = accel < _LEARNT * self._config.accel_bias and gyro < self._config.gyro_bias
-        return ImuBias(s.bg, s.ba, gyro, accel) if surer else None
+        return learnt_bias(self._scene.state, self._config)
 
     @property
     def looks(self) -> Looks | None:

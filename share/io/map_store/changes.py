@@ -14,6 +14,7 @@ from share.core.keeping import (
     KeepLoop,
     KeepPoses,
     KeepRun,
+    KeepVoice,
     Retire,
 )
 from share.io.map_store import rows
@@ -31,6 +32,8 @@ def apply(db: sqlite3.Connection, change: Change) -> None:
     match change:
         case KeepRun():
             _run(db, change)
+        case KeepVoice(run, voice):
+            _voice(db, run, voice)
         case KeepKeyframe():
             _keyframe(db, change)
         case KeepLink():
@@ -58,6 +61,14 @@ def _run(db: sqlite3.Connection, change: KeepRun) -> None:
     if not _one(db, "SELECT 1 FROM run WHERE key = ?", change.key):
         for table in ("run", "run_copy"):
             insert(db, table, rows.of_run(change, 0))
+        _voice(db, change.key, change.voice)
+
+
+def _voice(db: sqlite3.Connection, run: str, voice: str | None) -> None:
+    row = rows.of_voice(run, voice or "")
+    db.execute("DELETE FROM about WHERE name = ?", row[:1])
+    if voice and _one(db, "SELECT 1 FROM run WHERE key = ?", run):
+        insert(db, "about", row)
 
 
 def _keyframe(db: sqlite3.Connection, change: KeepKeyframe) -> None:
@@ -107,6 +118,7 @@ def _retire(db: sqlite3.Connection, key: Key) -> None:
 def _forget_run(db: sqlite3.Connection, run: str) -> None:
     for table, column in _OF_RUN:
         db.execute(f"DELETE FROM {table} WHERE {column} = ?", (run,))
+    _voice(db, run, None)
 
 
 def _remember_next(db: sqlite3.Connection, run: str, following: int) -> None:

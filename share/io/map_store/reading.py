@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from share.core.keeping import KeepPoses, Kept, KeptKeyframe
@@ -14,6 +15,7 @@ from share.io.map_store.scan import Found
 from share.merge.join import Key
 
 _TIED = "keyframes lost the one before them and are tied to an earlier one"
+_ABOUT = "rows about the file, and who speaks for which run, could not be read"
 _UNSOLVED = "solutions could not be read: odometry and loops say where keyframes are"
 
 
@@ -21,7 +23,8 @@ def kept(found: Found) -> Kept:
     """What the rows say; they are taken out of `found`. Raises StoreError for another wire version."""
     following = {key: next for _, (key, next, *_) in found.tables["run"]}
     all_runs, bad_runs = _values(found, "run", rows.run)
-    runs = {run.key: run for run in all_runs}
+    voices = rows.voices(found.tables["about"])
+    runs = {run.key: replace(run, voice=voices.get(run.key, "")) for run in all_runs}
     keyframes, bad_keyframes = _values(found, "keyframe", rows.keyframe)
     homeless = [k for k in keyframes if k.key not in runs]
     links, bad_links = _values(found, "link", rows.link)
@@ -31,6 +34,7 @@ def kept(found: Found) -> Kept:
     there = {k.at for k in whole.keyframes}
     tied = tuple(loop for loop in loops if loop.a in there and loop.b in there)
     lost = [
+        _counted(found, "about", found.lost["about"], _ABOUT),
         _counted(found, "run", bad_runs, "agent runs could not be read"),
         _counted(found, "keyframe", bad_keyframes, "keyframes could not be read"),
         _counted(found, "", len(homeless), "keyframes are of a run that could not be read"),

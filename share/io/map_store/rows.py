@@ -30,6 +30,7 @@ COLUMNS = {
     "poses": ("keys", "T_map_body"),
 }
 
+_VOICE = "voice "  # with a run's key after it, a name in `about`: SHARE 0.1 passes over it
 _READABLE = (3, 4, codec.VERSION)  # wire versions in which a Hello and a Keyframe are what they are now
 _pack = msgspec.msgpack.encode
 _frames = msgspec.msgpack.Decoder(list[bytes]).decode
@@ -67,6 +68,11 @@ def of_run(run: KeepRun, next_keyframe: int) -> Row:
     return run.key, next_keyframe, codec.VERSION, _message(run.hello)
 
 
+def of_voice(run: str, voice: str) -> Row:
+    """Of `about`: the public key that speaks for a run. Where none does there is no row."""
+    return _VOICE + run, voice
+
+
 def of_keyframe(keyframe: KeepKeyframe, stretch: int, ordinal: int) -> Row:
     return (*keyframe.at, stretch, ordinal, codec.VERSION, _message(keyframe.keyframe))
 
@@ -92,6 +98,12 @@ def run(row: Row) -> KeepRun:
     key, following, version, hello = row
     checked_id("next", _whole(following))
     return KeepRun(_text(key), _decoded(messages.Hello, version, hello))
+
+
+def voices(about: list[tuple[int, Row]]) -> dict[str, str]:
+    """By run, from the rows of `about`."""
+    found = {name: value for _, (name, value) in about if isinstance(name, str) and isinstance(value, str)}
+    return {name.removeprefix(_VOICE): value for name, value in found.items() if name.startswith(_VOICE)}
 
 
 def keyframe(row: Row) -> KeptKeyframe:

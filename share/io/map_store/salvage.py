@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from share.io.files import fresh, sync_folder, writing
-from share.io.map_store import connect, schema
+from share.io.map_store import connect, rows, schema
 from share.io.map_store.connect import BROKEN
 from share.io.map_store.rows import insert
 from share.io.map_store.scan import Found, whole_rows, with_copies
@@ -123,6 +123,10 @@ def _write(found: Found, part: Path) -> None:
             for number, row in numbered:
                 if table != "about":
                     insert(connection, table, row, number)
+        own = {run for _, (run, *_) in found.tables["run"]}
+        for run, voice in rows.voices(found.tables["about"]).items():
+            if run in own:
+                insert(connection, "about", rows.of_voice(run, voice))
         for statement in _ORPHANS:
             connection.execute(statement)
         for stretch in connection.execute(_NAMELESS).fetchall():

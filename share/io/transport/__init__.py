@@ -85,6 +85,10 @@ class EdgeLink(Protocol):
         """Who was not let in since the last call, and what to do: a line each, the same for the same."""
         ...
 
+    def trouble(self) -> str | None:
+        """Why nobody can be let in now; None where nothing is wrong."""
+        ...
+
     def wake(self) -> None:
         """As `AgentLink.wake`."""
         ...

@@ -132,6 +132,9 @@ class MemoryEdgeLink:
     def refusals(self) -> list[str]:
         return []
 
+    def trouble(self) -> str | None:
+        return None
+
     def wake(self) -> None:
         self.inbox.wake()
 

@@ -42,6 +42,11 @@ class Doorkeeper:
         """Whether someone who was let in may not be here any more."""
         return not all(self._allowed.admits(key) for key in tuple(self._inside))
 
+    def trouble(self) -> str | None:
+        """Why nobody is let in, for a person; None where the list can be read."""
+        wrong = self._allowed.trouble()
+        return None if wrong is None else f"nobody is let in: {wrong}"
+
     def refusals(self) -> list[str]:
         """A line for each since the last call."""
         return [self._refusals.popleft() for _ in range(len(self._refusals))]
@@ -65,11 +70,9 @@ class Doorkeeper:
                 return [version, number, b"300", b"kept out", b"", b""]
             self._inside.add(key)  # a revocation since then is seen by the next `revoked`
             return [version, number, b"200", b"", key.encode(), b""]
-        wrong = self._allowed.trouble()
         self._refusals.append(
-            f"nobody is let in: {wrong}"
-            if wrong
-            else f"the key '{key}' ({address.decode()}) is not authorized; "
+            self.trouble()
+            or f"the key '{key}' ({address.decode()}) is not authorized; "
             f"to let it in: share keys authorize NAME '{key}'"
         )
         return [version, number, b"400", b"not authorized", b"", b""]

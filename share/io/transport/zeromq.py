@@ -39,11 +39,10 @@ _SLICE = 2000  # of these, in one call: 3 ms
 _WAKE, _POKE = b"w", b"p"
 _REFUSALS = 128  # lines at a time
 _IN_VAIN = 2000  # messages of strangers, or of who was cut off, in one call
+_LIST_S = 0.1  # so old is what the edge knows of its list; a look at each message was a quarter of its work
 _LOOK_MS = 20  # how often an agent looks how much of its edge waits
 _WELL_S = 10.0  # an edge that has been connected so long does not send too much
-_REDIAL_S = (
-    1.0  # after a handshake that failed, or a connection; libzmq itself gives up where it was wrong ZMTP
-)
+_REDIAL_S = 1.0  # after a handshake that failed, or a connection; libzmq gives up where it was wrong ZMTP
 _COMMON: dict[int, int] = {
     zmq.LINGER: LINGER_MS,
     zmq.SNDHWM: QUEUE_MESSAGES,
@@ -284,6 +283,9 @@ class ZmqEdgeLink:
             **({} if max_frame_bytes > MAX_FRAME_BYTES else {zmq.RCVBUF: _RECEIVED_BYTES}),
         }
         self._kept_out = KeepOut()
+        self._names: dict[str, frozenset[str]] = {}  # by key, since the last look at the list
+        self._list_due_s = 0.0
+        self._list_trouble: str | None = None
         self.strangers = 0  # messages dropped: their sender is no agent, or was cut off
         self._open()
 
@@ -295,8 +297,7 @@ class ZmqEdgeLink:
         return self._link.send([peer, *frames])
 
     def receive(self, timeout_ms: int) -> Arrival | None:
-        if self._door is not None and self._door.revoked():
-            self._reopen()
+        self._keep_to_list()
         end_s = time.monotonic() + timeout_ms * 1e-3
         arrival, poked = self._receive_now(), True
         while arrival is None and poked:
@@ -340,7 +341,23 @@ class ZmqEdgeLink:
         return "" if self._keys is None else str(part.get("User-Id"))
 
     def names(self, key: str) -> frozenset[str] | None:
-        return None if self._keys is None else self._keys.allowed.agents(key)
+        if self._keys is None:
+            return None
+        if key not in self._names:
+            self._names[key] = self._keys.allowed.agents(key)
+        return self._names[key]
+
+    def trouble(self) -> str | None:
+        return self._list_trouble
+
+    def _keep_to_list(self) -> None:
+        """Of who is authorized, as the file says now and then."""
+        if self._door is not None and (now_s := time.monotonic()) >= self._list_due_s:
+            self._list_due_s = now_s + _LIST_S
+            self._names.clear()
+            self._list_trouble = self._door.trouble()
+            if self._door.revoked():
+                self._reopen()
 
     def refusals(self) -> list[str]:
         cut_off, failed = self._guard.lines(), min(self._guard.failed(), _REFUSALS)
