@@ -34,7 +34,7 @@ _UNSURE = np.array([0, 1, 6, 7, 8])  # tilt and velocity,
 _LOOSE = np.array([3e-4, 3e-4, 1e-2, 1e-2, 1e-2])  # rad^2, (m/s)^2: where single precision is too little
 _MOVING = 15  # columns that propagation changes
 _LEAST_COV = 1e-10  # what differences of covariances lose
-AS_ONE = 16.0  # sights of an error that lasts: by NEES, see docs/vio.md
+AS_ONE = 16.0  # sights of an error that lasts; chosen by NEES
 _SETTLED = 1e-4  # rad, m, 1/m: a correction that changes no derivative
 
 
