@@ -17,11 +17,21 @@ class Columns:
 
     def take(self, rows: NDArray[np.bool_] | I64) -> Self:
         """These rows, by a mask (N,) or by their numbers."""
-        return type(self)(*(_rows(getattr(self, f.name), rows) for f in fields(self)))
+        return type(self)(*[_rows(getattr(self, name), rows) for name in _names(type(self))])
 
     def join(self, *others: Self) -> Self:
         """All rows, one table after the other."""
-        return type(self)(*(_joined([getattr(t, f.name) for t in (self, *others)]) for f in fields(self)))
+        tables = (self, *others)
+        return type(self)(*[_joined([getattr(t, name) for t in tables]) for name in _names(type(self))])
+
+
+_NAMES: dict[type[Columns], tuple[str, ...]] = {}  # looked up once
+
+
+def _names(table: type[Columns]) -> tuple[str, ...]:
+    if table not in _NAMES:
+        _NAMES[table] = tuple(f.name for f in fields(table))
+    return _NAMES[table]
 
 
 def _rows(value: Any, rows: NDArray[np.bool_] | I64) -> Any:

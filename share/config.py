@@ -59,11 +59,10 @@ class TrackerConfig:
 class InertialConfig:
     """Tracking by cameras and IMU (`share.estimator.inertial`)."""
 
-    features: int = 110  # followed at a time
+    features: int = 80  # followed at a time
     spacing_px: float = 18.0  # least distance between new ones
     sigma_px: float = 0.15  # of a feature found again, anew in every image,
     lasting_px: float = 0.3  # and of what is wrong with it for longer: edges, patches seen from elsewhere;
-    lasting_s: float = 1.0  # for so long
     stereo_px: float = 0.25  # of a new feature's disparity
     common_rad: float = 1e-3  # error of an image that all its features share: its blur, its time
     common_m: float = 1e-4  # the same, as a shift of the camera
@@ -78,11 +77,11 @@ class InertialConfig:
     extrinsic_m: float = 1e-5  # the same, of its position
     offset_s: float = 1e-6  # the same of its time against the IMU's
     gravity: float = 9.81  # m/s^2
-    keyframe_m: float = 0.15  # a keyframe after this much motion since the last one,
-    keyframe_rad: float = 0.2  # or this much turning,
-    keyframe_seen: float = 0.7  # or when fewer than this part of its features are seen
+    keyframe_m: float = 0.25  # a keyframe after this much motion since the last one,
+    keyframe_rad: float = 0.35  # or this much turning,
+    keyframe_seen: float = 0.8  # or when fewer than this part of its features are seen
     keyframe_gap_s: float = 0.1  # but never sooner
-    max_keyframes: int = 30  # in the state
+    max_keyframes: int = 20  # in the state
     recall: int = 80  # features of earlier keyframes looked for again at a keyframe,
     recall_m: float = 1.5  # of keyframes no further away than this
     recall_rad: float = 0.7  # and turned by no more than this
@@ -96,7 +95,7 @@ class InertialConfig:
 
     def __post_init__(self) -> None:
         _require_positive(self, "features", "spacing_px", "sigma_px", "gate", "imu_noise", "gravity")
-        _require_positive(self, "max_keyframes", "lasting_s")
+        _require_positive(self, "max_keyframes")
 
 
 @dataclass(frozen=True)

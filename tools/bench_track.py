@@ -39,7 +39,7 @@ from share.emulate.demo import FALLBACK, SCENE  # noqa: E402
 from share.emulate.recipe import Recipe  # noqa: E402
 from share.emulate.render.context import missing  # noqa: E402
 from share.emulate.session import cached_session, make_session  # noqa: E402
-from share.estimator.inertial import ekf, features, find, keyframes, parsac  # noqa: E402
+from share.estimator.inertial import ekf, features, find, keyframes, observe  # noqa: E402
 from share.estimator.inertial.scene import Scene  # noqa: E402
 from share.estimator.inertial.tracker import InertialTracker  # noqa: E402
 from share.estimator.visual import VisualTracker  # noqa: E402
@@ -55,16 +55,16 @@ SHORTEST_S = 3  # of a session
 KITCHEN = Path(__file__).resolve().parents[2] / "shared" / "data" / "real" / "redkitchen_0000_0499"
 STAGES: tuple[tuple[Any, str, str], ...] = (
     (ekf, "propagate", "imu"),
-    (find, "_expected", "expect"),
+    (observe, "aim", "expect"),
     (patches, "align", "align"),
     (find, "rescue", "rescue"),
-    (parsac, "of_the_room", "movers"),
-    (Scene, "sight", "rows"),
+    (Scene, "mark_movers", "movers"),
+    (Scene, "heard", "rows"),
     (ekf, "relinearised", "anew where far off"),
     (ekf, "gains", "gains"),
     (ekf, "update", "update"),
     (Scene, "seen", "slant and runaways"),
-    (Scene, "_wake", "keyframe: wake"),
+    (Scene, "wake", "keyframe: wake"),
     (Scene, "_forget", "keyframe: forget"),
     (Scene, "_inverse_depths", "keyframe: depth"),
     (features, "looks", "keyframe: patches"),
@@ -160,7 +160,7 @@ def bench(source: Source, estimator: Tracker, stages: Stages, most: int | None =
         pose_out = time.process_time()
         if result.keyframe:
             estimator.keyframe(frame)
-            estimator.settle()
+        estimator.settle()
         pose_ms.append(1e3 * (pose_out - cpu_began))
         keyframe_ms.append(1e3 * (time.process_time() - pose_out) if result.keyframe else np.nan)
         tracked += result.T_odom_body is not None

@@ -92,12 +92,13 @@ class Camera:
         if not self.distortion:
             return observed
         uv = (observed if about is None else about).copy()
-        for _ in range(8):  # Newton on the 2x2 system; converges quadratically inside the image
-            J = self._radtan_jacobian(uv)
+        for k in range(8):  # Newton on the 2x2 system; converges quadratically inside the image
+            if k == 0 or about is None:  # near enough, the first derivative will do
+                J = self._radtan_jacobian(uv)
+                J = J / (J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0])[..., None, None]
             r = observed - self._radtan(uv)
-            det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-            uv[..., 0] += (J[..., 1, 1] * r[..., 0] - J[..., 0, 1] * r[..., 1]) / det
-            uv[..., 1] += (J[..., 0, 0] * r[..., 1] - J[..., 1, 0] * r[..., 0]) / det
+            uv[..., 0] += J[..., 1, 1] * r[..., 0] - J[..., 0, 1] * r[..., 1]
+            uv[..., 1] += J[..., 0, 0] * r[..., 1] - J[..., 1, 0] * r[..., 0]
             if np.nanmax(np.abs(r), initial=0.0) < 1e-6:  # so the step leaves about its square
                 break
         return uv
@@ -122,14 +123,11 @@ class Camera:
         k1, k2, p1, p2, k3 = self._coefficients()
         x, y = uv[..., 0], uv[..., 1]
         r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        return np.stack(
-            [
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            ],
-            axis=-1,
-        )
+        xy, radial = 2 * x * y, 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        out = np.empty(uv.shape)
+        out[..., 0] = x * radial + p1 * xy + p2 * (r2 + 2 * x * x)
+        out[..., 1] = y * radial + p1 * (r2 + 2 * y * y) + p2 * xy
+        return out
 
     def _radtan_jacobian(self, uv: F64) -> F64:
         """d(distorted)/d(undistorted), (..., 2, 2)."""

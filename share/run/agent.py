@@ -203,6 +203,7 @@ class AgentRun:
         self._log.add_result(result.new_stretch, result.sound, result.waits)
         if result.keyframe:
             self._keyframe(frame, tracked)
+        self._tracker.attempt("settling a frame", frame, self._tracker.settle)
         self._log.imu_doubted = self._tracker.doubted
         self._log.cpu_s += time.thread_time() - cpu
 
@@ -216,8 +217,6 @@ class AgentRun:
         make = partial(self._errors.keyframe, frame, self._tracker)
         candidate = self._tracker.attempt("making a keyframe", frame, make)
         self._post(ev.KeyframeMade(tracked, candidate))
-        if candidate is not None:
-            self._tracker.attempt("settling a keyframe", frame, self._tracker.settle)
 
     def _post(self, event: ev.AgentEvent) -> None:
         """Waits for room, as long as anybody takes what is posted."""

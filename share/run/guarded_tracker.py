@@ -48,13 +48,12 @@ class GuardedTracker:
             self._give_up(frame)
             return None
 
-    def keep(self, frame: Frame) -> None:
-        """Makes `frame` a keyframe, where nobody else is to have it."""
-        self.attempt("making a keyframe", frame, partial(self._keep, frame))
-
-    def _keep(self, frame: Frame) -> None:
-        self.keyframe(frame)
-        self._tracker.settle()
+    def finish(self, frame: Frame, keyframe: bool) -> None:
+        """What is left to do for the frame just tracked, where nobody else is to have what it shows.
+        keyframe: whether it is one."""
+        if keyframe:
+            self.attempt("making a keyframe", frame, partial(self.keyframe, frame))
+        self.attempt("settling a frame", frame, self._tracker.settle)
 
     def keyframe(self, frame: Frame) -> Candidate:
         """Within `attempt`; so `settle` and `footing`."""

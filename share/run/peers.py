@@ -68,7 +68,7 @@ def ours(source: Source, settings: Config, show: Show = lambda done: None) -> Tr
         result = tracker.track(frame)
         if result.keyframe:
             tracker.keyframe(frame)
-            tracker.settle()
+        tracker.settle()
         run.add(frame.stamp_ns, result.T_odom_body, time.process_time() - began)
         show(len(run.cpu_ms))
     run.cpu_ms = run.cpu_ms[1:]

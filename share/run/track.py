@@ -51,8 +51,7 @@ def track(
         result = tracker.track(frame)
         track_ms = 1e3 * (time.perf_counter() - began)
         log.add_result(result.new_stretch, result.sound, result.waits)
-        if result.keyframe:
-            tracker.keep(frame)
+        tracker.finish(frame, result.keyframe)
         log.cpu_s += time.process_time() - cpu
         log.add(frame.stamp_ns, track_ms, result.state, result.keyframe)
         if result.T_odom_body is not None:

@@ -98,8 +98,7 @@ def track_all(
         new_stretch = result.new_stretch or (broken and result.state.has_pose)
         broken = broken and not new_stretch
         answer(Answered(key, life, _told(frame, result, new_stretch)))
-        if result.keyframe:  # after its pose is out; what it shows to others is for nobody
-            tracker.keep(frame)
+        tracker.finish(frame, result.keyframe)  # after its pose is out; what it shows to others is for nobody
         heap.tidy(time.monotonic())
 
 

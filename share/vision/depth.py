@@ -86,7 +86,10 @@ def from_stereo(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, guess_m: F64
         z = np.where(np.isnan(expected[todo]), fallback, expected[todo])
         guess = rig.cam1.project(se3.transform(rig.T_cam1_cam0, ray[todo] * z[:, None]))
         start = np.where(np.isnan(guess), px[todo], guess).astype(np.float32)
-        right, found = klt.follow(image0, image1, px[todo], start, window=15, levels=2, back_check_px=None)
+        levels = 1 if guess_m is not None and fallback == _FIRST else 2
+        right, found = klt.follow(
+            image0, image1, px[todo], start, window=15, levels=levels, back_check_px=None
+        )
         depth, error_px = _two_rays(rig, ray[todo], rig.cam1.normalise(right.astype(np.float64)))
         found &= (error_px < 1.5) & (depth > MIN_DEPTH) & (depth < MAX_DEPTH * 2)
         found &= klt.resemblance(image0, image1, px[todo], right) > 0.8

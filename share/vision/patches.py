@@ -20,6 +20,7 @@ HALF = 5  # px; patches are 11 x 11
 _SIDE = 2 * HALF + 1
 _AXIS = np.arange(-HALF, HALF + 1, dtype=np.float32)
 OFFSETS: F32 = np.stack(np.meshgrid(_AXIS, _AXIS), axis=-1).reshape(-1, 2)  # (S, 2) px, x and y
+_MEAN: F32 = np.full(_SIDE**2, 1 / _SIDE**2, np.float32)
 _FLAT = 1e-3  # gray levels: a patch with less contrast is nothing
 _MOST_ROWS = 30_000  # of what cv2.remap gives at a time (SHRT_MAX)
 
@@ -28,12 +29,14 @@ _MOST_ROWS = 30_000  # of what cv2.remap gives at a time (SHRT_MAX)
 class Patches(Columns):
     """N patches of S samples. gray (N, S): zero mean, unit norm; contrast (N,): the norm that it had.
     slope (N, 2, S): derivatives by x and y less what gain and bias explain, in gray levels a pixel;
-    inverse (N, 2, 2): of their normal matrix."""
+    inverse (N, 2, 2): of their normal matrix. probe (N, 3, S): gray, and what gives the shift: times samples
+    of zero mean and unit norm, how alike they are and how far off, px."""
 
     gray: F32
     contrast: F32
     slope: F32
     inverse: F32
+    probe: F32
 
     def __len__(self) -> int:
         return len(self.gray)
@@ -47,7 +50,7 @@ class Patches(Columns):
 
 def empty() -> Patches:
     s = len(OFFSETS)
-    shapes = ((0, s), (0,), (0, 2, s), (0, 2, 2))
+    shapes = ((0, s), (0,), (0, 2, s), (0, 2, 2), (0, 3, s))
     return Patches(*(np.zeros(shape, np.float32) for shape in shapes))
 
 
@@ -66,50 +69,82 @@ def cut(image: U8, px: F32) -> Patches:
     slope = slope - slope.mean(axis=2, keepdims=True)
     slope = slope - (slope @ gray[:, :, None]) * gray[:, None, :]
     normal = slope @ slope.transpose(0, 2, 1) + np.float32(1e-3) * np.eye(2, dtype=np.float32)
-    return Patches(gray, contrast, slope, np.linalg.inv(normal))
+    inverse = np.linalg.inv(normal)
+    probe = np.concatenate([gray[:, None], contrast[:, None, None] * (inverse @ slope)], axis=1)
+    return Patches(gray, contrast, slope, inverse, probe)
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
     """px (N, 2) where the patches are; alike (N,): normalised correlation there, 1 at best; step (N,): px
-    of the last correction, small where it settled; error (N, S): gray levels that no shift explains."""
+    of the last correction, small where it settled. What was last seen: samples (N, S), zero mean, unit norm;
+    shift (N, 2), px of the patch, from there."""
 
     px: F32
     alike: F32
     step: F32
-    error: F32
+    samples: F32
+    shift: F32
 
 
-def align(image: U8, patches: Patches, px: F64, warp: F64, most: int = 4, settled_px: float = 0.02) -> Found:
-    """From px (N, 2), the patches being warped by (N, 2, 2): d px here / d px there. At most `most` steps."""
+def align(
+    images: tuple[U8, ...],
+    first: int,
+    patches: Patches,
+    px: F64,
+    warp: F64,
+    most: int = 4,
+    settled_px: float = 0.02,
+) -> Found:
+    """From px (N, 2), the patches being warped by (N, 2, 2): d px here / d px there. At most `most` steps.
+    The first so many are sought in the first of one or two images, the others in the second."""
     n = len(patches)
     at, W = px.astype(np.float32), warp.astype(np.float32)
     alike, step = np.zeros(n, np.float32), np.full(n, np.inf, np.float32)
-    left = np.zeros_like(patches.gray)
-    spread = OFFSETS @ W.transpose(0, 2, 1)  # (N, S, 2)
-    todo = np.arange(n)
+    samples, shift = np.zeros_like(patches.gray), np.zeros((n, 2), np.float32)
+    x, y = W[:, 0] @ OFFSETS.T, W[:, 1] @ OFFSETS.T
+    probe, todo = patches.probe, np.arange(n)
     for _ in range(most):
         if len(todo) == 0:
             break
-        part = patches if len(todo) == n else patches.take(todo)
-        here = spread[todo]
-        seen, _ = _normed(sample(image, at[todo, :1] + here[..., 0], at[todo, 1:] + here[..., 1]))
-        alike[todo] = np.einsum("ns,ns->n", seen, part.gray)
-        error = (seen - part.gray) * part.contrast[:, None]
-        shift = part.inverse @ (part.slope @ error[:, :, None])
-        left[todo] = error - (shift.transpose(0, 2, 1) @ part.slope)[:, 0]
-        move = (W[todo] @ shift)[:, :, 0]
+        if len(todo) < n:
+            probe, X, Y = patches.probe[todo], x[todo], y[todo]
+        else:
+            X, Y = x, y
+        here = at[todo]
+        seen = _sampled(images, int(np.searchsorted(todo, first)), X + here[:, :1], Y + here[:, 1:])
+        seen, _ = _normed(seen)
+        told = np.einsum("nks,ns->nk", probe, seen)
+        alike[todo], samples[todo], shift[todo] = told[:, 0], seen, told[:, 1:]
+        move = np.einsum("nij,nj->ni", W[todo], told[:, 1:])
         at[todo] -= move
-        step[todo] = np.hypot(move[:, 0], move[:, 1])
-        todo = todo[(step[todo] > settled_px) & np.isfinite(step[todo])]
-    return Found(at, alike, step, left)
+        far = np.hypot(move[:, 0], move[:, 1])
+        step[todo] = far
+        todo = todo[(far > settled_px) & np.isfinite(far)]
+    return Found(at, alike, step, samples, shift)
+
+
+def _sampled(images: tuple[U8, ...], first: int, x: F32, y: F32) -> F32:
+    """Gray levels (N, S), of the first so many in the first image."""
+    if first >= len(x):
+        return sample(images[0], x, y)
+    if first == 0:
+        return sample(images[1], x, y)
+    return np.concatenate([sample(images[0], x[:first], y[:first]), sample(images[1], x[first:], y[first:])])
+
+
+def unexplained(patches: Patches, samples: F32, shift: F32) -> F32:
+    """Gray levels (N, S) that no shift explains of what `align` saw last."""
+    error = (samples - patches.gray) * patches.contrast[:, None]
+    out: F32 = error - (shift[:, None, :] @ patches.slope)[:, 0]
+    return out
 
 
 def slanted(patches: Patches, error: F32, along: F64) -> tuple[F64, F64]:
     """What a patch says of the slant of its surface: information (N, 2, 2) and its product with the step
     (N, 2), for one gray level of noise. along (N, 2): px of the patch by which its middle moves for one
-    unit more of inverse depth; the step is the change of inverse depth by px of the patch. error: of
-    `align`."""
+    unit more of inverse depth; the step is the change of inverse depth by px of the patch. error (N, S):
+    `unexplained`."""
     moved = (along.astype(np.float32)[:, None, :] @ patches.slope)[:, 0]  # gray levels for a unit
     S = moved[:, None, :] * OFFSETS.T
     S = S - S.mean(axis=2, keepdims=True)
@@ -136,6 +171,7 @@ def sample(image: U8, x: F32, y: F32) -> F32:
 
 def _normed(gray: F32) -> tuple[F32, F32]:
     """Zero mean, unit norm (N, S), and the norm (N,)."""
-    gray = gray - gray.mean(axis=1, keepdims=True)
+    gray = gray - (gray @ _MEAN)[:, None]
     norm = np.sqrt(np.einsum("ns,ns->n", gray, gray))
-    return gray / np.maximum(norm, _FLAT)[:, None], norm
+    gray /= np.maximum(norm, _FLAT)[:, None]
+    return gray, norm

@@ -62,8 +62,9 @@ def orb(image: U8, count: int, grid: tuple[int, int] = (8, 6)) -> tuple[F32, U8]
     keypoints = detector.detect(image, None)
     if not keypoints:
         return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
-    px = np.array([k.pt for k in keypoints], np.float32)
+    px = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32)
     response = np.array([k.response for k in keypoints])
     chosen = np.sort(evenly(px, response, image.shape[::-1], grid)[:count])
     kept, descriptors = detector.compute(image, [keypoints[i] for i in chosen])
-    return np.array([k.pt for k in kept], np.float32).reshape(-1, 2), np.asarray(descriptors, np.uint8)
+    px = np.asarray(cv2.KeyPoint.convert(kept), np.float32).reshape(-1, 2)
+    return px, np.asarray(descriptors, np.uint8)

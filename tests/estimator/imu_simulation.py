@@ -19,7 +19,7 @@ from share.types import ImuBatch
 
 FRAME_HZ = 20
 SHIPPED = InertialConfig()
-LASTING_PX, LASTING_S = SHIPPED.lasting_px, SHIPPED.lasting_s
+LASTING_PX, LASTING_S = SHIPPED.lasting_px, 1.0  # a Gauss-Markov process of the world's
 
 
 @dataclass
@@ -87,7 +87,6 @@ def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
         part = imu.take(near)
         samples.all = imu.take(slice(int(np.searchsorted(imu.stamps_ns, to_ns)) + 1))
         rate = ekf.propagate(state, part, to_ns, shaken(noise, samples.latest(to_ns)), GRAVITY)
-        ekf.fade(state, 1 / FRAME_HZ, LASTING_PX / CAMERA.focal, LASTING_S)
         taken = stamp + offset
         level = world.see(state, taken, rate)
         if len(state.ids) < 0.7 * setup.features or stamp - keyframe_at > 1.0:
@@ -158,9 +157,16 @@ class _World:
         inside = ~np.isnan([px[:, 0] for px in seen]).any(axis=0)
         which = np.flatnonzero(inside)
         sigma = np.full(len(which), self._sigma_px / CAMERA.focal)
+        lasts = np.full(len(which), LASTING_PX / CAMERA.focal)
         first, *others = (
             ekf.sight(
-                state, which, observe.predict(state, which, T), CAMERA.normalise(px[which]), sigma, rate
+                state,
+                which,
+                observe.predict(state, which, T),
+                CAMERA.normalise(px[which]),
+                sigma,
+                lasts,
+                rate,
             )
             for px, T in zip(seen, self._eyes, strict=True)
         )
@@ -192,7 +198,7 @@ class _World:
         ids = np.arange(next_id, next_id + count)
         if self._mono:
             g = guess(state, px.astype(np.float32), self._px)
-            ekf.add_features(state, ids, np.full(count, host), uv, g.rho, g.sigma, 0.0, g.like, g.common)
+            ekf.add_features(state, ids, np.full(count, host), uv, g.rho, g.sigma, g.like, g.common)
             return next_id + count
         sigma = self._sigma_px / CAMERA.fx / self._rig.baseline
         rho = np.maximum(1 / z + self._rng.normal(0, sigma, count), 0.02)

@@ -1,6 +1,7 @@
 """Every derivative of the inertial filter against differences of what it is the derivative of."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,7 +61,7 @@ def basis(state, k):
 
 def looked(state, T):
     """Where features show in an image."""
-    return observe.predict(state, np.arange(10), T).uv + state.lasting
+    return observe.predict(state, np.arange(10), T).uv
 
 
 @pytest.mark.parametrize("right", [False, True])
@@ -69,13 +70,12 @@ def test_what_is_seen(state, right):
     which = np.arange(10)
     rate = np.array([0.3, -0.2, 0.5])
     seen = observe.predict(state, which, T)
-    rows = ekf.sight(state, which, seen, np.zeros((10, 2)), np.ones(10), rate)
+    rows = ekf.sight(state, which, seen, np.zeros((10, 2)), np.ones(10), np.zeros(10), rate)
     H = np.zeros((20, state.size))
     H[:, :CORE] = rows.core.reshape(20, CORE)
     for i in range(10):
         H[2 * i : 2 * i + 2, state.keyframe(rows.host[i])] = rows.by_host[i]
         H[2 * i : 2 * i + 2, state.features_at + i] = rows.by_rho[i]
-        H[2 * i : 2 * i + 2, state.lasting_at + 2 * i : state.lasting_at + 2 * i + 2] = np.eye(2)
     for k in range(state.size):
         if k == OFFSET:
             continue
@@ -89,6 +89,22 @@ def test_what_is_seen(state, right):
     HP, S = ekf.gains(state, rows)
     assert np.allclose(HP, H @ state.cov, atol=1e-14)
     assert np.allclose(S, H @ state.cov @ H.T + np.eye(20), atol=1e-14)
+
+
+def test_what_lasts_is_the_same_in_both_cameras(state):
+    which, rate = np.arange(10), np.zeros(3)
+    sigma, lasting = np.full(10, 0.5), np.full(10, 0.3)
+    left, right = (
+        ekf.sight(state, which, observe.predict(state, which, T), np.zeros((10, 2)), sigma, lasting, rate)
+        for T in (None, RIG.T_cam1_cam0)
+    )
+    right = right.take(np.arange(3, 7))
+    rows = left.join(right)
+    rows = rows.take(np.argsort(rows.host, kind="stable"))
+    alone, together = (ekf.gains(state, r)[1] for r in (replace(rows, lasting=0 * rows.lasting), rows))
+    same = (rows.which[:, None] == rows.which)[:, None, :, None] * np.eye(2)[:, None, :]
+    shared = ekf.AS_ONE * 0.3**2 * same.reshape(alone.shape)
+    assert np.allclose(together - alone, shared, atol=1e-14)
 
 
 def test_covariance_of_a_motion(state):

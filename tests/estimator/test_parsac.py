@@ -31,7 +31,7 @@ def judged(state, shift_px, proven=None, noise=0.3):
     seen = observe.predict(state, np.arange(N))
     rng = np.random.default_rng(2)
     uv = seen.uv + (shift_px + noise * rng.normal(size=(N, 2))) / CAMERA.focal
-    rows = ekf.sight(state, np.arange(N), seen, uv, np.full(N, SIGMA), np.zeros(3))
+    rows = ekf.sight(state, np.arange(N), seen, uv, np.full(N, SIGMA), np.zeros(N), np.zeros(3))
     px = RIG.cam0.distort(uv).astype(np.float32)
     return parsac.of_the_room(state, rows, px, np.ones(N, bool) if proven is None else proven, RIG.cam0)
 
@@ -86,5 +86,13 @@ def test_a_motion_that_the_imu_missed_is_no_split(state):
 def test_too_few_are_believed(state):
     few = np.arange(5)
     seen = observe.predict(state, few)
-    rows = ekf.sight(state, few, seen, seen.uv + 1.0, np.full(5, SIGMA), np.zeros(3))
+    rows = ekf.sight(state, few, seen, seen.uv + 1.0, np.full(5, SIGMA), np.zeros(5), np.zeros(3))
     assert parsac.of_the_room(state, rows, np.zeros((5, 2), np.float32), np.ones(5, bool), RIG.cam0).all()
+
+
+@pytest.mark.parametrize(("share", "as_expected"), [(0.05, True), (0.3, False), (1.0, False)])
+def test_the_imu_alone_explains_an_image_where_nothing_moves(share, as_expected):
+    """Else somebody is asked; so too if all of the image moves."""
+    off_px = np.random.default_rng(4).normal(0, 0.3, (N, 2))
+    off_px[: round(share * N)] += 3.0
+    assert parsac.as_expected(off_px, 0.15, 0.3) == as_expected

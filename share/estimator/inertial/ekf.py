@@ -28,10 +28,13 @@ from share.estimator.inertial.state import (
 )
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
-from share.types import F64, I64, ImuBatch
+from share.types import F32, F64, I64, ImuBatch
 
+_UNSURE = np.array([0, 1, 6, 7, 8])  # tilt and velocity,
+_LOOSE = np.array([3e-4, 3e-4, 1e-2, 1e-2, 1e-2])  # rad^2, (m/s)^2: where single precision is too little
 _MOVING = 15  # columns that propagation changes
 _LEAST_COV = 1e-10  # what differences of covariances lose
+AS_ONE = 16.0  # sights of an error that lasts; chosen by NEES
 _SETTLED = 1e-4  # rad, m, 1/m: a correction that changes no derivative
 
 
@@ -39,8 +42,8 @@ _SETTLED = 1e-4  # rad, m, 1/m: a correction that changes no derivative
 class Sight(Columns):
     """Rows of an update: residual (M, 2) measured - predicted, and how it depends on the state: core
     (M, 2, 22), the pose (M, 2, 6) of keyframe number host (M,), inverse depth (M, 2) of feature number
-    which (M,), and its lasting error, as it is. sigma (M,) of one coordinate, as the residual: normalised
-    coordinates."""
+    which (M,). Of one coordinate, as the residual: sigma (M,), anew in every image; lasting (M,), the same
+    in both cameras' and much the same in the next ones."""
 
     which: I64
     host: I64
@@ -49,6 +52,7 @@ class Sight(Columns):
     by_host: F64
     by_rho: F64
     sigma: F64
+    lasting: F64
 
 
 def propagate(state: State, imu: ImuBatch, to_ns: int, noise: ImuNoise, gravity: float) -> F64:
@@ -64,55 +68,54 @@ def propagate(state: State, imu: ImuBatch, to_ns: int, noise: ImuNoise, gravity:
     return motion.rate
 
 
-def fade(state: State, seconds: float, sigma: float, time_s: float) -> None:
-    """What sights have wrong that lasts forgets itself in `time_s`, and is renewed: a Gauss-Markov process of
-    `sigma`, normalised coordinates (Gelb 1974, 3.8)."""
-    kept, at, P = np.exp(-seconds / time_s), state.lasting_at, state.cov
-    state.lasting = kept * state.lasting
-    P[at:] *= kept
-    P[:, at:] *= kept
-    own = np.arange(at, state.size)
-    P[own, own] += (1 - kept**2) * sigma**2
-
-
 def twist(state: State, rate: F64) -> F64:
     """How the body's pose moves with time, (6,): T(t + dt) = Exp(twist dt) T(t). rate (3,): rad/s, body."""
     turning = state.T[:3, :3] @ rate
     return np.concatenate([turning, state.v - np.cross(turning, state.T[:3, 3])])
 
 
-def sight(state: State, which: I64, seen: Prediction, uv: F64, sigma: F64, rate: F64) -> Sight:
-    """What was seen at uv (M, 2), sigma (M,), of features number `which` (M,), where `seen` was predicted."""
+def sight(state: State, which: I64, seen: Prediction, uv: F64, sigma: F64, lasting: F64, rate: F64) -> Sight:
+    """What was seen at uv (M, 2), sigma and lasting (M,), of features number `which` (M,), where `seen` was
+    predicted."""
     core = np.zeros((len(which), 2, CORE))
     core[:, :, POSE], core[:, :, EXTRINSIC] = seen.by_pose, seen.by_extrinsic
     core[:, :, OFFSET] = seen.by_pose @ twist(state, rate)
-    residual = uv - seen.uv - state.lasting[which]
-    return Sight(which, state.host[which], residual, core, -seen.by_pose, seen.by_rho, sigma)
+    return Sight(which, state.host[which], uv - seen.uv, core, -seen.by_pose, seen.by_rho, sigma, lasting)
 
 
 def gains(state: State, rows: Sight, common: F64 | None = None) -> tuple[F64, F64]:
-    """H cov (2 M, n) and H cov H' + R (2 M, 2 M) of rows sorted by host. H is not formed: a row has 30
+    """H cov (2 M, n) and H cov H' + R (2 M, 2 M) of rows sorted by host. H is not formed: a row has 29
     entries. common (6, 6): covariance of an error that all rows share, as one of the pose, on its right."""
     P, M = state.cov, len(rows.which)
     core, by_host = rows.core.reshape(2 * M, CORE), rows.by_host.reshape(2 * M, 6)
     by_rho, at_rho = rows.by_rho.ravel(), np.repeat(state.features_at + rows.which, 2)
-    at_lasting = (state.lasting_at + 2 * rows.which[:, None] + (0, 1)).ravel()
     groups = [
         (state.keyframe(int(h)), slice(2 * a, 2 * b)) for h, a, b in zip(*_runs(rows.host), strict=True)
     ]
     HP = core @ P[:CORE]
     HP += by_rho[:, None] * P[at_rho]
-    HP += P[at_lasting]
     for columns, part in groups:
         HP[part] += by_host[part] @ P[columns]
-    S = HP[:, :CORE] @ core.T + HP[:, at_rho] * by_rho + HP[:, at_lasting]
+    S = HP[:, :CORE] @ core.T + HP[:, at_rho] * by_rho
     for columns, part in groups:
         S[:, part] += HP[:, columns] @ by_host[part].T
-    S[np.diag_indices(2 * M)] += np.repeat(rows.sigma**2, 2)
+    S[np.diag_indices(2 * M)] += np.repeat(rows.sigma**2 + AS_ONE * rows.lasting**2, 2)
+    left, right = _pairs(rows.which)
+    for axis in (0, 1):
+        both = 2 * left + axis, 2 * right + axis
+        S[both] += AS_ONE * rows.lasting[left] * rows.lasting[right]
+        S[both[::-1]] = S[both]
     if common is not None:
         B = core[:, POSE] @ se3.adjoint(state.T)
         S += B @ common @ B.T
     return HP, S
+
+
+def _pairs(which: I64) -> tuple[I64, I64]:
+    """Numbers (K,) of rows that both cameras have of a feature."""
+    order = np.argsort(which, kind="stable")
+    twice = np.flatnonzero(which[order[1:]] == which[order[:-1]])
+    return order[twice], order[twice + 1]
 
 
 def _runs(host: I64) -> tuple[I64, I64, I64]:
@@ -127,7 +130,8 @@ def surprise(rows: Sight, S: F64) -> F64:
     M = len(rows.which)
     a, b = 2 * np.arange(M), 2 * np.arange(M) + 1
     x, y = rows.residual.T
-    sxx, sxy, syy = S[a, a], S[a, b], S[b, b]
+    less = (AS_ONE - 1) * rows.lasting**2  # it is no larger for lasting
+    sxx, sxy, syy = S[a, a] - less, S[a, b], S[b, b] - less
     d = (syy * x * x - 2 * sxy * x * y + sxx * y * y) / (sxx * syy - sxy * sxy)
     out: F64 = np.where(np.isfinite(d), d, np.inf)
     return out
@@ -146,7 +150,7 @@ def relinearised(
         rows = rows_at()
         rows.residual[:] += times(state, rows, error)
         HP, S = gains(state, rows, common)
-        step = _gain(HP, S, rows.residual.ravel())[0] - error
+        step = _gain(HP, S, rows.residual.ravel(), exactly=True)[0] - error
         error += step
         state.restore(before)
         move(state, error)
@@ -162,8 +166,7 @@ def times(state: State, rows: Sight, error: F64) -> F64:
     """H error (M, 2)."""
     poses = error[CORE : state.features_at].reshape(-1, 6)[rows.host]
     by_rho = rows.by_rho * error[state.features_at + rows.which, None]
-    lasting = error[state.lasting_at :].reshape(-1, 2)[rows.which]
-    out: F64 = rows.core @ error[:CORE] + (rows.by_host @ poses[:, :, None])[:, :, 0] + by_rho + lasting
+    out: F64 = rows.core @ error[:CORE] + (rows.by_host @ poses[:, :, None])[:, :, 0] + by_rho
     return out
 
 
@@ -176,7 +179,7 @@ def update(state: State, rows: Sight, HP: F64, S: F64) -> float:
 
 def apply(state: State, residual: F64, HP: F64, S: F64) -> float:
     """residual (m,), H cov (m, n), its covariance S (m, m)."""
-    error, W, white = _gain(HP, S, residual)
+    error, W, white = _gain(HP, S, residual, exactly=bool((np.diag(state.cov)[_UNSURE] > _LOOSE).any()))
     state.cov -= W.T @ W  # numpy makes this one symmetric to the last bit
     move(state, error)
     return float(white @ white)
@@ -207,14 +210,20 @@ def doubt(state: State, turn: float, shift: float, speed: float) -> None:
     state.cov[VELOCITY, VELOCITY] += speed**2 * np.eye(3)
 
 
-def _gain(HP: F64, S: F64, residual: F64) -> tuple[F64, F64, F64]:
-    """The error (n,) that the residual tells of, L^-1 H cov (m, n), L^-1 residual (m,) with L L' = S."""
+def _gain(HP: F64, S: F64, residual: F64, exactly: bool) -> tuple[F64, F64 | F32, F64]:
+    """The error (n,) that the residual tells of, L^-1 H cov (m, n), L^-1 residual (m,) with L L' = S. Half as
+    long where not `exactly`: what is taken from the covariance is then right to seven digits, which is too
+    little only where nearly all of a large variance goes at once."""
     L, failed = lapack.dpotrf(S, lower=1, clean=1)
     if failed:
         raise np.linalg.LinAlgError("innovation covariance is not positive definite")
-    W: F64 = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1).T  # as Fortran has it: no copy
     white: F64 = blas.dtrsm(1.0, L, residual[:, None], lower=1)[:, 0]
-    return W.T @ white, W, white
+    if exactly:
+        W: F64 = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1).T  # as Fortran has it: no copy
+        return W.T @ white, W, white
+    short: F32 = blas.strsm(1.0, L.astype(np.float32), HP.T.astype(np.float32), side=1, lower=1, trans_a=1).T
+    gain: F64 = blas.dtrsm(1.0, L, white[:, None], lower=1, trans_a=1)[:, 0]
+    return gain @ HP, short, white
 
 
 def move(state: State, error: F64) -> None:
@@ -227,8 +236,7 @@ def move(state: State, error: F64) -> None:
     state.bg, state.ba = state.bg + error[GYRO_BIAS], state.ba + error[ACCEL_BIAS]
     state.T_body_cam = state.T_body_cam @ se3.exp(error[EXTRINSIC])
     state.offset_s += float(error[OFFSET])
-    state.rho = state.rho + error[state.features_at : state.lasting_at]
-    state.lasting = state.lasting + error[state.lasting_at :].reshape(-1, 2)
+    state.rho = state.rho + error[state.features_at :]
 
 
 def add_keyframe(state: State, keyframe: int, rate: F64) -> int:
@@ -239,7 +247,7 @@ def add_keyframe(state: State, keyframe: int, rate: F64) -> int:
     copy[:, POSE] = np.eye(6)
     copy[:, OFFSET] = twist(state, rate)
     rows = copy @ state.cov
-    grown = _widened(state.cov, ((at, 6),))
+    grown = _widened(state.cov, at, 6)
     for old, now in ((slice(0, at), slice(0, at)), (slice(at, n), slice(at + 6, n + 6))):
         grown[at : at + 6, now], grown[now, at : at + 6] = rows[:, old], rows[:, old].T
     grown[at : at + 6, at : at + 6] = rows @ copy.T
@@ -256,27 +264,24 @@ def add_features(
     ray: F64,
     rho: F64,
     sigma: F64,
-    lasting: float = 0.0,
     like: F64 | None = None,
     common: F64 | None = None,
 ) -> None:
     """Features (N,) that keyframes number `host` (N,) see on rays (N, 2), inverse depths rho, sigma (N,) of
-    what each is off by itself. lasting: sigma of what a sight of them now has wrong; nothing in the image
-    that defines them. like (N, M): how the errors of the M inverse depths there are come in; common (N,):
-    sigma of an error that the new ones share."""
-    n, at, more = state.size, state.lasting_at, len(ids)
-    grown = _widened(state.cov, ((at, more), (n, 2 * more)))
-    rhos, errors = np.arange(at, at + more), np.arange(n + more, n + 3 * more)
-    grown[rhos, rhos], grown[errors, errors] = sigma**2, lasting**2
+    what each is off by itself. like (N, M): how the errors of the M inverse depths there are come in; common
+    (N,): sigma of an error that the new ones share."""
+    n, more = state.size, len(ids)
+    grown = _widened(state.cov, n, more)
+    new = slice(n, n + more)
     if like is not None and like.shape[1]:
-        rows, new = like @ state.cov[state.features_at : at], slice(at, at + more)
-        for old, now in ((slice(0, at), slice(0, at)), (slice(at, n), slice(at + more, n + more))):
-            grown[new, now], grown[now, new] = rows[:, old], rows[:, old].T
-        grown[new, new] += rows[:, state.features_at : at] @ like.T
+        rows = like @ state.cov[state.features_at :]
+        grown[new, :n], grown[:n, new] = rows, rows.T
+        grown[new, new] = rows[:, state.features_at :] @ like.T
+    own = np.arange(n, n + more)
+    grown[own, own] += sigma**2
     if common is not None and common.any():
-        grown[at : at + more, at : at + more] += np.outer(common, common)
+        grown[new, new] += np.outer(common, common)
     state.cov = grown
-    state.lasting = np.concatenate([state.lasting, np.zeros((more, 2))])
     state.ids = np.concatenate([state.ids, ids])
     state.host = np.concatenate([state.host, host])
     state.ray = np.concatenate([state.ray, ray])
@@ -285,24 +290,27 @@ def add_features(
 
 def keep_features(state: State, keep: NDArray[np.bool_]) -> None:
     """The others are forgotten; what they taught of the rest stays."""
-    _keep_columns(state, np.r_[np.ones(state.features_at, bool), keep, np.repeat(keep, 2)])
+    if keep.all():
+        return
+    _keep_columns(state, np.concatenate([np.ones(state.features_at, bool), keep]))
     state.ids, state.host = state.ids[keep], state.host[keep]
-    state.ray, state.rho, state.lasting = state.ray[keep], state.rho[keep], state.lasting[keep]
+    state.ray, state.rho = state.ray[keep], state.rho[keep]
 
 
 def drop_keyframes(state: State, keyframes: I64) -> None:
     """These ids, with the features that they host."""
     leave = np.isin(state.keyframes, keyframes)
-    keep_features(state, ~leave[state.host])
-    features = np.ones(3 * len(state.ids), bool)
-    _keep_columns(state, np.r_[np.ones(CORE, bool), np.repeat(~leave, 6), features])
-    state.host = (np.cumsum(~leave) - 1)[state.host]
+    if not leave.any():
+        return
+    keep = ~leave[state.host]
+    _keep_columns(state, np.concatenate([np.ones(CORE, bool), np.repeat(~leave, 6), keep]))
+    state.ids, state.ray, state.rho = state.ids[keep], state.ray[keep], state.rho[keep]
+    state.host = (np.cumsum(~leave) - 1)[state.host[keep]]
     state.keyframes, state.poses = state.keyframes[~leave], state.poses[~leave]
 
 
 def _keep_columns(state: State, keep: NDArray[np.bool_]) -> None:
-    if not keep.all():
-        state.cov = square(state.cov, np.flatnonzero(keep))
+    state.cov = square(state.cov, np.flatnonzero(keep))
 
 
 def square(matrix: F64, which: I64) -> F64:
@@ -310,16 +318,12 @@ def square(matrix: F64, which: I64) -> F64:
     return matrix.take(which, axis=0).take(which, axis=1)
 
 
-def _widened(cov: F64, gaps: tuple[tuple[int, int], ...]) -> F64:
-    """With so many new rows and columns of zeros before column `at`, for each (at, how many) in order."""
-    n, more = len(cov), sum(count for _, count in gaps)
+def _widened(cov: F64, at: int, more: int) -> F64:
+    """With so many new rows and columns of zeros before number `at`."""
+    n = len(cov)
     out = np.zeros((n + more, n + more))
-    ends = [0, *(at for at, _ in gaps), n]
-    by = np.cumsum([0, *(count for _, count in gaps)]).tolist()
-    parts = [(slice(a, b), slice(a + d, b + d)) for a, b, d in zip(ends[:-1], ends[1:], by, strict=True)]
-    for old_rows, rows in parts:
-        for old_columns, columns in parts:
-            out[rows, columns] = cov[old_rows, old_columns]
+    out[:at, :at], out[:at, at + more :] = cov[:at, :at], cov[:at, at:]
+    out[at + more :, :at], out[at + more :, at + more :] = cov[at:, :at], cov[at:, at:]
     return out
 
 
@@ -357,7 +361,7 @@ def _between(state: State, a: slice, b: slice) -> F64:
 def scale_sigma(state: State) -> float:
     """Of the scale of what is seen, relative: of the best estimate of an error that all inverse depths share;
     inf without any."""
-    at = slice(state.features_at, state.lasting_at)
+    at = slice(state.features_at, state.size)
     P = state.cov[at, at]
     known = float(state.rho @ np.linalg.solve(P, state.rho)) if len(P) else 0.0
     return float(np.inf) if known <= 0 else known**-0.5

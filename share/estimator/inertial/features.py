@@ -13,8 +13,7 @@ from share.types import F32, F64, I64, U8
 from share.vision import patches
 from share.vision.patches import Patches
 
-_NEW, _YOUNG = 4, 10  # frames
-_FEW = 40  # features, of which none waits for its turn
+_YOUNG = 10  # frames
 _LATELY = 0.2  # of a residual that is added to a lag
 _RUN_PX, _UNUSUAL = 0.5, 5.0  # a lag of this size, and so many times the least ones, is a motion of its own
 _FEWEST = 12  # features that say something of each other
@@ -68,25 +67,18 @@ def runaways(looks: Looks, which: I64, residual: F64) -> NDArray[np.bool_]:
     """
     if len(which) < _FEWEST:
         return np.zeros(len(which), bool)
-    far = np.linalg.norm(looks.lag[which], axis=1)
-    still = far <= np.quantile(far, 0.25)
+    lag, quarter = looks.lag[which], len(which) // 4
+    still = np.argpartition(np.hypot(lag[:, 0], lag[:, 1]), quarter)[: quarter + 1]
     own = residual - np.median(residual[still], axis=0)
-    looks.lag[which] += _LATELY * (own - looks.lag[which])
-    far = np.linalg.norm(looks.lag[which], axis=1)
-    out: NDArray[np.bool_] = far > max(_RUN_PX, _UNUSUAL * float(np.quantile(far, 0.25)))
+    looks.lag[which] = lag = lag + _LATELY * (own - lag)
+    far = np.hypot(lag[:, 0], lag[:, 1])
+    out: NDArray[np.bool_] = far > max(_RUN_PX, _UNUSUAL * float(np.partition(far, quarter)[quarter]))
     return out
-
-
-def heard(looks: Looks) -> NDArray[np.bool_]:
-    """Which (N,) the filter hears in an image: new ones always, others in every second. What is wrong with a
-    sight is the same in the next one."""
-    out: NDArray[np.bool_] = (looks.age < _NEW) | (turn(looks) % 2 == 0)
-    return out | (len(out) < _FEW)
 
 
 def seen_twice(looks: Looks) -> NDArray[np.bool_]:
     """Which of these a second camera is asked for: young ones always, for their depth, others by turns."""
-    out: NDArray[np.bool_] = heard(looks) & ((looks.age < _YOUNG) | (turn(looks) % 4 == 0))
+    out: NDArray[np.bool_] = (looks.age < _YOUNG) | (turn(looks) % 4 == 0)
     return out
 
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from share.config import InertialConfig
+from share.estimator.inertial import ekf
+from share.estimator.inertial.state import State
 from share.types import F64
 
 _OVER_S, _LEAST_S = 5.0, 1.0  # averaged over; of frames, before anything is said
@@ -66,3 +69,9 @@ class Straying:
     def certain(self) -> bool:
         """True where it has gone on for too long."""
         return self._frames >= _ASTRAY or self._refused_s > _REFUSED_S
+
+
+def trusted(s: State, config: InertialConfig) -> bool:
+    """Finite, no faster than a person or robot can be, and not gone too far unseen."""
+    finite = np.isfinite(s.T).all() and np.isfinite(s.v).all() and np.isfinite(s.cov).all()
+    return bool(finite and np.linalg.norm(s.v) < config.max_speed_m_s and ekf.drift_m(s) < config.lost_m)

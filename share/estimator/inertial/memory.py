@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from share.columns import Columns
+from share.estimator.inertial import observe
 from share.estimator.inertial.features import Looks
 from share.estimator.inertial.state import State
 from share.geometry import se3
+from share.geometry.camera import Camera
 from share.types import F64, I64
 
 _KNOWN = 0.1  # relative sigma of an inverse depth worth remembering
@@ -34,53 +37,65 @@ class Memory:
 
     def __init__(self) -> None:
         self._of: dict[int, Asleep] = {}
+        self._new: list[tuple[I64, Asleep]] = []  # ids of their hosts; sorted only where somebody asks
 
     def sleep(self, state: State, looks: Looks, which: I64) -> None:
         """Remember features number `which` of the state if their depth is known."""
         sigma = _FORGETFUL * np.sqrt(state.rho_variance[which])
         known = (sigma < _KNOWN * np.abs(state.rho[which])) | (sigma < 0.003)
         known &= looks.age[which] >= 5
-        for host in np.unique(state.host[which[known]]):
-            mine = known & (state.host[which] == host)
-            part = which[mine]
-            asleep = Asleep(
-                state.ids[part],
-                state.host[part],
-                state.ray[part],
-                state.rho[part],
-                sigma[mine],
-                looks.take(part),
-            )
-            key = int(state.keyframes[host])
-            old = self._of.get(key)
-            asleep = asleep if old is None else old.join(asleep)
-            best = np.argsort(asleep.sigma, kind="stable")[:_MOST]
-            self._of[key] = asleep.take(np.sort(best))
+        part = which[known]
+        if len(part):
+            hosts, looked = state.host[part], looks.take(part)
+            asleep = Asleep(state.ids[part], hosts, state.ray[part], state.rho[part], sigma[known], looked)
+            self._new.append((state.keyframes[hosts], asleep))
 
-    def has(self, keyframe: int) -> bool:
-        return keyframe in self._of
+    def _sort(self) -> None:
+        """By keyframe, the best of each."""
+        if not self._new:
+            return
+        keys = np.concatenate([keys for keys, _ in self._new])
+        first, *others = (asleep for _, asleep in self._new)
+        new, self._new = first.join(*others), []
+        for key in np.unique(keys).tolist():
+            mine, old = new.take(keys == key), self._of.get(key)
+            asleep = mine if old is None else old.join(mine)
+            if len(asleep.ids) > _MOST:
+                best = np.argsort(asleep.sigma, kind="stable")[:_MOST]
+                asleep = asleep.take(np.sort(best))
+            self._of[key] = asleep
+
+    def has(self, keyframes: I64) -> NDArray[np.bool_]:
+        """Of which keyframes (K,) there are any."""
+        self._sort()
+        return np.isin(keyframes, list(self._of))
 
     def forget(self, keyframes: I64) -> None:
+        self._sort()
         for keyframe in keyframes.tolist():
             self._of.pop(keyframe, None)
 
-    def near(self, state: State, max_m: float, max_rad: float, most: int) -> Asleep | None:
-        """Those of the keyframes that look from about here, the nearest ones first until there are `most`;
-        their hosts are numbers in the state. None where there are none."""
+    def near(self, state: State, camera: Camera, max_m: float, max_rad: float, most: int) -> Asleep | None:
+        """Those that the camera should see of the keyframes that look from about here, the nearest ones first
+        until there are `most`; their hosts are numbers in the state. None where there are none."""
+        self._sort()
         (far,), (turned,) = se3.apart(state.T[None], state.poses)
-        out: Asleep | None = None
+        out: list[Asleep] = []
         for k in np.argsort(far + turned, kind="stable").tolist():
             mine = self._of.get(int(state.keyframes[k]))
             if mine is None or far[k] >= max_m or turned[k] >= max_rad:
                 continue
-            mine = replace(mine, host=np.full(len(mine.ids), k))
-            out = mine if out is None else out.join(mine)
-            if len(out.ids) >= most:
+            mine = mine.take(observe.in_view(state, camera, k, mine.ray, mine.rho))
+            if len(mine.ids) == 0:
+                continue
+            out.append(replace(mine, host=np.full(len(mine.ids), k)))
+            if sum(len(one.ids) for one in out) >= most:
                 break
-        return out
+        return out[0].join(*out[1:]) if out else None
 
     def wake(self, ids: I64) -> None:
         """These are features of the state again."""
+        self._sort()
         for keyframe, asleep in list(self._of.items()):
             keep = ~np.isin(asleep.ids, ids)
             if not keep.any():

@@ -9,11 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from share.columns import Columns
 from share.estimator.inertial.state import State
 from share.geometry import se3
-from share.geometry.camera import rays
+from share.geometry.camera import Camera, rays
 from share.types import F64, I64
 
 _NEAREST = 0.02  # homogeneous depth below which nothing is seen
@@ -31,47 +32,99 @@ class Prediction(Columns):
     by_rho: F64
 
 
-def predict(state: State, which: I64, T_right_left: F64 | None = None) -> Prediction:
-    """What cam0, or with T_right_left (4, 4) cam1, should see of the features at indices `which` (N,)."""
-    f, rho = rays(state.ray[which]), state.rho[which]
-    T_odom_host = state.poses[state.host[which]] @ state.T_body_cam
-    R_odom_host, t_odom_host = T_odom_host[:, :3, :3], T_odom_host[:, :3, 3]
+def predict(
+    state: State, which: I64, T_right_left: F64 | None = None, right: NDArray[np.bool_] | None = None
+) -> Prediction:
+    """What cam0 should see of the features at indices `which` (N,). With T_right_left (4, 4) cam1, or only of
+    those that are `right` (N,)."""
+    f, rho, host = rays(state.ray[which]), state.rho[which], state.host[which]
+    T_odom_host = state.poses @ state.T_body_cam
     T_cam_odom = se3.inverse(state.T @ state.T_body_cam)
+    R_odom_host, t_odom_host = T_odom_host[host, :3, :3], T_odom_host[host, :3, 3]
     R, t = T_cam_odom[:3, :3], T_cam_odom[:3, 3]
     q_odom = (R_odom_host @ f[:, :, None])[:, :, 0] + rho[:, None] * t_odom_host
     q = q_odom @ R.T + rho[:, None] * t
-    by_pose = -lever(R, q_odom, rho)
-    by_extrinsic = lever(R @ R_odom_host, f, rho) - lever(np.eye(3), q, rho)
     by_rho = t_odom_host @ R.T + t
-    if T_right_left is not None:
-        turn, shift = T_right_left[:3, :3], T_right_left[:3, 3]
-        q, by_rho = q @ turn.T + rho[:, None] * shift, by_rho @ turn.T + shift
-        by_pose, by_extrinsic = turn @ by_pose, turn @ by_extrinsic
-    uv, D = _projected(q)
-    return Prediction(uv, D @ by_pose, D @ by_extrinsic, (D @ by_rho[:, :, None])[:, :, 0])
+    uv, D, by_rho = _in_camera(q, rho, by_rho, T_right_left, right)
+    DR = D @ R
+    by_extrinsic = lever(DR @ R_odom_host, f, rho) - lever(D, q, rho)
+    return Prediction(uv, -lever(DR, q_odom, rho), by_extrinsic, by_rho)
 
 
-def warp(state: State, which: I64, spread: F64, slant: F64, T_right_left: F64 | None = None) -> F64:
-    """(N, 2, 2) how normalised coordinates change with the pixel of the host: what a patch round a feature
-    looks like. spread (N, 2, 2): d ray / d px of the host. slant (N, 2): d rho / d px, of the surface."""
-    T = hosts_in_camera(state, which)
-    if T_right_left is not None:
-        T = T_right_left @ T
+@dataclass(frozen=True, eq=False)
+class Aim(Columns):
+    """Where to look for N features, and as what: uv (N, 2) normalised coordinates, NaN behind the camera;
+    warp (N, 2, 2), how these change with the pixel of the host: what a patch looks like; by_rho (N, 2), with
+    inverse depth."""
+
+    uv: F64
+    warp: F64
+    by_rho: F64
+
+
+def aim(
+    state: State,
+    which: I64,
+    spread: F64,
+    slant: F64,
+    T_right_left: F64 | None = None,
+    right: NDArray[np.bool_] | None = None,
+) -> Aim:
+    """As `predict`. spread (N, 2, 2): d ray / d px of the host. slant (N, 2): d rho / d px, of the
+    surface."""
+    rho, T = state.rho[which], hosts_in_camera(state, which)
     R, t = T[:, :3, :3], T[:, :3, 3]
-    q = (R @ rays(state.ray[which])[:, :, None])[:, :, 0] + state.rho[which, None] * t
-    _, D = _projected(q)
-    out: F64 = D @ (R[:, :, :2] @ spread + t[:, :, None] * slant[:, None, :])
-    return out
+    q = (R @ rays(state.ray[which])[:, :, None])[:, :, 0] + rho[:, None] * t
+    uv, D, by_rho = _in_camera(q, rho, t, T_right_left, right)
+    return Aim(uv, (D @ R)[:, :, :2] @ spread + by_rho[:, :, None] * slant[:, None, :], by_rho)
+
+
+def _in_camera(
+    q: F64, rho: F64, by_rho: F64, T_right_left: F64 | None, right: NDArray[np.bool_] | None
+) -> tuple[F64, F64, F64]:
+    """Of points q (N, 3) in cam0, which inverse depth moves by by_rho (N, 3): uv (N, 2), its derivative
+    (N, 2, 3) by q, and (N, 2) by inverse depth."""
+    if T_right_left is None:
+        uv, D = _projected(q)
+        return uv, D, (D @ by_rho[:, :, None])[:, :, 0]
+    turn, shift = T_right_left[:3, :3], T_right_left[:3, 3]
+    if right is None:
+        uv, D = _projected(q @ turn.T + rho[:, None] * shift)
+        D_q = D @ turn
+        return uv, D_q, (D_q @ by_rho[:, :, None])[:, :, 0] + D @ shift
+    there = q.copy()
+    there[right] = q[right] @ turn.T + rho[right, None] * shift
+    uv, D = _projected(there)
+    by = D[right] @ shift
+    D[right] = D[right] @ turn
+    moved = (D @ by_rho[:, :, None])[:, :, 0]
+    moved[right] += by
+    return uv, D, moved
+
+
+def in_view(state: State, camera: Camera, keyframe: int, ray: F64, rho: F64) -> NDArray[np.bool_]:
+    """Which of what keyframe number `keyframe` sees on rays (N, 2), inverse depth rho (N,), cam0 has in
+    view."""
+    T = se3.inverse(state.T @ state.T_body_cam) @ state.poses[keyframe] @ state.T_body_cam
+    uv, _ = _projected(rays(ray) @ T[:3, :3].T + rho[:, None] * T[:3, 3])
+    return np.asarray(camera.inside(np.nan_to_num(camera.distort(uv), nan=-1e6)), bool)
 
 
 def hosts_in_camera(state: State, which: I64 | slice = slice(None)) -> F64:
     """T_cam_host (N, 4, 4): from cam0 of the hosts of features `which` (N,), all by default, to cam0 now."""
-    return se3.inverse(state.T @ state.T_body_cam) @ state.poses[state.host[which]] @ state.T_body_cam
+    T_cam_host = se3.inverse(state.T @ state.T_body_cam) @ state.poses @ state.T_body_cam
+    out: F64 = T_cam_host[state.host[which]]
+    return out
 
 
-def lever(R: F64, q: F64, rho: F64) -> F64:
-    """R [-hat(q) | rho I], (N, 3, 6): what Exp(xi) does to q (N, 3), seen through R (3, 3) or (N, 3, 3)."""
-    return np.concatenate([-R @ se3.hat(q), R * rho[:, None, None]], axis=2)
+def lever(D: F64, q: F64, rho: F64) -> F64:
+    """D [-hat(q) | rho I], (N, K, 6): what Exp(xi) does to q (N, 3), seen through D (N, K, 3) or (K, 3)."""
+    out = np.empty((len(q), D.shape[-2], 6))
+    x, y, z = q[:, 0, None], q[:, 1, None], q[:, 2, None]
+    a, b, c = D[..., 0], D[..., 1], D[..., 2]
+    out[:, :, 0], out[:, :, 1], out[:, :, 2] = y * c - z * b, z * a - x * c, x * b - y * a
+    np.multiply(D, rho[:, None, None], out=out[:, :, 3:])
+    return out
 
 
 def _projected(q: F64) -> tuple[F64, F64]:

@@ -35,6 +35,13 @@ _FARTHEST = 1e-3  # 1/m
 _FLOOR = np.repeat([1e-4, 2e-4], 3) ** 2  # rad^2, m^2
 
 
+def as_expected(residual: F64, sigma: float, lasting: float) -> bool:
+    """Whether nearly all features are where the IMU alone has them, so that nobody needs to be asked.
+    residual (M, 2), sigma and lasting of each coordinate."""
+    off = (residual**2).sum(axis=1) / (sigma**2 + lasting**2)
+    return bool((off < _AGREES**2).mean() > 1 - _SPLIT)
+
+
 def of_the_room(
     state: State, rows: Sight, px: F32, proven: NDArray[np.bool_], camera: Camera
 ) -> NDArray[np.bool_]:
@@ -86,10 +93,9 @@ class _Fit:
         prior = ekf.motion_since(state) + np.diag(_FLOOR)
         J = rows.core[:, :, POSE] @ se3.adjoint(state.T) @ np.linalg.cholesky(prior)
         rho_variance = state.rho_variance[rows.which, None, None]
-        rho = rows.by_rho[:, :, None] * rows.by_rho[:, None, :] * rho_variance
-        lasts = state.lasting_at + 2 * rows.which[:, None] + (0, 1)
-        own: F64 = rho + state.cov[lasts[:, :, None], lasts[:, None, :]]
-        white = np.linalg.inv(np.linalg.cholesky(own + rows.sigma[:, None, None] ** 2 * np.eye(2)))
+        own: F64 = rows.by_rho[:, :, None] * rows.by_rho[:, None, :] * rho_variance
+        seen = (rows.sigma**2 + rows.lasting**2)[:, None, None] * np.eye(2)
+        white = np.linalg.inv(np.linalg.cholesky(own + seen))
         self._J, self._r = white @ J, (white @ rows.residual[:, :, None])[:, :, 0]
 
     @property

@@ -36,7 +36,7 @@ class Pivot:
         """Whatever has been learnt since the last call."""
         _, was, now = np.intersect1d(self._keyframes, s.keyframes, return_indices=True)
         if len(now):
-            turned = se3.so3_log(s.poses[now, :3, :3] @ self._R[was].swapaxes(1, 2)).mean(axis=0)
+            turned = _small_turn((s.poses[now, :3, :3] @ self._R[was].swapaxes(1, 2)).mean(axis=0))
             turned[_UP] = 0.0  # about the vertical nothing is ever learnt; what turns keeps its place
             arm = s.T[:3, 3] - self._about
             self.shift = self.shift - (arm - se3.so3_exp(-turned) @ arm)
@@ -49,4 +49,11 @@ class Pivot:
         return out
 
     def _remember(self, s: State) -> None:
-        self._keyframes, self._R = s.keyframes.copy(), s.poses[:, :3, :3].copy()
+        self._keyframes, self._R = s.keyframes, s.poses[:, :3, :3]
+
+
+def _small_turn(R: F64) -> F64:
+    """rad (3,) of a rotation R (3, 3) by less than a right angle: half of what R - R' has is its sine."""
+    sines = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+    sine = float(np.linalg.norm(sines))
+    return sines * (np.arcsin(min(sine, 1.0)) / sine) if sine > 1e-9 else sines

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.config import InertialConfig
-from share.estimator.inertial import ekf, features, find, observe
+from share.estimator.inertial import ekf, features, find, observe, parsac
 from share.estimator.inertial.features import Looks
 from share.estimator.inertial.find import Sought
 from share.estimator.inertial.guess import Guess, guess
@@ -17,7 +17,7 @@ from share.estimator.inertial.state import State
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
 from share.types import F32, F64, I64, U8, Footing, Frame
-from share.vision import corners, epipolar
+from share.vision import corners, epipolar, patches
 from share.vision.depth import from_depth_camera, from_stereo
 from share.vision.view import measures_depth
 
@@ -28,7 +28,7 @@ _SAME_PLACE_PX = 2.0  # of disparity
 _SHUN_FRAMES = 30  # for which nothing new is sought where something moved by itself
 _CROWD, _WARY_FRAMES = 5, 60  # features at a time that went astray: somebody moves in the view
 _PROBATION_S, _UNPROVEN = 0.34, 5.0  # in which a feature proves itself, and times its sigma until then
-_SLANT_EVERY = 2  # frames in which a feature's slant is learnt
+_SLANT_EVERY = 4  # frames in which a feature's slant is learnt
 _FARTHEST, _NEAREST_M = 0.03, 0.2  # 1/m; m
 _VAGUE = 0.05  # 1/m, sigma; half a pixel a frame of somebody who walks
 _SURE = 0.1  # relative sigma of an inverse depth that others are told
@@ -41,30 +41,21 @@ class Scene:
     def __init__(self, state: State, rig: Rig, config: InertialConfig) -> None:
         self.state, self._rig, self._config = state, rig, config
         self.looks: Looks = features.none()
-        self._lasting = config.lasting_px / rig.cam0.focal
         self._memory = Memory()
         self._shunned: list[F32] = []
-        self._measured = True
         self._probation = 0  # frames that _PROBATION_S are
         self._wary = 0  # frames for which new features have to prove themselves
         self._next_feature = self._next_keyframe = 0
         self._last: tuple[Sought, NDArray[np.bool_], I64] | None = None  # frame: sought, believed, their ids
 
-    def add_keyframe(self, rate: F64) -> None:
-        """The frame just tracked: its pose."""
+    def add_keyframe(self, rate: F64) -> int:
+        """The frame just tracked: its pose. Its id."""
         ekf.add_keyframe(self.state, self._next_keyframe, rate)
         self._next_keyframe += 1
+        return self._next_keyframe - 1
 
-    def replenish(self, frame: Frame, rate: F64) -> None:
-        """The newest keyframe, made of `frame`: features seen from about here before, and new ones."""
-        self._wake(frame, rate)
-        self._add_features(frame, host=len(self.state.keyframes) - 1)
-        self._forget()
-
-    def step(self, seconds: float, measured: bool) -> None:
-        """Since the frame before. measured: an IMU told how the body turned meanwhile."""
-        self._measured = measured
-        ekf.fade(self.state, seconds, self._lasting, self._config.lasting_s)
+    def step(self, seconds: float) -> None:
+        """Since the frame before."""
         self._probation = int(_PROBATION_S / max(seconds, 1e-3))
 
     def seen(self, left: Sought, seen: NDArray[np.bool_]) -> None:
@@ -78,7 +69,8 @@ class Scene:
         self._shun(left.px[left.astray])
         self._wary = _WARY_FRAMES if left.astray.sum() >= _CROWD else max(self._wary - 1, 0)
         now = np.flatnonzero(seen & (features.turn(self.looks) % _SLANT_EVERY == 0))
-        features.learn_slant(self.looks, now, left.error[now], left.along[now])
+        error = patches.unexplained(self.looks.patch.take(now), left.samples[now], left.shift[now])
+        features.learn_slant(self.looks, now, error, left.along[now])
         self._memory.sleep(self.state, self.looks, np.flatnonzero(~left.found))
         self.keep(seen)
         self._last = left, seen, self.state.ids
@@ -118,30 +110,59 @@ class Scene:
         """No new feature near px (N, 2) for a while: there goes somebody."""
         self._shunned = [*self._shunned[-_SHUN_FRAMES:], px]
 
-    def sight(
-        self, sought: Sought, rate: F64, T_right_left: F64 | None = None, anew: bool = False
-    ) -> ekf.Sight:
-        """Rows for the filter of the features that were found in cam0, or with T_right_left in cam1.
-        anew: the state has moved since they were sought."""
-        camera = self._rig.cam0 if T_right_left is None else self._rig.cam1
-        assert camera is not None
-        which = np.flatnonzero(sought.found & ~sought.astray)
-        uv = camera.normalise(sought.px[which].astype(np.float64), sought.prediction.uv[which])
-        sigma = np.full(len(which), self._config.sigma_px / camera.focal)
-        seen = observe.predict(self.state, which, T_right_left) if anew else sought.prediction.take(which)
-        return ekf.sight(self.state, which, seen, uv, sigma, rate)
+    def measured(self, sought: Sought) -> F64:
+        """uv (N, 2) where cam0 shows the features; NaN where they were not found."""
+        out, found = np.full((len(sought.found), 2), np.nan), sought.found
+        out[found] = self._rig.cam0.normalise(sought.px[found].astype(np.float64), sought.uv[found])
+        return out
 
-    def heard(self, first: ekf.Sight, *others: ekf.Sight) -> ekf.Sight:
-        """What the filter hears of all that was seen in a frame's images, sorted by host."""
-        rows = self._with_doubt(first.join(*others))
-        if self._measured:  # else nothing but images leads from one to the next
-            rows = rows.take(features.heard(self.looks)[rows.which])
-        return rows.take(np.argsort(rows.host, kind="stable"))
+    def mark_movers(self, sought: Sought, uv: F64, rate: F64) -> None:
+        """What moves by itself is astray; looked for only where the IMU alone does not explain the image. uv
+        (N, 2): of `measured`."""
+        which = np.flatnonzero(sought.found)
+        residual = uv[which] - sought.uv[which]
+        camera, config = self._rig.cam0, self._config
+        if len(which) == 0 or parsac.as_expected(residual * camera.focal, config.sigma_px, config.lasting_px):
+            return
+        rows = self.sight(uv, which, rate)
+        fixed = parsac.of_the_room(self.state, rows, sought.px[which], self.proven(which), camera)
+        sought.astray[which[~fixed]] = True
+
+    def sight(self, uv: F64, which: I64, rate: F64) -> ekf.Sight:
+        """Rows for the filter of features `which` (M,) of those at uv (N, 2) in cam0."""
+        return self._rows(which, uv[which], None, rate)
+
+    def heard(self, sought: Sought, uv: F64, rate: F64) -> ekf.Sight:
+        """Rows of all that was seen in a frame's images, sorted by host; as the state is now. uv (N, 2): of
+        `measured`."""
+        heard = sought.found & ~sought.astray
+        which, right = np.flatnonzero(heard), None
+        at = uv[which]
+        if (there := sought.right) is not None and self._rig.cam1 is not None:
+            both = heard[there.which]
+            more = there.which[both]
+            seen = self._rig.cam1.normalise(there.px[both].astype(np.float64), there.uv[both])
+            right = np.arange(len(which) + len(more)) >= len(which)
+            which, at = np.concatenate([which, more]), np.concatenate([at, seen])
+        order = np.argsort(self.state.host[which], kind="stable")
+        right = None if right is None else right[order]
+        return self._with_doubt(self._rows(which[order], at[order], right, rate))
+
+    def _rows(self, which: I64, uv: F64, right: NDArray[np.bool_] | None, rate: F64) -> ekf.Sight:
+        """Of features `which` (M,) seen at uv (M, 2), in cam1 where `right` (M,) says so."""
+        T = None if right is None else self._rig.T_cam1_cam0
+        focal = np.full(len(which), self._rig.cam0.focal)
+        if right is not None and self._rig.cam1 is not None:
+            focal[right] = self._rig.cam1.focal
+        seen = observe.predict(self.state, which, T, right)
+        sigma, lasting = self._config.sigma_px / focal, self._config.lasting_px / focal
+        return ekf.sight(self.state, which, seen, uv, sigma, lasting, rate)
 
     def _with_doubt(self, rows: ekf.Sight) -> ekf.Sight:
         """While somebody moves in the view, what is new in it counts little."""
         unproven = (self._wary > 0) & ~self.proven(rows.which)
-        return replace(rows, sigma=np.where(unproven, _UNPROVEN, 1.0) * rows.sigma)
+        times = np.where(unproven, _UNPROVEN, 1.0)
+        return replace(rows, sigma=times * rows.sigma, lasting=times * rows.lasting)
 
     def proven(self, which: I64) -> NDArray[np.bool_]:
         """Which of features `which` (M,) have long done as they should."""
@@ -153,10 +174,29 @@ class Scene:
         out: NDArray[np.bool_] = self.state.rho_variance > _VAGUE**2
         return out
 
-    def _add_features(self, frame: Frame, host: int) -> None:
-        config, camera, s = self._config, self._rig.cam0, self.state
-        taken = np.concatenate([self.looks.px, *self._shunned])
-        px = corners.detect(frame.image0, taken, config.features - len(s.ids), config.spacing_px)
+    def taken(self) -> F32:
+        """px (M, 2) of the frame just tracked, near which nothing new is sought."""
+        return np.concatenate([self.looks.px, *self._shunned])
+
+    def corners(self, frame: Frame, taken: F32) -> F32:
+        """px (N, 2) of what may become features of a keyframe, away from those `taken` (M, 2), the most
+        wanted first."""
+        more = self._config.features if self._room() else 0
+        return corners.detect(frame.image0, taken, more, self._config.spacing_px)
+
+    def admit(self, frame: Frame, keyframe: int, px: F32) -> None:
+        """New features at px (N, 2) of the frame that is keyframe number `keyframe`; the last frame may be a
+        later one. Keyframes that nothing is left of make room."""
+        host, room = int(np.flatnonzero(self.state.keyframes == keyframe)[0]), self._room()
+        self._add_features(frame, host, px[:room])
+        self._forget()
+
+    def _room(self) -> int:
+        """For so many features more."""
+        return max(self._config.features - len(self.state.ids), 0)
+
+    def _add_features(self, frame: Frame, host: int, px: F32) -> None:
+        camera, s = self._rig.cam0, self.state
         ray = camera.normalise(px.astype(np.float64))
         far = self._inverse_depths(frame, px, ray)
         looks = features.looks(frame.image0, camera, px, ray, np.nan_to_num(far.rho))
@@ -164,9 +204,11 @@ class Scene:
         ids = np.arange(self._next_feature, self._next_feature + int(good.sum()))
         self._next_feature += len(ids)
         far = far.take(good)
-        hosts = np.full(len(ids), host)
-        ekf.add_features(s, ids, hosts, ray[good], far.rho, far.sigma, 0.0, far.like, far.common)
+        before = len(s.ids)
+        ekf.add_features(s, ids, np.full(len(ids), host), ray[good], far.rho, far.sigma, far.like, far.common)
         self.looks = self.looks.join(looks.take(good))
+        here = camera.distort(observe.predict(s, np.arange(before, before + len(ids))).uv)
+        self.looks.px[before:] = np.where(np.isnan(here), px[good], here)  # in the last frame
 
     def _inverse_depths(self, frame: Frame, px: F32, ray: F64) -> Guess:
         """Of new features, NaN unknown: measured, or else guessed."""
@@ -186,27 +228,31 @@ class Scene:
         """m (N,), NaN where the pair does not agree on one: the clearest place on each line, then to a
         fraction of a pixel."""
         about = epipolar.search(image0, image1, self._rig, px, ray)
-        z = from_stereo(image0, image1, self._rig, px, ray, about)
-        off_px = np.abs(1 / z - 1 / about) * self._rig.cam0.focal * self._rig.baseline
-        return np.where(off_px < _SAME_PLACE_PX, z, np.nan)
+        out, clear = np.full(len(px), np.nan), np.flatnonzero(~np.isnan(about))
+        z = from_stereo(image0, image1, self._rig, px[clear], ray[clear], about[clear])
+        off_px = np.abs(1 / z - 1 / about[clear]) * self._rig.cam0.focal * self._rig.baseline
+        out[clear] = np.where(off_px < _SAME_PLACE_PX, z, np.nan)
+        return out
 
-    def _wake(self, frame: Frame, rate: F64) -> None:
-        """Features seen from about here before, where they lie as near as the filter knows."""
+    def wake(self, frame: Frame, rate: F64) -> F32:
+        """Features seen from about here before, where the frame just tracked shows them as near as the filter
+        knows: px (M, 2)."""
         s, config, fresh = self.state, self._config, len(self.state.ids)
-        asleep = self._memory.near(s, config.recall_m, config.recall_rad, config.recall)
+        asleep = self._memory.near(s, self._rig.cam0, config.recall_m, config.recall_rad, config.recall)
         if asleep is None:
-            return
-        ekf.add_features(s, asleep.ids, asleep.host, asleep.ray, asleep.rho, asleep.sigma, self._lasting)
+            return np.zeros((0, 2), np.float32)
+        ekf.add_features(s, asleep.ids, asleep.host, asleep.ray, asleep.rho, asleep.sigma)
         self.looks = self.looks.join(asleep.looks)
         good = self._recognised(frame, rate, fresh)
         self._memory.wake(s.ids[good][fresh:])
         self.keep(good)
+        return self.looks.px[fresh:]
 
     def _recognised(self, frame: Frame, rate: F64, fresh: int) -> NDArray[np.bool_]:
         """Of features from number `fresh` on, those that are found where they should be; all others."""
-        sought = find.seek(frame.image0, self._rig.cam0, self.state, self.looks, self._config, fresh=fresh)
+        sought = find.seek(frame, self._rig, self.state, self.looks, self._config, fresh)
         self.looks.px[sought.found] = sought.px[sought.found]
-        rows = self.sight(sought, rate)
+        rows = self.sight(self.measured(sought), np.flatnonzero(sought.found), rate)
         good = np.arange(len(self.state.ids)) < fresh
         if len(rows.which):
             _, S = ekf.gains(self.state, rows)
@@ -215,8 +261,9 @@ class Scene:
 
     def keep(self, keep: NDArray[np.bool_]) -> None:
         """The other features (N,) are forgotten."""
-        ekf.keep_features(self.state, keep)
-        self.looks = self.looks.take(keep)
+        if not keep.all():
+            ekf.keep_features(self.state, keep)
+            self.looks = self.looks.take(keep)
 
     def forget_asleep(self) -> None:
         """What is out of sight was remembered for nothing."""
@@ -227,7 +274,7 @@ class Scene:
         Never the newest two: others are told of the motion between them."""
         s = self.state
         busy = np.isin(np.arange(len(s.keyframes)), s.host)
-        leave = ~busy & ~np.array([self._memory.has(int(k)) for k in s.keyframes], bool)
+        leave = ~busy & ~self._memory.has(s.keyframes)
         leave[-2:] = False
         while len(s.keyframes) - leave.sum() > self._config.max_keyframes:
             left = np.flatnonzero(~leave)
@@ -237,6 +284,8 @@ class Scene:
             nearest = cost.min(axis=1) + _FAR * busy[left]
             nearest[-2:] = np.inf
             leave[left[np.argmin(nearest)]] = True
+        if not leave.any():
+            return
         self._memory.forget(s.keyframes[leave])
         self.looks = self.looks.take(~leave[s.host])
         ekf.drop_keyframes(s, s.keyframes[leave])

@@ -6,7 +6,7 @@ a turn of everything about the vertical and a shift of everything, is then the s
 error whatever the means are, so no linearisation point can make the filter believe that it saw it.
 
 Columns of the covariance: body pose 6 | velocity 3 | gyro bias 3 | accel bias 3 | T_body_cam 6 (on
-the right) | time offset 1 | keyframe poses 6 each | inverse depths 1 each | lasting errors 2 each.
+the right) | time offset 1 | keyframe poses 6 each | inverse depths 1 each.
 """
 
 from __future__ import annotations
@@ -34,8 +34,7 @@ class State:
 
     keyframes (K,) ids with poses (K, 4, 4) T_odom_body. Features: ids (N,), host (N,) index into
     keyframes, ray (N, 2) normalised coordinates in the host's cam0, by definition exact: a feature is
-    what is there; rho (N,) inverse depth along the host's axis, 1/m; lasting (N, 2) what its sights
-    have wrong that lasts, normalised coordinates. cov (22 + 6 K + 3 N, same).
+    what is there; rho (N,) inverse depth along the host's axis, 1/m. cov (22 + 6 K + N, same).
     """
 
     stamp_ns: int
@@ -52,36 +51,30 @@ class State:
     host: I64
     ray: F64
     rho: F64
-    lasting: F64
 
     @property
     def size(self) -> int:
-        return CORE + 6 * len(self.keyframes) + 3 * len(self.ids)
+        return CORE + 6 * len(self.keyframes) + len(self.ids)
 
     @property
     def features_at(self) -> int:
-        """The first feature's column, of its inverse depth."""
+        """The column of the first feature's inverse depth."""
         return CORE + 6 * len(self.keyframes)
-
-    @property
-    def lasting_at(self) -> int:
-        """The first column of the first feature's lasting error."""
-        return self.features_at + len(self.ids)
 
     @property
     def rho_variance(self) -> F64:
         """(N,) 1/m^2."""
-        return np.diag(self.cov)[self.features_at : self.lasting_at]
+        return np.diag(self.cov)[self.features_at :]
 
     def means(self) -> tuple[Any, ...]:
         """All but the covariance, for `restore`."""
         calibration = self.bg, self.ba, self.T_body_cam, self.offset_s
-        return self.T, self.v, *calibration, self.poses, self.rho, self.lasting
+        return self.T, self.v, *calibration, self.poses, self.rho
 
     def restore(self, means: tuple[Any, ...]) -> None:
         """What `means` gave. Steps of the filter replace arrays and never write into them."""
         self.T, self.v, self.bg, self.ba, self.T_body_cam, self.offset_s = means[:6]
-        self.poses, self.rho, self.lasting = means[6:]
+        self.poses, self.rho = means[6:]
 
     def keyframe(self, k: int) -> slice:
         """Columns of keyframe number k of `poses`."""
@@ -106,5 +99,4 @@ def begin(stamp_ns: int, T: F64, v: F64, bg: F64, ba: F64, T_body_cam: F64, sigm
         none,
         np.zeros((0, 2)),
         np.zeros(0),
-        np.zeros((0, 2)),
     )

@@ -19,7 +19,7 @@ from share.estimator.inertial import ekf, find, parsac
 from share.estimator.inertial.beginning import first_state, state_by_camera, unknown_bias
 from share.estimator.inertial.breaks import Doubt
 from share.estimator.inertial.features import Looks
-from share.estimator.inertial.health import Agreement, Straying
+from share.estimator.inertial.health import Agreement, Straying, trusted
 from share.estimator.inertial.imu import integrate
 from share.estimator.inertial.keyframes import Keyframes
 from share.estimator.inertial.noise import louder, shaken, without
@@ -33,7 +33,7 @@ from share.estimator.localmap import LocalMap
 from share.estimator.result import TrackResult, typical
 from share.geometry import se3
 from share.geometry.camera import ImuBias, ImuNoise, Rig
-from share.types import F64, U8, Candidate, Footing, Frame, ImuBatch, TrackState, Wait
+from share.types import F64, Candidate, Footing, Frame, ImuBatch, TrackState, Wait
 from share.vision import corners
 from share.vision.view import measures_depth
 
@@ -43,6 +43,7 @@ _GAP_NS = 250_000_000  # between frames: more than an IMU of this sort is modell
 _DOUBT = 0.02, 0.1, 0.3  # rad, m, m/s: how wrong the filter may be after it that believes nobody
 _REST_RATE, _REST_M_S = 0.03, 0.02  # rad/s of a body at rest; m/s of its velocity
 _SLOW_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to a filter that knows it moves
+_LITTLE = 0.5  # of the features that there may be: then a keyframe's come at once
 _PATIENCE = 10  # frames without a sample of the IMU, after which we begin without
 _LEVEL_RAD = np.radians(3.0)  # sigma of tilt up to which others are told what is up
 
@@ -69,8 +70,9 @@ class InertialTracker:
         self._samples = Samples()
         self._scene: Scene | None = None
         self._window: Window | None = None  # of a single camera, until its scale is known
-        self._image: U8 | None = None
+        self._last: Frame | None = None
         self._stamp_ns = 0
+        self._settled = True  # what there was to do after the last frame
         self._rate = np.zeros(3)
         self._straying = Straying(config.weak, config.blind)
         self._agreement, self._surprise = Agreement(), np.zeros(0)  # of the frame
@@ -107,25 +109,27 @@ class InertialTracker:
         self.settle()
         self._samples.add(frame.imu)
         result = self._begin(frame) if self._scene is None else self._follow(frame, self._scene)
-        self._image, self._stamp_ns = frame.image0, frame.stamp_ns
+        self._last, self._stamp_ns, self._settled = frame, frame.stamp_ns, False
         return result
 
     def keyframe(self, frame: Frame) -> Candidate:
-        """Make the frame just tracked a keyframe; call it where `track` said so. What it shows to others."""
+        """What the frame just tracked shows to others; call it where `track` said that it is a keyframe."""
         scene = self._scene
         assert scene is not None
         new_stretch, self._new_stretch = self._new_stretch, False
-        view, T_last_body, cov = self._keyframes.show(frame, scene, self._rate, new_stretch)
+        view, T_last_body, cov = self._keyframes.show(frame, scene, new_stretch)
         s, unsure = scene.state, tilt(scene.state)
         up = s.T[2, :3] if self._knows_up and unsure < _LEVEL_RAD else np.zeros(3)
         return Candidate(self._pivot.told(s.T), T_last_body, cov, up, unsure / np.sqrt(2), view, new_stretch)
 
     def settle(self) -> None:
-        """What `keyframe` left to do, half its work, and nobody waits for: new features, and the place to
-        find oneself by. For when the candidate is on its way; else the next `track` does it first."""
-        if self._scene is None:
+        """A slice of what keyframes leave to do, and nobody waits for: new features, and places to find
+        oneself by. For when the pose, and the candidate if there is one, are on their way; else the next
+        `track` does it first."""
+        if self._scene is None or self._last is None or self._settled:
             return
-        s, done = self._scene.state, self._keyframes.settle(self._scene, self._rate)
+        self._settled = True
+        s, done = self._scene.state, self._keyframes.settle(self._scene, self._last, self._rate)
         if done is not None and not self._straying.suspected:
             self._places.add_keyframe(done.frame.image0, s.T @ s.T_body_cam)
             self._places.set_view(done.view)
@@ -139,7 +143,7 @@ class InertialTracker:
         """Something failed in or after `frame`, the last: the filter may be in any state."""
         self._window = None
         self._lose(frame)
-        self._image, self._stamp_ns = frame.image0, frame.stamp_ns
+        self._last, self._stamp_ns = frame, frame.stamp_ns
 
     @property
     def doubted(self) -> int:
@@ -169,7 +173,7 @@ class InertialTracker:
         doubted = doubt is not None and bool(doubt.axes.any())
         since_s = (frame.stamp_ns - self._stamp_ns) * 1e-9
         measured = self._propagate(frame, scene.state, imu)
-        scene.step(since_s, measured)
+        scene.step(since_s)
         left, seen = self._look(frame, scene)
         heard = imu is not None and not (doubted and self._ready)
         if measured and self._window is None:
@@ -181,7 +185,7 @@ class InertialTracker:
         textured = count >= self._config.blind or corners.count(frame.image0) >= self._config.weak
         self._straying.add(textured, left.due(self._rig.cam0), int(left.found.sum()), count, since_s)
         state = self._judge(scene.state, count, heard)
-        if not self._trusted(scene.state) or self._straying.certain:
+        if not trusted(scene.state, self._config) or self._straying.certain:
             return self._lose(frame)
         if state is TrackState.LOST:
             return TrackResult(state, None)
@@ -192,7 +196,7 @@ class InertialTracker:
             if not self._solved(frame, scene, wanted):
                 return self._initialising(scene.state)
             state, wanted = TrackState.OK, True
-        told = self._told(scene.state, state, wanted, count)
+        told = self._told(frame, scene, state, wanted, count)
         return replace(told, found=int((left.found | seen).sum()), surprise=typical(self._surprise))
 
     def _solved(self, frame: Frame, scene: Scene, anchored: bool) -> bool:
@@ -207,33 +211,28 @@ class InertialTracker:
             return False
         return window.solved(scene, imu, anchored) and converged(s)
 
-    def _told(self, s: State, state: TrackState, wanted: bool, count: int) -> TrackResult:
+    def _told(self, frame: Frame, scene: Scene, state: TrackState, wanted: bool, count: int) -> TrackResult:
+        s = scene.state
         first, self._ready, self._window = not self._ready, True, None
         new_stretch = first and self._new_stretch
         if first:
             self._pivot.begin(s, self._begun_at, new_stretch)
         else:
             self._pivot.after(s)
-        sound = self._agreement.sound
-        return TrackResult(state, self._pose(s), wanted or first, count, new_stretch, ekf.pose_cov(s), sound)
+        pose, cov = self._pose(s), ekf.pose_cov(s)
+        shown = first or (wanted and self._keyframes.may_show(frame.stamp_ns))
+        if wanted or first:
+            self._keyframes.begin(frame, scene, self._rate, count < _LITTLE * self._config.features)
+        return TrackResult(state, pose, shown, count, new_stretch, cov, self._agreement.sound)
 
     def _look(self, frame: Frame, scene: Scene) -> tuple[find.Sought, NDArray[np.bool_]]:
         """Where cam0 shows the features, and which (N,) were seen and believed."""
-        s, looks = scene.state, scene.looks
-        camera = self._rig.cam0
-        left = find.seek(frame.image0, camera, s, looks, self._config)
-        if self._image is not None:
-            find.rescue(self._image, frame.image0, camera, looks, left, self._config)
-        rows = self._of_the_room(scene, left)
-        return left, self._update(frame, scene, left, rows)
-
-    def _of_the_room(self, scene: Scene, left: find.Sought) -> ekf.Sight:
-        """Rows of what cam0 shows of the room; what moves by itself is marked as astray."""
-        rows = scene.sight(left, self._rate)
-        px, proven = left.px[rows.which], scene.proven(rows.which)
-        fixed = parsac.of_the_room(scene.state, rows, px, proven, self._rig.cam0)
-        left.astray[rows.which[~fixed]] = True
-        return rows.take(fixed)
+        sought = find.seek(frame, self._rig, scene.state, scene.looks, self._config)
+        if self._last is not None:
+            find.rescue(self._last.image0, frame.image0, self._rig.cam0, scene.looks, sought, self._config)
+        uv = scene.measured(sought)
+        scene.mark_movers(sought, uv, self._rate)
+        return sought, self._update(frame, scene, sought, uv)
 
     def _heard(self, frame: Frame, s: State) -> ImuBatch | None:
         """What the IMU said until the image was taken; None if it was silent."""
@@ -277,30 +276,22 @@ class InertialTracker:
         """When the image was taken, IMU time."""
         return frame.stamp_ns + round(s.offset_s * 1e9)
 
-    def _update(
-        self, frame: Frame, scene: Scene, left: find.Sought, left_rows: ekf.Sight
-    ) -> NDArray[np.bool_]:
-        """Which features (N,) were seen and believed. left_rows: of `left`, before the update."""
-        s, config = scene.state, self._config
-        sought: list[tuple[find.Sought, F64 | None]] = [(left, None)]
-        if frame.image1 is not None and self._rig.cam1 is not None:
-            T = self._rig.T_cam1_cam0
-            right = find.seek(frame.image1, self._rig.cam1, s, scene.looks, config, T, left=left)
-            sought.append((right, T))
+    def _update(self, frame: Frame, scene: Scene, sought: find.Sought, uv: F64) -> NDArray[np.bool_]:
+        """Which features (N,) were seen and believed. uv (N, 2): where cam0 shows them."""
+        s = scene.state
 
         def rows_now() -> ekf.Sight:
-            return scene.heard(*(scene.sight(image, self._rate, T, anew=True) for image, T in sought))
+            return scene.heard(sought, uv, self._rate)
 
-        seen, self._surprise = np.zeros(len(s.ids), bool), np.zeros(0)
-        rows = scene.heard(left_rows, *(scene.sight(image, self._rate, T) for image, T in sought[1:]))
-        seen[left_rows.which] = True
+        seen, self._surprise = sought.found & ~sought.astray, np.zeros(0)
+        rows = rows_now()
         if len(rows.which) == 0:
             return seen
         rows, good, HP, S = self._judged(s, rows, rows_now)
         gap = frame.stamp_ns - self._stamp_ns > _GAP_NS
         if (
             (gap and good.mean() < _MINORITY) or (self._samples.odd(s.stamp_ns) and good.mean() < _MAJORITY)
-        ) and self._agreed(s, left):
+        ) and self._agreed(s, sought):
             ekf.doubt(s, *_DOUBT)
             rows, good, HP, S = self._judged(s, rows, rows_now)
         if good.all():
@@ -338,15 +329,6 @@ class InertialTracker:
         if not heard:
             return TrackState.VISION_ONLY
         return TrackState.OK if count >= config.weak else TrackState.WEAK
-
-    def _trusted(self, s: State) -> bool:
-        """Finite, no faster than a person or robot can be, and not gone too far unseen."""
-        finite = np.isfinite(s.T).all() and np.isfinite(s.v).all() and np.isfinite(s.cov).all()
-        return bool(
-            finite
-            and np.linalg.norm(s.v) < self._config.max_speed_m_s
-            and ekf.drift_m(s) < self._config.lost_m
-        )
 
     def _worth_telling(self, s: State) -> bool:
         return worth_telling(s, (s.stamp_ns - self._begun_ns) * 1e-9, self._new_stretch)
@@ -391,7 +373,7 @@ class InertialTracker:
         self._lost_ns = None
         if self._window is not None or not self._worth_telling(state):
             return self._initialising(state)
-        return self._told(state, TrackState.OK, True, len(state.ids))
+        return self._told(frame, scene, TrackState.OK, True, len(state.ids))
 
     def _lose(self, frame: Frame) -> TrackResult:
         """What is left of the filter is worth nothing."""

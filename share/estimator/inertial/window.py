@@ -36,7 +36,6 @@ class Window:
     ) -> None:
         sigma = _LASTING * float(np.hypot(config.sigma_px, config.lasting_px)) / camera.focal
         self._first, self._camera = copy.deepcopy(first), camera
-        self._lasting = config.lasting_px / camera.focal
         self._model = Model(noise, config.gravity, sigma, common, ROOM, ROOMS, DIFFER)
         self._shots: list[Shot] = []
         self._add(first, ImuBatch.empty(), np.zeros((0, 2)), anchored=True)
@@ -92,12 +91,10 @@ class Window:
         which = np.searchsorted(fit.ids, s.ids)
         poses = (SHOT * shot[:, None] + np.arange(6)).ravel()
         columns = np.r_[last : last + SHOT + 6, poses, last + SHOT + 6 + which]
-        calibration, fitted = slice(EXTRINSIC.start, CORE), np.r_[0 : EXTRINSIC.start, CORE : s.lasting_at]
+        calibration, fitted = slice(EXTRINSIC.start, CORE), np.r_[0 : EXTRINSIC.start, CORE : s.size]
         s.cov = np.zeros((s.size, s.size))
         s.cov[np.ix_(fitted, fitted)] = fit.cov[np.ix_(columns, columns)]
         s.cov[calibration, calibration] = self._first.cov[calibration, calibration]
-        lasting = np.arange(s.lasting_at, s.size)
-        s.cov[lasting, lasting], s.lasting = self._lasting**2, np.zeros((len(s.ids), 2))
         s.T, s.v, s.bg, s.ba = fit.T[-1], fit.v[-1], fit.bg, fit.ba
         s.poses, s.rho = fit.T[shot], fit.rho[which]
 
@@ -117,7 +114,7 @@ def window_for(
 def _by_camera(state: State) -> None:
     H = np.zeros((3, state.size))
     H[0, 0] = H[1, 1] = 1
-    H[2, state.features_at : state.lasting_at] = 1 / len(state.ids)
+    H[2, state.features_at :] = 1 / len(state.ids)
     ekf.learn(state, np.zeros(3), H, _TASTE)
 
 
