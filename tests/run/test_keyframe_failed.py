@@ -77,7 +77,7 @@ def tracked(run: AgentRun) -> list[tuple[bool, bool]]:
     ("fails", "logged", "calls"),
     [
         ("", (True, True), ["keyframe", "settle"]),
-        ("keyframe", (False, False), ["keyframe", "give up"]),
+        ("keyframe", (False, False), ["keyframe", "give up", "settle"]),
         ("settle", (True, True), ["keyframe", "settle", "give up"]),
     ],
 )
