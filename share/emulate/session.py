@@ -29,7 +29,7 @@ from share.emulate.takes import write_recording, write_truth
 from share.emulate.types import START_NS
 from share.errors import ShareError
 from share.io.arrays import read_array
-from share.io.files import atomic_write, writable_dir, writing
+from share.io.files import atomic_write, writable_dir, writing, xdg_folder
 from share.io.kalibr import to_kalibr
 from share.io.pool import Pool
 from share.io.session import SCHEMA, SESSION
@@ -77,8 +77,7 @@ def cached_session(
 
 def default_cache() -> Path:
     """$XDG_CACHE_HOME/share, or ~/.cache/share (XDG Base Directory Specification)."""
-    home = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(home) if Path(home).is_absolute() else Path.home() / ".cache") / "share"
+    return xdg_folder("XDG_CACHE_HOME", ".cache") / "share"
 
 
 def _make(recipe: Recipe, prepared: Prepared, growth: Growth, workers: int, progress: Progress) -> None:

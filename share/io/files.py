@@ -244,3 +244,10 @@ def new_folder(out: Path) -> Iterator[Path]:
             work.replace(out)
     finally:
         shutil.rmtree(work, ignore_errors=True)
+
+
+def xdg_folder(variable: str, otherwise: str) -> Path:
+    """What the environment's `variable` says, or that folder of the user's home (XDG Base Directory
+    Specification). Raises RuntimeError where nobody has a home."""
+    given = os.environ.get(variable, "")
+    return Path(given) if os.path.isabs(given) else Path.home() / otherwise

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from share.errors import DataError, UsageError
 from share.geometry.camera import ImuBias
-from share.io.files import atomic_write, writable_dir
+from share.io.files import atomic_write, writable_dir, xdg_folder
 from share.io.json_file import as_we_write_it, read_json
 
 _SCHEMA = 1
@@ -26,9 +26,8 @@ class Remembered(NamedTuple):
 def folder() -> Path:
     """$XDG_STATE_HOME/share/imu, or ~/.local/state/share/imu (XDG Base Directory Specification). Raises
     UsageError where nobody has a home."""
-    home = os.environ.get("XDG_STATE_HOME", "")
     try:
-        return (Path(home) if os.path.isabs(home) else Path.home() / ".local/state") / "share" / "imu"
+        return xdg_folder("XDG_STATE_HOME", ".local/state") / "share" / "imu"
     except RuntimeError:
         raise UsageError("no home folder to remember the IMU's bias in; set XDG_STATE_HOME") from None
 

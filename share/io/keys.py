@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from share.errors import UsageError
-from share.io.files import atomic_write, writing
+from share.io.files import atomic_write, writing, xdg_folder
 from share.io.regular_file import KEYS, read_text
 
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
@@ -127,8 +127,7 @@ class _Line(NamedTuple):
 
 def default_folder() -> Path:
     """$XDG_CONFIG_HOME/share/keys, or ~/.config/share/keys."""
-    base = os.environ.get("XDG_CONFIG_HOME", "")
-    return (Path(base) if os.path.isabs(base) else Path.home() / ".config") / "share" / "keys"
+    return xdg_folder("XDG_CONFIG_HOME", ".config") / "share" / "keys"
 
 
 def generate(folder: Path, name: str | None = None) -> KeyPair:

@@ -50,6 +50,17 @@ class Town:
             self.agreement.witness((a, b), ends, edge, Scale(log, SIGMA), None)
 
 
+def with_a_wrong_one():
+    """Ann and bob agree; eve's metres are 5 % too long for both."""
+    town = Town()
+    for run in ("ann-1", "bob-1", "eve-1"):
+        town.enter(run)
+    town.meet("ann-1", "bob-1", 1.0, 6)
+    for other in ("ann-1", "bob-1"):
+        town.meet(other, "eve-1", 1.05, 4)
+    return town
+
+
 def test_who_is_restarted_before_it_is_found_out_is_found_out_by_all_its_runs():
     """Two loops with each of two others in each run: never enough of one run."""
     town = Town()
@@ -71,12 +82,7 @@ def test_who_is_restarted_before_it_is_found_out_is_found_out_by_all_its_runs():
 
 @pytest.mark.parametrize("scale", [1.0, 1.05])
 def test_a_run_of_a_name_that_was_set_apart_is_compared_before_it_comes_in(scale):
-    town = Town()
-    for run in ("ann-1", "bob-1", "eve-1"):
-        town.enter(run)
-    town.meet("ann-1", "bob-1", 1.0, 6)
-    for other in ("ann-1", "bob-1"):
-        town.meet(other, "eve-1", 1.05, 4)
+    town = with_a_wrong_one()
     assert town.agreement.standing("eve-1").state == "set apart"
     town.enter("eve-2")
     assert "earlier run" in town.agreement.standing("eve-2").reason
@@ -98,12 +104,7 @@ def test_a_run_of_a_name_that_was_set_apart_is_compared_before_it_comes_in(scale
 
 
 def test_who_was_set_apart_before_is_wrong_again_where_only_one_can_say_so():
-    town = Town()
-    for run in ("ann-1", "bob-1", "eve-1"):
-        town.enter(run)
-    town.meet("ann-1", "bob-1", 1.0, 6)
-    for other in ("ann-1", "bob-1"):
-        town.meet(other, "eve-1", 1.05, 4)
+    town = with_a_wrong_one()
     town.enter("eve-2")
     town.meet("bob-1", "eve-2", 1.05, 5)
     assert town.agreement.standing("eve-2").state == "set apart"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +88,7 @@ def seek(
         return out
     seen, where = todo[ahead:], np.flatnonzero(good[ahead:] & out.found[which[todo[ahead:]]])
     there = Right(which[seen[where]], found.px[ahead:][where], aim.uv[seen[where]])
-    return Sought(**{**vars(out), "right": there})
+    return replace(out, right=there)
 
 
 def rescue(

@@ -169,10 +169,10 @@ class InertialTracker:
 
     def _follow(self, frame: Frame, scene: Scene) -> TrackResult:
         before, imu = scene.state.T, self._heard(frame, scene.state)
-        doubt = self._doubt(frame, scene.state)
+        doubt = self._samples.doubt(scene.state.stamp_ns, self._taken_ns(frame, scene.state))
         doubted = doubt is not None and bool(doubt.axes.any())
         since_s = (frame.stamp_ns - self._stamp_ns) * 1e-9
-        measured = self._propagate(frame, scene.state, imu)
+        measured = self._propagate(frame, scene.state, imu, doubt)
         scene.step(since_s)
         left, seen = self._look(frame, scene)
         heard = imu is not None and not (doubted and self._ready)
@@ -241,13 +241,9 @@ class InertialTracker:
             return ImuBatch.empty()
         return self._samples.between(s.stamp_ns, to_ns, round(self._config.silent_s * 1e9))
 
-    def _doubt(self, frame: Frame, s: State) -> Doubt | None:
-        """What is doubted of that. A sample after the image's time is the next frame's."""
-        return self._samples.doubt(s.stamp_ns, self._taken_ns(frame, s))
-
-    def _propagate(self, frame: Frame, s: State, imu: ImuBatch | None) -> bool:
+    def _propagate(self, frame: Frame, s: State, imu: ImuBatch | None, doubt: Doubt | None) -> bool:
         """To when the image was taken; without an IMU, as the body went before. Whether the IMU measured how
-        it turns."""
+        it turns. doubt: of these samples."""
         to_ns, gravity = self._taken_ns(frame, s), self._config.gravity
         if to_ns <= s.stamp_ns:
             return True
@@ -258,7 +254,7 @@ class InertialTracker:
             noise = without(self._noise, self._coasting, np.arange(6) >= 3)
             self._rate = ekf.propagate(s, without_force(s, imu, to_ns, gravity), to_ns, noise, gravity)
             return True
-        clipped, doubt = self._samples.clipped(imu), self._doubt(frame, s)
+        clipped = self._samples.clipped(imu)
         silent = clipped if doubt is None else clipped | doubt.axes
         noise = shaken(self._noise, self._samples.latest(to_ns))
         noise = without(noise, self._coasting, silent)
