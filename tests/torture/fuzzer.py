@@ -101,6 +101,7 @@ class Attacker:
         self.args, self.draw = args, random.Random(args.seed)
         self.corpus = Corpus(args.corpus)
         self.small = _small(self.corpus.by_kind[args.kind], args.kind)
+        self.valid = self._said_validly()
         self.runs = [Run(self._identity()) for _ in range(CONNECTIONS)]
         self.ring: deque[Recorded] = deque(maxlen=RING)
         self.counts: Counter[str] = Counter(sent=0, with_run=0, connections=0, closed=0, unanswered=0)
@@ -198,14 +199,17 @@ class Attacker:
             message = self.corpus.hello(name, identity)
         return mutate(self.draw, message)
 
-    def _valid(self, identity: bytes) -> Message:
-        """What an agent of that kind of message might say as often: for a Frame a pose, a hello its own."""
+    def _said_validly(self) -> list[Message]:
+        """What an agent of that kind might say as often: for a Frame a pose, for what an edge says a ping."""
         kind = {"frame": "pose", "bye": "ping"}.get(self.args.kind, self.args.kind)
         if KINDS[kind] >= 16:
             kind = "ping"
-        if kind == "hello":
+        return _small(self.corpus.by_kind[kind][:50], kind)
+
+    def _valid(self, identity: bytes) -> Message:
+        if self.args.kind == "hello":  # its own
             return self.corpus.hello(own_name(identity, self.args.keys), identity)
-        return self.draw.choice(_small(self.corpus.by_kind[kind][:50], kind))
+        return self.draw.choice(self.valid)
 
 
 def _small(messages: list[Message], kind: str) -> list[Message]:
