@@ -15,13 +15,13 @@ Source: docs.optitrack.com, *Data Export: CSV*. Which axis is up is chosen at th
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from share.errors import DataError
+from share.io import cells
 from share.io.cells import numbers
 from share.io.tables import read_text
 from share.io.trajectory import poses
@@ -90,7 +90,7 @@ def read_motive(path: Path) -> dict[str, Mocap | None]:
 
 
 def _read(path: Path) -> _Export:
-    rows = [[cell.strip() for cell in row] for row in csv.reader(read_text(path).splitlines())]
+    rows = cells.rows(read_text(path).splitlines(), path)
     place = next((k for k, row in enumerate(rows) if row[:1] == ["Frame"]), 0)
     head = [row for row in rows[1:place] if any(row)]
     if len(head) < 3 or place + 1 >= len(rows):
@@ -110,11 +110,7 @@ def _stamps(export: _Export) -> I64:
     if place is None:
         raise DataError(f"{export.path}, line {export.line - 1}: has no column Time (Seconds); export again")
     seconds = numbers(export.path, export.line, export.rows, [place])[:, 0]
-    bad = np.flatnonzero(~np.isfinite(seconds) | (np.diff(seconds, prepend=-np.inf) <= 0))
-    if len(bad):
-        where = f"{export.path}, line {export.line + int(bad[0])}"
-        raise DataError(f"{where}: its time does not follow the one before; export again")
-    return np.asarray(np.round(seconds * 1e9), np.int64)
+    return cells.stamps(seconds, "time", export.path, export.line)
 
 
 def _body(export: _Export, name: str, stamps: I64, places: list[int], scale: float) -> Mocap | None:

@@ -75,7 +75,7 @@ def trajectory_of(stamps_ns: I64, p: F64, q: F64, path: Path, losses: Losses | N
     Raises DataError likewise."""
     if losses is None:
         return Trajectory(stamps_ns, poses(p, q, path))
-    length = np.linalg.norm(q, axis=1)
+    length = _lengths(q)
     good = (np.abs(length - 1) <= _NEAR_ONE) & (np.abs(p) <= MOST_M).all(1)
     for i in np.flatnonzero(~good):
         why = f"quaternion has length {length[i]:.3g}, or it is farther than {MOST_M:g} m"
@@ -86,13 +86,25 @@ def trajectory_of(stamps_ns: I64, p: F64, q: F64, path: Path, losses: Losses | N
 
 def poses(p: F64, q: F64, path: Path) -> F64:
     """(N, 3) m and quaternions (N, 4) xyzw -> (N, 4, 4). DataError where a quaternion is no rotation."""
-    norm = np.linalg.norm(q, axis=1)
-    bad = np.flatnonzero(~(np.abs(norm - 1) <= _NEAR_ONE))
+    length = _lengths(q)
+    bad = np.flatnonzero(~(np.abs(length - 1) <= _NEAR_ONE))
     if len(bad):
-        raise DataError(f"{path}: pose {bad[0] + 1}: quaternion has length {norm[bad[0]]:.3g}, expected 1")
+        raise DataError(f"{path}: pose {bad[0] + 1}: quaternion has length {length[bad[0]]:.3g}, expected 1")
+    check_near(p, path)
+    return se3.from_quat(p, q)
+
+
+def check_near(p: F64, path: Path) -> None:
+    """Raises DataError where a position (N, 3), m, is beyond any room."""
     if (far := np.flatnonzero(~(np.abs(p) <= MOST_M).all(1))).size:
         raise DataError(f"{path}: pose {far[0] + 1}: is farther than {MOST_M:g} m from the origin")
-    return se3.from_quat(p, q)
+
+
+def _lengths(q: F64) -> F64:
+    """(N,) of rows (N, 4) that may hold anything."""
+    with np.errstate(over="ignore"):
+        out: F64 = np.linalg.norm(q, axis=1)
+    return out
 
 
 def format_seconds(stamp_ns: int) -> str:

@@ -13,7 +13,6 @@ or semicolons; with these a number may have a decimal comma.
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,9 +21,10 @@ import numpy as np
 
 from share.errors import DataError
 from share.geometry import se3
+from share.io import cells
 from share.io.cells import numbers, point
 from share.io.tables import read_text
-from share.io.trajectory import poses
+from share.io.trajectory import check_near, poses
 from share.mocap.mocap import Mocap
 from share.types import F64, I64
 
@@ -116,7 +116,7 @@ def _block(path: Path) -> _Block:
         raise DataError(f"{path}: has no block {' or '.join(_BLOCKS)}; export rigid bodies, not markers")
     end = next((k for k in range(start + _HEAD, len(titles)) if not titles[k]), len(lines))
     separator = ";" if lines[start + 3 : start + 4] and ";" in lines[start + 3] else ","
-    rows = [[cell.strip() for cell in row] for row in csv.reader(lines[start:end], delimiter=separator)]
+    rows = cells.rows(lines[start:end], path, start + 1, separator)
     if len(rows) <= _HEAD or rows[3][0].lower() != "frame":
         raise DataError(
             f"{path}, line {start + 1}: {titles[start]}: expected a rate, names, columns that begin with "
@@ -131,14 +131,9 @@ def _stamps(block: _Block) -> I64:
         rate = float(point(block.head[1][0]))
     except (ValueError, IndexError):
         rate = 0.0
-    if not 0 < rate < 1e5:
+    if not 1e-3 < rate < 1e5:
         raise DataError(f"{block.path}, line {block.line + 1}: expected the frames a second")
-    frames = block.values[:, 0]
-    bad = np.flatnonzero(~np.isfinite(frames) | (np.diff(frames, prepend=-np.inf) <= 0))
-    if len(bad):
-        where = f"{block.path}, line {block.line + _HEAD + int(bad[0])}"
-        raise DataError(f"{where}: its frame does not follow the one before; export again")
-    return np.asarray(np.round(frames * (1e9 / rate)), np.int64)
+    return cells.stamps(block.values[:, 0] / rate, "frame", block.path, block.line + _HEAD)
 
 
 def _poses(block: _Block, start: int, rotations: str) -> tuple[F64, np.ndarray]:
@@ -151,4 +146,5 @@ def _poses(block: _Block, start: int, rotations: str) -> tuple[F64, np.ndarray]:
     seen = np.isfinite(p).all(1) & np.isfinite(turn).all(1) & (p != 0).any(1)  # some versions write zeros
     if quaternion:
         return poses(p[seen], turn[seen], block.path), seen
+    check_near(p[seen], block.path)
     return se3.compose(ROTATIONS[rotations](turn[seen]), p[seen]), seen

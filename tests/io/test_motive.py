@@ -85,6 +85,8 @@ def test_a_body_that_was_never_there_is_known_but_not_seen(tmp_path):
         ("Rigid Body", "Bone", "has no rigid body; export Rigid Bodies"),
         ("Time (Seconds)", "Clock", "line 8: has no column Time"),
         ("\n2,0.016667", "\n2,0.008333", "line 11: its time does not follow"),
+        (",1.75,", ",1e308,", "line 9: '1e308' is not a number"),
+        ("0,0.000000,", "0,0.000000," + "9" * 200_000, "line 9: field larger than field limit"),
         (",1.75,", ",high,", "line 9: 'high' is not a number"),
         ("Frame,Time", "Time,Frame", "was exported without its header"),
         ("0,0.000000,", "0,0.000000,9", "pose 1: quaternion has length"),

@@ -82,6 +82,10 @@ def test_a_file_that_names_nobody_is_one_body(tmp_path):
     ("old", "new", "said"),
     [
         ("102,0,11", "102,0,eleven", "line 7: 'eleven' is not a number"),
+        ("102,0,11", "102,0,1e308", "line 7: '1e308' is not a number"),
+        ("1001,2000", "1e14,2000", "is farther than 1e"),
+        ("\n106,", "\n1e14,", "line 10: its frame does not follow"),
+        ("102,0,11", "102,0," + "9" * 200_000, "line 7: field larger than field limit"),
         ("\n103,", "\n102,", "line 8: its frame does not follow"),
         ("100\n", "\n", "line 2: expected the frames a second"),
         ("mm,mm,mm,deg", "ft,ft,ft,deg", "line 5: unit 'ft' is not known; known: mm"),
