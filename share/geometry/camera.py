@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from share.geometry.lens import COUNTS, EQUIDISTANT, RADTAN, Equidistant, Radtan, lens
 from share.types import F64, checked, checked_pose
@@ -142,6 +143,17 @@ class Camera:
         if not self.distortion:
             return np.broadcast_to(scale * np.eye(2), (*uv.shape, 2)).copy()
         return scale * lens(self.model, self.distortion).jacobian(uv)
+
+    def evened(self, uv: F64) -> F64:
+        """Normalised coordinates (..., 2) to such of which a pixel is as much, 1 / focal, all over the image: of a
+        fisheye lens those in its image plane, of others the same."""
+        return lens(self.model, self.distortion).bend(uv) if self.fisheye else uv
+
+    def knows(self, px: F64) -> NDArray[np.bool_]:
+        """Which pixels (..., 2) have normalised coordinates, as far as a fisheye lens lacks them."""
+        if not self.fisheye:
+            return np.ones(px.shape[:-1], bool)
+        return np.isfinite(self.normalise(px)).all(axis=-1)
 
     def inside(self, px: F64, border: float = 0.0) -> np.ndarray:
         """Which pixels (..., 2) lie in the image, at least `border` px from its edge."""
