@@ -153,7 +153,7 @@ class Camera:
         """Which pixels (..., 2) have normalised coordinates, as far as a fisheye lens lacks them."""
         if not self.fisheye:
             return np.ones(px.shape[:-1], bool)
-        return np.isfinite(self.normalise(px)).all(axis=-1)
+        return np.asarray(np.isfinite(self.normalise(px)).all(axis=-1))
 
     def inside(self, px: F64, border: float = 0.0) -> np.ndarray:
         """Which pixels (..., 2) lie in the image, at least `border` px from its edge."""

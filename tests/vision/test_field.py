@@ -40,7 +40,10 @@ def test_all_of_another_lens_is_looked_at():
 def test_disparity_is_what_the_images_show():
     rig = Rig(FISHEYE, np.eye(4), FISHEYE, T_CAM1_CAM0)
     uv, rho, eps = np.array([[0.0, 0], [1.5, 0.2], [-2.5, 0], [0.3, -2.5]]), np.full(4, 0.5), 1e-5
-    seen = [rig.cam1.project(rays(uv) @ T_CAM1_CAM0[:3, :3].T + r * T_CAM1_CAM0[:3, 3]) for r in (0.5 - eps, 0.5 + eps)]
+    seen = [
+        rig.cam1.project(rays(uv) @ T_CAM1_CAM0[:3, :3].T + r * T_CAM1_CAM0[:3, 3])
+        for r in (0.5 - eps, 0.5 + eps)
+    ]
     moved = np.linalg.norm(seen[1] - seen[0], axis=1) / (2 * eps)
     np.testing.assert_allclose(disparity_px(rig, uv, rho), moved, rtol=1e-4)
     assert moved[0] > 5 * moved[2]  # along the baseline, at 68 degrees
