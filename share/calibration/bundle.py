@@ -24,6 +24,7 @@ from share.geometry import se3
 from share.geometry.camera import Camera
 from share.geometry.lens import RADTAN
 from share.geometry.target import Target
+from share.geometry.trackable import lens_objection
 from share.types import F64
 
 LEAST_VIEWS = 4
@@ -82,7 +83,8 @@ class Solution:
 
 def calibrate(views: Sequence[View], target: Target, size: tuple[int, int], model: str = RADTAN) -> Solution:
     """From views each of which `start.enough` corners of one camera tell. size: (width, height) of an image.
-    model: of the lenses. Radtan's k3 is taken where it is told: `_SURE` sigmas from 0 in one camera at least.
+    model: of the lenses. Radtan's k3 is taken where it is told, `_SURE` sigmas from 0 in one camera at least, and
+    a tracker can use it.
 
     Raises ValueError where the views are too few, or do not tell what is sought.
     """
@@ -104,10 +106,12 @@ def _with_k3(four: Solution, views: Sequence[View], target: Target) -> Solution:
         five = _solve(views, target, replace(four.state, cameras=tuple(wider)))
     except (ValueError, np.linalg.LinAlgError):
         return four
-    for part, camera in zip(five.state.parts, five.state.cameras, strict=True):
-        if abs(camera.distortion[4]) > _SURE * five.sigmas[part.stop - 1]:
-            return five
-    return four
+    told = [
+        abs(camera.distortion[4]) > _SURE * five.sigmas[part.stop - 1]
+        for part, camera in zip(five.state.parts, five.state.cameras, strict=True)
+    ]
+    sound = all(lens_objection(camera) is None for camera in five.state.cameras)
+    return five if any(told) and sound else four
 
 
 def errors(state: State, views: Sequence[View], target: Target) -> tuple[tuple[F64, ...], ...]:

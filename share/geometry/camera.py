@@ -87,6 +87,11 @@ class Camera:
         return self.model == EQUIDISTANT
 
     @property
+    def bounded(self) -> bool:
+        """Whether the lens's range may end within the image: there pixels have no normalised coordinates."""
+        return self.fisheye or ((bends := self.lens) is not None and bends.limit < math.inf)
+
+    @property
     def field_rad(self) -> tuple[float, float]:
         """Across and upright: 2 atan(size / 2 f), as without distortion; of a fisheye lens as it has it, as far as
         there are normalised coordinates."""
@@ -150,8 +155,8 @@ class Camera:
         return lens(self.model, self.distortion).bend(uv) if self.fisheye else uv
 
     def knows(self, px: F64) -> NDArray[np.bool_]:
-        """Which pixels (..., 2) have normalised coordinates, as far as a fisheye lens lacks them."""
-        if not self.fisheye:
+        """Which pixels (..., 2) have normalised coordinates."""
+        if not self.bounded:
             return np.ones(px.shape[:-1], bool)
         return np.asarray(np.isfinite(self.normalise(px)).all(axis=-1))
 

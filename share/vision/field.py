@@ -1,4 +1,4 @@
-"""What of a fisheye lens's image is looked at: no more than so far off the axis."""
+"""What of an image is looked at: where the lens's range ends, and no more than so far off the axis."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ EVEN_DEG = 60.0
 
 @lru_cache(maxsize=8)
 def within(camera: Camera, degrees: float = WIDEST_DEG) -> U8 | None:
-    """A mask (H, W), 255 up to so many degrees off the axis; None, which is all, of other lenses."""
-    if not camera.fisheye:
+    """A mask (H, W), 255 up to so many degrees off the axis, where there are normalised coordinates; None, which is
+    all, of a lens whose range does not end."""
+    if not camera.bounded:
         return None
     px = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
     uv = camera.normalise(px.astype(np.float64))

@@ -37,6 +37,17 @@ def test_all_of_another_lens_is_looked_at():
     assert (within(FISHEYE) > 0).mean() > (within(FISHEYE, 60.0) > 0).mean() > 0.3
 
 
+def test_a_lens_that_ends_within_the_image_is_looked_at_up_to_there():
+    """As the real EuRoC lens with k3: its radial polynomial falls beyond 55 degrees."""
+    lens = Camera(752, 480, 460.3, 459.0, 367.2, 248.4, (-0.315, 0.136, 1e-4, -1e-4, -0.0325))
+    mask = within(lens)
+    y, x = np.nonzero(mask == 0)
+    assert 0 < len(x) < 0.05 * mask.size
+    assert np.hypot(x - lens.cx, y - lens.cy).min() > 400
+    beyond = np.column_stack([x, y]).astype(float)
+    assert not lens.knows(beyond).any() and lens.knows(np.array([[376.0, 240.0]])).all()
+
+
 def test_disparity_is_what_the_images_show():
     rig = Rig(FISHEYE, np.eye(4), FISHEYE, T_CAM1_CAM0)
     uv, rho, eps = np.array([[0.0, 0], [1.5, 0.2], [-2.5, 0], [0.3, -2.5]]), np.full(4, 0.5), 1e-5

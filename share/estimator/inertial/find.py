@@ -84,7 +84,7 @@ def seek(
     found = patches.align(images, ahead, looks.patch.take(which[todo]), at, warp[todo])
     good = _good(found, at, config, config.reach_px)
     for camera, part in zip(cameras, (slice(0, ahead), slice(ahead, None)), strict=False):
-        if camera.fisheye:  # it may have strayed to where there is no ray
+        if camera.bounded:  # it may have strayed to where there is no ray
             good[part] &= camera.knows(found.px[part].astype(np.float64))
     _put(out, which[todo[:ahead]], found, good, slice(0, ahead))
     if len(cameras) == 1:
