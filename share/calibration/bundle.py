@@ -1,10 +1,9 @@
 """Calibration of one or two cameras from views of a flat target, by bundle adjustment.
 
-Found together: fx fy cx cy and the lens's coefficients of each camera, T_cam1_cam0 and a pose of the target in
-each view.
-Levenberg-Marquardt on the corners' reprojection errors; the poses, each of which meets only its own view, are
-eliminated by the Schur complement (Triggs et al., Bundle adjustment: a modern synthesis, 2000, section 6.1).
-Huber's weights hold back corners that were found wrongly.
+Found together: fx fy cx cy and the lens's coefficients of each camera, T_cam1_cam0 and a pose of the target
+in each view. Levenberg-Marquardt on the corners' reprojection errors; the poses, each of which meets only its
+own view, are eliminated by the Schur complement (Triggs et al., Bundle adjustment: a modern synthesis, 2000,
+section 6.1). Huber's weights hold back corners that were found wrongly.
 """
 
 from __future__ import annotations
@@ -59,9 +58,10 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """`state`, with two covariances (S, S) of the intrinsics of each camera, see `projection.names`, and, of two,
-    xi of T_cam1_cam0 Exp(xi): `independent`, if corners err so; `by_views`, as views contradict one another. Of each view and camera
-    the residuals (N, 2) px, seen less predicted; sigma_px: noise of a coordinate."""
+    """`state`, with two covariances (S, S) of the intrinsics of each camera, see `projection.names`, and, of
+    two, xi of T_cam1_cam0 Exp(xi): `independent`, if corners err so; `by_views`, as views contradict one
+    another. Of each view and camera the residuals (N, 2) px, seen less predicted; sigma_px: noise of a
+    coordinate."""
 
     state: State
     independent: F64
@@ -83,8 +83,8 @@ class Solution:
 
 def calibrate(views: Sequence[View], target: Target, size: tuple[int, int], model: str = RADTAN) -> Solution:
     """From views each of which `start.enough` corners of one camera tell. size: (width, height) of an image.
-    model: of the lenses. Radtan's k3 is taken where it is told, `_SURE` sigmas from 0 in one camera at least, and
-    a tracker can use it.
+    model: of the lenses. Radtan's k3 is taken where it is told, `_SURE` sigmas from 0 in one camera at least,
+    and a tracker can use it.
 
     Raises ValueError where the views are too few, or do not tell what is sought.
     """

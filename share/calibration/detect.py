@@ -35,8 +35,8 @@ class Detection:
 
 
 def detector(target: Target, fisheye: bool = False) -> Callable[[U8], Detection]:
-    """What finds this target's corners in a gray image (H, W), of a fisheye lens or not; none found is an empty
-    Detection."""
+    """What finds this target's corners in a gray image (H, W), of a fisheye lens or not; none found is an
+    empty Detection."""
     return _april(target, fisheye) if isinstance(target, AprilGrid) else _charuco(target)
 
 

@@ -1,7 +1,7 @@
 """Projection of a target's corners by a lens, and all its derivatives.
 
-Models and order of the coefficients as in `share.geometry.lens`: fx fy cx cy, then k1 k2 p1 p2 [k3] of radtan, k1 k2
-k3 k4 of equidistant.
+Models and order of the coefficients as in `share.geometry.lens`: fx fy cx cy, then k1 k2 p1 p2 [k3] of
+radtan, k1 k2 k3 k4 of equidistant.
 """
 
 from __future__ import annotations

@@ -53,8 +53,8 @@ def pose(camera: Camera, board: F64, px: F64) -> F64:
 
 
 def first_fisheye(boards: Sequence[F64], pixels: Sequence[F64], size: tuple[int, int]) -> Camera:
-    """A fisheye camera without coefficients, its axis in the image's middle, from the same: of many focal lengths the
-    one by which the boards are flattest. Raises ValueError where none will do."""
+    """A fisheye camera without coefficients, its axis in the image's middle, from the same: of many focal
+    lengths the one by which the boards are flattest. Raises ValueError where none will do."""
     best, least = None, np.inf
     for f in np.geomspace(*_FISHEYE, _TRIED) * max(size):
         middle = (np.array(size) - 1) / 2
@@ -82,8 +82,8 @@ def _off_px(camera: Camera, board: F64, px: F64) -> F64:
 
 
 def _pose_by_directions(ray: F64, board: F64) -> F64:
-    """T_cam_target (4, 4) of unit vectors (N, 3), NaN unknown, to corners (N, 2) m: the direct linear transform of
-    ray x (H xy1) = 0, which also holds behind the camera."""
+    """T_cam_target (4, 4) of unit vectors (N, 3), NaN unknown, to corners (N, 2) m: the direct linear
+    transform of ray x (H xy1) = 0, which also holds behind the camera."""
     known = np.isfinite(ray).all(axis=1)
     ray, xy = ray[known], board[known]
     middle, scale = xy.mean(axis=0), float(xy.std())

@@ -1,6 +1,7 @@
 """Cameras with a radial-tangential or a fisheye lens, and the rig that holds them.
 
-Pixel centres are at integers: the centre of the top-left pixel is (0, 0). `share.geometry.lens` has the lenses.
+Pixel centres are at integers: the centre of the top-left pixel is (0, 0). `share.geometry.lens` has the
+lenses.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ def _either(counts: tuple[int, ...]) -> str:
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics in pixels; `distortion` is () or (k1, k2, p1, p2) or (k1, k2, p1, p2, k3) of the `model` radtan,
-    (k1, k2, k3, k4) of equidistant."""
+    """Intrinsics in pixels; `distortion` is () or (k1, k2, p1, p2) or (k1, k2, p1, p2, k3) of the `model`
+    radtan, (k1, k2, k3, k4) of equidistant."""
 
     width: int
     height: int
@@ -93,8 +94,8 @@ class Camera:
 
     @property
     def field_rad(self) -> tuple[float, float]:
-        """Across and upright: 2 atan(size / 2 f), as without distortion; of a fisheye lens as it has it, as far as
-        there are normalised coordinates."""
+        """Across and upright: 2 atan(size / 2 f), as without distortion; of a fisheye lens as it has it, as
+        far as there are normalised coordinates."""
         if isinstance(bends := self.lens, Equidistant):
             sides = np.array([[self.width / (2 * self.fx), 0.0], [0.0, self.height / (2 * self.fy)]])
             half = np.arccos(bends.directions(sides)[:, 2])
@@ -108,8 +109,8 @@ class Camera:
         return (self.fx + self.fy) / 2
 
     def project(self, points: F64) -> F64:
-        """Points (..., 3) in the camera frame -> pixels (..., 2). What has no normalised coordinates gives NaN:
-        behind the camera, beyond the lens's range."""
+        """Points (..., 3) in the camera frame -> pixels (..., 2). What has no normalised coordinates gives
+        NaN: behind the camera, beyond the lens's range."""
         z = np.where(points[..., 2:] > 1e-6, points[..., 2:], np.nan)
         return self.distort(points[..., :2] / z)
 
@@ -126,16 +127,16 @@ class Camera:
         return uv * (self.fx, self.fy) + (self.cx, self.cy)
 
     def normalise(self, px: F64, about: F64 | None = None) -> F64:
-        """Pixels (..., 2) -> undistorted normalised coordinates (x/z, y/z), to 1e-9 inside the image; NaN beyond the
-        lens's range. about: where they nearly are, from which it is found sooner."""
+        """Pixels (..., 2) -> undistorted normalised coordinates (x/z, y/z), to 1e-9 inside the image; NaN
+        beyond the lens's range. about: where they nearly are, from which it is found sooner."""
         observed = (px - (self.cx, self.cy)) / (self.fx, self.fy)
         if not self.distortion:
             return observed
         return lens(self.model, self.distortion).straighten(observed, about)
 
     def directions(self, px: F64) -> F64:
-        """Pixels (..., 2) -> unit vectors (..., 3) in the camera frame, also of what has no normalised coordinates;
-        NaN beyond the lens's range."""
+        """Pixels (..., 2) -> unit vectors (..., 3) in the camera frame, also of what has no normalised
+        coordinates; NaN beyond the lens's range."""
         observed = (px - (self.cx, self.cy)) / (self.fx, self.fy)
         if (bends := self.lens) is not None:
             return bends.directions(observed)
@@ -150,8 +151,8 @@ class Camera:
         return scale * lens(self.model, self.distortion).jacobian(uv)
 
     def evened(self, uv: F64) -> F64:
-        """Normalised coordinates (..., 2) to such of which a pixel is as much, 1 / focal, all over the image: of a
-        fisheye lens those in its image plane, of others the same."""
+        """Normalised coordinates (..., 2) to such of which a pixel is as much, 1 / focal, all over the image:
+        of a fisheye lens those in its image plane, of others the same."""
         return lens(self.model, self.distortion).bend(uv) if self.fisheye else uv
 
     def knows(self, px: F64) -> NDArray[np.bool_]:

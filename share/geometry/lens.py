@@ -1,9 +1,9 @@
 """How a lens bends rays: from normalised coordinates (x/z, y/z) to those in the image plane, and back.
 
 Radial-tangential: OpenCV's plumb-bob model k1 k2 p1 p2 [k3] (Brown 1966), Kalibr's `radtan` and EuRoC's
-`radial-tangential`. Equidistant: k1 k2 k3 k4 of Kannala and Brandt (A generic camera model, PAMI 2006), OpenCV's
-fisheye model. A ray beyond the range in which a model grows with the angle gives NaN: it would fold back into the
-image.
+`radial-tangential`. Equidistant: k1 k2 k3 k4 of Kannala and Brandt (A generic camera model, PAMI 2006),
+OpenCV's fisheye model. A ray beyond the range in which a model grows with the angle gives NaN: it would fold
+back into the image.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from share.types import F64
 
 RADTAN, EQUIDISTANT = "radtan", "equidistant"
 COUNTS = {RADTAN: (0, 4, 5), EQUIDISTANT: (4,)}  # of coefficients
-# Off the axis of a fisheye lens, beyond which a tracker uses nothing: (x/z, y/z) ends at 90 degrees, and here a
-# pixel is 15 times as much of it as in the middle.
+# Off the axis of a fisheye lens, beyond which a tracker uses nothing: (x/z, y/z) ends at 90 degrees, and here
+# a pixel is 15 times as much of it as in the middle.
 WIDEST_DEG = 75.0
 _TINY = 1e-8  # of a squared radius: below it limits are taken
 _ROUNDS, _EXACT = 20, 1e-12  # of Newton's method for an angle
@@ -64,8 +64,8 @@ class Radtan:
         return J
 
     def straighten(self, bent: F64, about: F64 | None = None) -> F64:
-        """The inverse of `bend`, to 1e-9 inside the image. about: where they nearly are, from which it is found
-        sooner."""
+        """The inverse of `bend`, to 1e-9 inside the image. about: where they nearly are, from which it is
+        found sooner."""
         uv = (bent if about is None else about).copy()
         if self.limit < math.inf and about is None:  # begin inside, where there is a way
             r = np.hypot(uv[..., 0], uv[..., 1])[..., None]
@@ -123,8 +123,8 @@ class Radtan:
 
 @dataclass(frozen=True)
 class Equidistant:
-    """limit: of the angle from the axis, rad, up to which it grows; at most pi. Normalised coordinates are of rays
-    up to WIDEST_DEG only, `bend_points` and `directions` are of all."""
+    """limit: of the angle from the axis, rad, up to which it grows; at most pi. Normalised coordinates are of
+    rays up to WIDEST_DEG only, `bend_points` and `directions` are of all."""
 
     coefficients: tuple[float, ...]
     limit: float
@@ -165,7 +165,8 @@ class Equidistant:
         return np.asarray(bent * scale[..., None])
 
     def bend_points(self, points: F64) -> F64:
-        """Points (..., 3) in the camera frame, also behind it, -> image plane (..., 2); NaN beyond `limit`."""
+        """Points (..., 3) in the camera frame, also behind it, -> image plane (..., 2); NaN beyond
+        `limit`."""
         theta, across = self._of(points)
         return np.asarray(points[..., :2] * self._scale(points, theta, across)[..., None])
 
@@ -229,8 +230,8 @@ class Equidistant:
             return np.where(ahead, 1 / points[..., 2], self._bent(theta) / across)
 
     def _angle(self, radius: F64, most: float) -> F64:
-        """rad (...) off the axis of what is seen at a radius (...) in the image plane; NaN beyond `most`. Newton's
-        method between 0 and `most`, where the radius grows with the angle."""
+        """rad (...) off the axis of what is seen at a radius (...) in the image plane; NaN beyond `most`.
+        Newton's method between 0 and `most`, where the radius grows with the angle."""
         end = float(self._bent(np.asarray(most)))
         sought = np.where(radius <= end, radius, np.nan)
         low, high = np.zeros_like(sought), np.full_like(sought, most)

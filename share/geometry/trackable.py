@@ -68,8 +68,8 @@ def _of_lens(camera: Camera) -> Iterator[str]:
     if camera.fisheye and (beyond := _beyond(camera)).any():  # of no use, and no fault
         if 1 - beyond.mean() < _USED:
             yield (
-                f"{100 * beyond.mean():.0f} % of its image lie beyond {WIDEST_DEG:g} degrees off the axis, where "
-                "nothing is tracked; focal lengths are in pixels of the images that are recorded"
+                f"{100 * beyond.mean():.0f} % of its image lie beyond {WIDEST_DEG:g} degrees off the axis, "
+                "where nothing is tracked; focal lengths are in pixels of the images that are recorded"
             )
             return
         uv, known = uv[~beyond], known[~beyond]

@@ -103,7 +103,8 @@ def find_views(
     """Views of every `every`-th picture, also empty ones, and each camera's size. Finding a board takes
     some hundredths of a second: `workers` processes share that.
 
-    told: how many are done, of how many. fisheye: what the lenses are. Raises DataError where pictures of a camera differ in size.
+    told: how many are done, of how many. fisheye: what the lenses are. Raises DataError where pictures of a
+    camera differ in size.
     """
     sizes: list[tuple[int, int]] = []
     views: dict[int, View] = {}

@@ -82,8 +82,8 @@ def kalibr_text(outcome: Outcome, source: str, report: str) -> str:
 
 
 def to_json(outcome: Outcome) -> dict[str, Any]:
-    """Plain data: verdict, each camera, the mounting, each view. covariance: of the parameters of each camera and,
-    of two, xi of T_cam1_cam0 Exp(xi)."""
+    """Plain data: verdict, each camera, the mounting, each view. covariance: of the parameters of each camera
+    and, of two, xi of T_cam1_cam0 Exp(xi)."""
     verdict = outcome.verdict
     out: dict[str, Any] = {
         "passed": verdict.passed,

@@ -116,8 +116,9 @@ def _two_rays(rig: Rig, rays0: F64, uv1: F64) -> tuple[F64, F64]:
 
 
 def disparity_px(rig: Rig, uv: F64, rho: F64) -> F64:
-    """px (N,) by which points on rays uv (N, 2), at inverse depths (N,), move in cam1 for 1/m more. Of a fisheye
-    lens they move less the farther off the axis they are; of others this takes it as it is in the middle."""
+    """px (N,) by which points on rays uv (N, 2), at inverse depths (N,), move in cam1 for 1/m more. Of a
+    fisheye lens they move less the farther off the axis they are; of others this takes it as it is in the
+    middle."""
     assert rig.cam1 is not None and rig.T_cam1_cam0 is not None
     if not rig.cam1.fisheye:
         return np.full(len(uv), rig.cam1.focal * rig.baseline)

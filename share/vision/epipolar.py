@@ -38,8 +38,8 @@ def search(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64) -> F64:
 
 
 def _scores(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, rho: F64) -> F32:
-    """Correlation (N, K) of each patch with that at each inverse depth (K,), or its own (N, K); -1 outside the
-    image."""
+    """Correlation (N, K) of each patch with that at each inverse depth (K,), or its own (N, K); -1 outside
+    the image."""
     assert rig.cam1 is not None and rig.T_cam1_cam0 is not None
     R, t = rig.T_cam1_cam0[:3, :3], rig.T_cam1_cam0[:3, 3]
     q = (rays(uv) @ R.T)[:, None] + rho[..., None] * t

@@ -1,7 +1,8 @@
 """A fisheye lens: up to five undistorted views, ahead and to the sides, each resampled where it is nearest.
 
-One view of 150 degrees would be 15 times finer at its edge than in its middle, and end at 180; the faces of a cube
-stay within a factor of three, and show what lies behind the camera too (Greene, Environment mapping, 1986).
+One view of 150 degrees would be 15 times finer at its edge than in its middle, and end at 180; the faces of a
+cube stay within a factor of three, and show what lies behind the camera too (Greene, Environment mapping,
+1986).
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ class Face:
 
 
 def faces(camera: Camera, zoom: float = 1.0) -> tuple[Face, ...]:
-    """The faces that a fisheye camera sees; as finely drawn as `share.emulate.render.lens.lens` has it. Pixels
-    beyond the range of the lens belong to none."""
+    """The faces that a fisheye camera sees; as finely drawn as `share.emulate.render.lens.lens` has it.
+    Pixels beyond the range of the lens belong to none."""
     px = pixels(camera).reshape(-1, 2)
     ray = camera.directions(px)
     along = np.nan_to_num(np.stack([ray @ R[:, 2] for R in _FACES]), nan=-1.0)
