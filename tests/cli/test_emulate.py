@@ -73,7 +73,7 @@ TYPED = {
     ),
     "profile": (
         ["--profile", "d436"],
-        "profile 'd436' is not known; known: d435i-n100-headset, d435i-turtlebot4, d435i, euroc, laptop-edge, tumvi",
+        "profile 'd436' is not known; known: d435i-n100-headset, d435i-turtlebot4, d435i, euroc, laptop-edge",
     ),
     "profile file": (["--profile", "mine.yaml"], "mine.yaml: no such profile file"),
     "mode": (["--profile", "d435i:9x9"], "mode '9x9' is not known; known: 640x480@30/15/60/90, 848x480"),

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 from click.testing import CliRunner
 
-from share.cli.main import main
+from share.cli.main import cli
 from share.emulate.recipe import Recipe
 from share.emulate.render.context import missing
 from share.emulate.session import make_session
@@ -61,7 +61,7 @@ def test_a_fisheye_pair_is_tracked(tmp_path):
     middle."""
     recipe = Recipe("warehouse", ("a=walk:",), seconds=6.0, seed=11, profiles={"": "tumvi"})
     session = make_session(recipe, tmp_path / "session")
-    done = CliRunner().invoke(main, ["track", str(session / "a"), "--json"], catch_exceptions=False)
+    done = CliRunner().invoke(cli, ["track", str(session / "a"), "--json"], catch_exceptions=False)
     told = json.loads(done.stdout)
     assert told["tracked"] > 100 and told["lost_s"] == 0
     assert told["ate_m"] < 0.006

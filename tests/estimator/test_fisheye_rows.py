@@ -12,7 +12,7 @@ FISHEYE = Camera(512, 512, 190.0, 190.0, 254.93, 256.90, LENS, "equidistant")
 
 def test_a_pixel_is_as_much_everywhere():
     px = np.array([[255.0, 257], [255 + 240, 257], [100, 400]])
-    one = FISHEYE.evened(FISHEYE.normalise(px + (1.0, 0.0))) - FISHEYE.evened(FISHEYE.normalise(px))
+    one = FISHEYE.evened(FISHEYE.normalise(px + np.array([1.0, 0]))) - FISHEYE.evened(FISHEYE.normalise(px))
     np.testing.assert_allclose(190.0 * one, [[1, 0]] * 3, atol=1e-6)
     plain = Camera(640, 480, 400.0, 400.0, 320.0, 240.0)
     assert plain.evened(px) is px

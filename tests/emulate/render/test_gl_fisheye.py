@@ -1,8 +1,8 @@
 """What a fisheye lens is shown: points where they project, also to the sides and behind, and their depth."""
 
 import numpy as np
-from rendered import furnished, looking, needs_opengl, plain
 from rendered import checker as checkered
+from rendered import furnished, looking, needs_opengl, plain
 from test_gl_place import corners_of_walls, saddles
 
 from share.emulate.render.fisheye import faces
