@@ -1,15 +1,16 @@
 """Calibration of one or two cameras from views of a flat target, by bundle adjustment.
 
-Found together: fx fy cx cy k1 k2 p1 p2 of each camera, T_cam1_cam0 and a pose of the target in each view.
-Levenberg-Marquardt on the corners' reprojection errors; the poses, each of which meets only its own view, are
-eliminated by the Schur complement (Triggs et al., Bundle adjustment: a modern synthesis, 2000, section 6.1).
-Huber's weights hold back corners that were found wrongly.
+Found together: fx fy cx cy and the lens's coefficients of each camera, T_cam1_cam0 and a pose of the target
+in each view. Levenberg-Marquardt on the corners' reprojection errors; the poses, each of which meets only its
+own view, are eliminated by the Schur complement (Triggs et al., Bundle adjustment: a modern synthesis, 2000,
+section 6.1). Huber's weights hold back corners that were found wrongly.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -17,15 +18,18 @@ from share.calibration import start
 from share.calibration.corners import spread
 from share.calibration.detect import Detection
 from share.calibration.doubt import jackknife, larger
-from share.calibration.projection import INTRINSICS, camera_of, intrinsics, moved, project
+from share.calibration.projection import camera_of, intrinsics, moved, names, project
 from share.geometry import se3
 from share.geometry.camera import Camera
+from share.geometry.lens import RADTAN
 from share.geometry.target import Target
+from share.geometry.trackable import lens_objection
 from share.types import F64
 
 LEAST_VIEWS = 4
 _ROUNDS = 60
 _HUBER = 2.5  # times the residuals' own spread
+_SURE = 3.0  # sigmas from 0 at which a fifth coefficient is told
 _STILL = 1e-9  # relative fall of the cost at which it has arrived
 
 
@@ -45,12 +49,19 @@ class State:
     T_cam1_cam0: F64
     T_cam0_target: F64
 
+    @property
+    def parts(self) -> tuple[slice, ...]:
+        """Where each camera's intrinsics are among the shared parameters."""
+        ends = np.cumsum([0, *(len(names(camera)) for camera in self.cameras)]).tolist()
+        return tuple(slice(a, b) for a, b in pairwise(ends))
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """`state`, with two covariances (S, S) of 8 intrinsics a camera and, of two, xi of T_cam1_cam0 Exp(xi):
-    `independent`, if corners err so; `by_views`, as views contradict one another. Of each view and camera
-    the residuals (N, 2) px, seen less predicted; sigma_px: noise of a coordinate."""
+    """`state`, with two covariances (S, S) of the intrinsics of each camera, see `projection.names`, and, of
+    two, xi of T_cam1_cam0 Exp(xi): `independent`, if corners err so; `by_views`, as views contradict one
+    another. Of each view and camera the residuals (N, 2) px, seen less predicted; sigma_px: noise of a
+    coordinate."""
 
     state: State
     independent: F64
@@ -70,20 +81,37 @@ class Solution:
         return np.sqrt(np.diag(self.covariance))
 
 
-def calibrate(views: Sequence[View], target: Target, size: tuple[int, int]) -> Solution:
+def calibrate(views: Sequence[View], target: Target, size: tuple[int, int], model: str = RADTAN) -> Solution:
     """From views each of which `start.enough` corners of one camera tell. size: (width, height) of an image.
+    model: of the lenses. Radtan's k3 is taken where it is told, `_SURE` sigmas from 0 in one camera at least,
+    and a tracker can use it.
 
     Raises ValueError where the views are too few, or do not tell what is sought.
     """
     eyes = len(views[0].seen) if views else 0
-    alone = [_alone(views, target, size, eye) for eye in range(eyes)]
+    alone = [_alone(views, target, size, eye, model) for eye in range(eyes)]
     if eyes == 0:
         raise ValueError("no view of the target")
-    if eyes == 1:
-        return _solve(views, target, alone[0][0])
-    return _solve(
-        views, target, _together([state for state, _ in alone], [at for _, at in alone], len(views))
-    )
+    first = alone[0][0]
+    if eyes == 2:
+        first = _together([state for state, _ in alone], [at for _, at in alone], len(views))
+    four = _solve(views, target, first)
+    return four if model != RADTAN else _with_k3(four, views, target)
+
+
+def _with_k3(four: Solution, views: Sequence[View], target: Target) -> Solution:
+    """The solution with a fifth coefficient, where it tells that one; else as it is."""
+    wider = [replace(camera, distortion=(*camera.distortion, 0.0)) for camera in four.state.cameras]
+    try:
+        five = _solve(views, target, replace(four.state, cameras=tuple(wider)))
+    except (ValueError, np.linalg.LinAlgError):
+        return four
+    told = [
+        abs(camera.distortion[4]) > _SURE * five.sigmas[part.stop - 1]
+        for part, camera in zip(five.state.parts, five.state.cameras, strict=True)
+    ]
+    sound = all(lens_objection(camera) is None for camera in five.state.cameras)
+    return five if any(told) and sound else four
 
 
 def errors(state: State, views: Sequence[View], target: Target) -> tuple[tuple[F64, ...], ...]:
@@ -105,14 +133,17 @@ def _board(view: View, eye: int, target: Target) -> F64:
     return target.corners[view.seen[eye].ids, :2]
 
 
-def _alone(views: Sequence[View], target: Target, size: tuple[int, int], eye: int) -> tuple[State, list[int]]:
+def _alone(
+    views: Sequence[View], target: Target, size: tuple[int, int], eye: int, model: str
+) -> tuple[State, list[int]]:
     """One camera by itself, and which views it has."""
     at = [k for k, view in enumerate(views) if start.enough(_board(view, eye, target))]
     if len(at) < LEAST_VIEWS:
         raise ValueError(f"cam{eye}: {len(at)} views of the target; {LEAST_VIEWS} are needed at least")
     mine = [View(views[k].name, (views[k].seen[eye],)) for k in at]
     boards = [_board(view, 0, target) for view in mine]
-    camera = start.first_camera(boards, [view.seen[0].px for view in mine], size)
+    begin = start.first_camera if model == RADTAN else start.first_fisheye
+    camera = begin(boards, [view.seen[0].px for view in mine], size)
     poses = [start.pose(camera, xy, view.seen[0].px) for xy, view in zip(boards, mine, strict=True)]
     return _solve(mine, target, State((camera,), np.eye(4), np.stack(poses))).state, at
 
@@ -137,7 +168,7 @@ def _first_pose(state: State, view: View, target: Target) -> F64:
 
 
 def _linear(state: State, view: View, k: int, eye: int, target: Target) -> tuple[F64, F64, F64, F64]:
-    """Residuals (N, 2) and the derivatives of what is predicted, by intrinsics (N, 2, 8), by xi of
+    """Residuals (N, 2) and the derivatives of what is predicted, by intrinsics (N, 2, I), by xi of
     T_cam1_cam0 and by xi of T_cam0_target (N, 2, 6)."""
     seen = view.seen[eye]
     points, by_pose = moved(state.T_cam0_target[k], target.corners[seen.ids])
@@ -152,12 +183,12 @@ def _linear(state: State, view: View, k: int, eye: int, target: Target) -> tuple
 def _block(state: State, view: View, k: int, target: Target) -> tuple[F64, F64]:
     """Residuals (M, 2) of one view and derivatives (M, 2, S + 6): shared parameters, then its pose."""
     eyes = len(state.cameras)
-    size = shared(eyes)
+    size = shared(state.cameras)
     rs, Js = [], []
     for eye in range(eyes):
         r, by_intrinsics, by_mount, by_pose = _linear(state, view, k, eye, target)
         J = np.zeros((len(r), 2, size + 6))
-        J[:, :, INTRINSICS * eye : INTRINSICS * (eye + 1)] = by_intrinsics
+        J[:, :, state.parts[eye]] = by_intrinsics
         J[:, :, size:] = by_pose
         if eyes == 2:
             J[:, :, size - 6 : size] = by_mount
@@ -166,9 +197,9 @@ def _block(state: State, view: View, k: int, target: Target) -> tuple[F64, F64]:
     return np.concatenate(rs), np.concatenate(Js)
 
 
-def shared(eyes: int) -> int:
-    """How many parameters the views share: 8 intrinsics of each camera, and xi of T_cam1_cam0."""
-    return INTRINSICS * eyes + 6 * (eyes - 1)
+def shared(cameras: Sequence[Camera]) -> int:
+    """How many parameters the views share: intrinsics of each camera, and xi of T_cam1_cam0."""
+    return sum(len(names(camera)) for camera in cameras) + 6 * (len(cameras) - 1)
 
 
 def _solve(views: Sequence[View], target: Target, state: State, cameras_fixed: bool = False) -> Solution:
@@ -245,8 +276,8 @@ def _moved(state: State, shared: F64, poses: F64) -> State | None:
     """None where a step leads to no camera."""
     try:
         cameras = tuple(
-            camera_of(intrinsics(c) + shared[INTRINSICS * k : INTRINSICS * (k + 1)], (c.width, c.height))
-            for k, c in enumerate(state.cameras)
+            camera_of(intrinsics(camera) + shared[part], camera)
+            for camera, part in zip(state.cameras, state.parts, strict=True)
         )
     except ValueError:
         return None

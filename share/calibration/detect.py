@@ -34,12 +34,13 @@ class Detection:
         return len(self.ids)
 
 
-def detector(target: Target) -> Callable[[U8], Detection]:
-    """What finds this target's corners in a gray image (H, W); none found is an empty Detection."""
-    return _april(target) if isinstance(target, AprilGrid) else _charuco(target)
+def detector(target: Target, fisheye: bool = False) -> Callable[[U8], Detection]:
+    """What finds this target's corners in a gray image (H, W), of a fisheye lens or not; none found is an
+    empty Detection."""
+    return _april(target, fisheye) if isinstance(target, AprilGrid) else _charuco(target)
 
 
-def _april(grid: AprilGrid) -> Callable[[U8], Detection]:
+def _april(grid: AprilGrid, fisheye: bool) -> Callable[[U8], Detection]:
     options = cv2.aruco.DetectorParameters()
     options.markerBorderBits = 2
     options.errorCorrectionRate = 1.0  # 5 bits: any two tags of the family differ in 11
@@ -56,7 +57,7 @@ def _april(grid: AprilGrid) -> Callable[[U8], Detection]:
         found = np.asarray(tags).reshape(-1)
         px = np.asarray(quads, np.float32).reshape(-1, 4, 2)[:, _OURS]
         found, px = _once(found, px, grid.rows * grid.cols)
-        there = _in_place(grid.tags[found], px)
+        there = np.ones(len(found), bool) if fisheye else _in_place(grid.tags[found], px)
         return _corners(image, grid, 4 * found[there, None] + np.arange(4), px[there])
 
     return find

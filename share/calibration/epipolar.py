@@ -19,13 +19,18 @@ from share.types import F64
 
 def off_line(cam0: Camera, cam1: Camera, T_cam1_cam0: F64, views: Sequence[View]) -> F64:
     """(N,) px of cam1 without its distortion, signed: each corner that both saw, from the line on which
-    cam0's puts it."""
+    cam0's puts it. Of fisheye lenses px of the image, of those corners that have normalised coordinates."""
     pairs = [_both(view) for view in views]
     px0, px1 = (np.concatenate([pair[eye] for pair in pairs] or [np.empty((0, 2))]) for eye in (0, 1))
     lines = rays(cam0.normalise(px0)) @ (hat(T_cam1_cam0[:3, 3]) @ T_cam1_cam0[:3, :3]).T
-    apart = (rays(cam1.normalise(px1)) * lines).sum(axis=1)
+    uv1 = cam1.normalise(px1)
+    apart = (rays(uv1) * lines).sum(axis=1)
     off: F64 = cam1.focal * apart / np.linalg.norm(lines[:, :2], axis=1)
-    return off
+    if not cam1.fisheye:
+        return off
+    nearest = uv1 - (apart / (lines[:, :2] ** 2).sum(axis=1))[:, None] * lines[:, :2]
+    miss = cam1.focal * np.linalg.norm(cam1.evened(uv1) - cam1.evened(nearest), axis=1) * np.sign(apart)
+    return np.asarray(miss[np.isfinite(miss)])
 
 
 def typical_miss(cam0: Camera, cam1: Camera, T_cam1_cam0: F64, views: Sequence[View]) -> float:

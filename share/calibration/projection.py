@@ -1,6 +1,7 @@
-"""Projection of a target's corners with radial-tangential distortion, and all its derivatives.
+"""Projection of a target's corners by a lens, and all its derivatives.
 
-Model and order of the coefficients as in `share.geometry.camera`: fx fy cx cy k1 k2 p1 p2.
+Models and order of the coefficients as in `share.geometry.lens`: fx fy cx cy, then k1 k2 p1 p2 [k3] of
+radtan, k1 k2 k3 k4 of equidistant.
 """
 
 from __future__ import annotations
@@ -8,47 +9,42 @@ from __future__ import annotations
 import numpy as np
 
 from share.geometry.camera import Camera
+from share.geometry.lens import EQUIDISTANT, lens
 from share.geometry.se3 import hat
 from share.types import F64
 
-INTRINSICS = 8
+_RADTAN, _EQUIDISTANT = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")
+
+
+def names(camera: Camera) -> tuple[str, ...]:
+    """Of its parameters, in order: as many as are sought with it."""
+    coefficients = _EQUIDISTANT if camera.model == EQUIDISTANT else _RADTAN
+    return "fx", "fy", "cx", "cy", *coefficients[: max(len(camera.distortion), 4)]
 
 
 def intrinsics(camera: Camera) -> F64:
-    """(8,): fx fy cx cy k1 k2 p1 p2."""
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *(camera.distortion or (0.0,) * 4)[:4]])
+    """(I,): those of `names`."""
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *(camera.distortion or (0.0,) * 4)])
 
 
-def camera_of(theta: F64, size: tuple[int, int]) -> Camera:
-    """The camera of `theta` (8,) with images of size (width, height). Raises ValueError."""
+def camera_of(theta: F64, like: Camera) -> Camera:
+    """The camera of `theta` (I,) with the images and the model of another. Raises ValueError."""
     fx, fy, cx, cy, *distortion = (float(value) for value in theta)
-    return Camera(*size, fx, fy, cx, cy, tuple(distortion))
+    return Camera(like.width, like.height, fx, fy, cx, cy, tuple(distortion), like.model)
 
 
 def project(camera: Camera, points: F64) -> tuple[F64, F64, F64]:
-    """Points (N, 3) in the camera frame -> px (N, 2), d px / d intrinsics (N, 2, 8) and d px / d points
-    (N, 2, 3). Points behind the camera give NaN."""
-    z = np.where(points[:, 2] > 1e-6, points[:, 2], np.nan)
-    uv = points[:, :2] / z[:, None]
-    px = camera.distort(uv)
-    into = np.zeros((len(points), 2, 3))
-    into[:, 0, 0] = into[:, 1, 1] = 1 / z
-    into[:, :, 2] = -uv / z[:, None]
-    return px, _by_intrinsics(camera, px, uv), camera.jacobian(uv) @ into
-
-
-def _by_intrinsics(camera: Camera, px: F64, uv: F64) -> F64:
-    x, y = uv.T
-    r2 = x * x + y * y
-    out = np.zeros((len(uv), 2, INTRINSICS))
-    out[:, 0, 0] = (px[:, 0] - camera.cx) / camera.fx
-    out[:, 1, 1] = (px[:, 1] - camera.cy) / camera.fy
-    out[:, 0, 2] = out[:, 1, 3] = 1
-    bent = np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x], axis=1)
-    out[:, 0, 4:] = camera.fx * bent
-    bent = np.stack([y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y], axis=1)
-    out[:, 1, 4:] = camera.fy * bent
-    return out
+    """Points (N, 3) in the camera frame -> px (N, 2), d px / d intrinsics (N, 2, I) and d px / d points
+    (N, 2, 3). What is out of the lens's range gives NaN: behind the camera, unless it is a fisheye."""
+    bends = lens(camera.model, camera.distortion or (0.0,) * 4)
+    if not camera.fisheye:
+        points = np.where(points[:, 2:] > 1e-6, points, np.nan)
+    bent, scale = bends.bend_points(points), np.array([camera.fx, camera.fy])
+    by = np.zeros((len(points), 2, len(names(camera))))
+    by[:, 0, 0], by[:, 1, 1] = bent.T
+    by[:, 0, 2] = by[:, 1, 3] = 1
+    by[:, :, 4:] = bends.by_coefficients(points) * scale[:, None]
+    return bent * scale + (camera.cx, camera.cy), by, bends.jacobian_points(points) * scale[:, None]
 
 
 def moved(T: F64, points: F64) -> tuple[F64, F64]:

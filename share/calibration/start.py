@@ -15,9 +15,12 @@ import numpy as np
 
 from share.geometry import se3
 from share.geometry.camera import Camera
+from share.geometry.lens import EQUIDISTANT
+from share.geometry.se3 import hat
 from share.types import F64
 
 LEAST_CORNERS = 6
+_FISHEYE, _TRIED = (0.15, 1.5), 48  # focal lengths over the image's longer side
 _RANK = 1e-3  # of the largest singular value
 
 
@@ -39,8 +42,58 @@ def first_camera(boards: Sequence[F64], pixels: Sequence[F64], size: tuple[int, 
 
 def pose(camera: Camera, board: F64, px: F64) -> F64:
     """T_cam_target (4, 4) of one view, closed form: [r1 r2 t] of the homography of normalised corners."""
+    if camera.fisheye:
+        return _pose_by_directions(camera.directions(px), board)
     H = homography(board, camera.normalise(px))
     H = H / np.linalg.norm(H[:, :2], axis=0).mean() * np.sign(H[2, 2])
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])])
+    T[:3, 3] = H[:, 2]
+    return se3.orthonormal(T)
+
+
+def first_fisheye(boards: Sequence[F64], pixels: Sequence[F64], size: tuple[int, int]) -> Camera:
+    """A fisheye camera without coefficients, its axis in the image's middle, from the same: of many focal
+    lengths the one by which the boards are flattest. Raises ValueError where none will do."""
+    best, least = None, np.inf
+    for f in np.geomspace(*_FISHEYE, _TRIED) * max(size):
+        middle = (np.array(size) - 1) / 2
+        camera = Camera(
+            *size, float(f), float(f), float(middle[0]), float(middle[1]), (0.0,) * 4, EQUIDISTANT
+        )
+        off = [_off_px(camera, xy, px) for xy, px in zip(boards, pixels, strict=True)]
+        if (cost := float(np.median(np.concatenate(off)))) < least:
+            best, least = camera, cost
+    if best is None:
+        raise ValueError(
+            "the views do not tell the focal length of a fisheye lens; is --target another board?"
+        )
+    return best
+
+
+def _off_px(camera: Camera, board: F64, px: F64) -> F64:
+    """(N,) by how much corners miss where a pose has them; inf where there is none."""
+    if np.isnan(camera.directions(px)).any():
+        return np.full(len(px), np.inf)
+    T = pose(camera, board, px)
+    there = board @ T[:3, :2].T + T[:3, 3]
+    off: F64 = np.linalg.norm(camera.project_all(there) - px, axis=1)
+    return np.nan_to_num(off, nan=np.inf)
+
+
+def _pose_by_directions(ray: F64, board: F64) -> F64:
+    """T_cam_target (4, 4) of unit vectors (N, 3), NaN unknown, to corners (N, 2) m: the direct linear
+    transform of ray x (H xy1) = 0, which also holds behind the camera."""
+    known = np.isfinite(ray).all(axis=1)
+    ray, xy = ray[known], board[known]
+    middle, scale = xy.mean(axis=0), float(xy.std())
+    at = np.column_stack([(xy - middle) / scale, np.ones(len(xy))])
+    A = (hat(ray)[:, :, :, None] * at[:, None, None, :]).reshape(-1, 9)
+    H = np.linalg.svd(A, full_matrices=False)[2][-1].reshape(3, 3)
+    H = H @ np.array([[1 / scale, 0, -middle[0] / scale], [0, 1 / scale, -middle[1] / scale], [0, 0, 1.0]])
+    H = H / np.linalg.norm(H[:, :2], axis=0).mean()
+    ahead = np.einsum("ni,ij,nj->n", ray, H, np.column_stack([xy, np.ones(len(xy))]))
+    H = H * np.sign(np.median(ahead))
     T = np.eye(4)
     T[:3, :3] = np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])])
     T[:3, 3] = H[:, 2]

@@ -12,7 +12,7 @@ from share.calibration import corners
 from share.calibration.bundle import LEAST_VIEWS, Solution, View
 from share.calibration.coverage import Coverage
 from share.calibration.epipolar import typical_miss
-from share.calibration.projection import INTRINSICS, intrinsics
+from share.calibration.projection import intrinsics
 from share.types import F64
 
 _WRONG_SHARE = 0.05
@@ -94,7 +94,8 @@ def judge(
 def _reasons(solution: Solution, eye: int, rms: float, lost: int, limits: Limits) -> list[str]:
     views = sum(len(view[eye]) > 0 for view in solution.residuals)
     corners = sum(len(view[eye]) for view in solution.residuals)
-    part = slice(INTRINSICS * eye, INTRINSICS * eye + 2)
+    begin = solution.state.parts[eye].start
+    part = slice(begin, begin + 2)
     loose = float((solution.sigmas[part] / intrinsics(solution.state.cameras[eye])[:2]).max())
     out = []
     if views < max(limits.views, LEAST_VIEWS):

@@ -32,6 +32,10 @@ if TYPE_CHECKING:
     "--views", "most", type=click.IntRange(4), default=60, show_default=True, metavar="N",
     help="Use the N views that together tell most.",
 )  # fmt: skip
+@click.option(
+    "--lens", "model", type=click.Choice(["radtan", "equidistant"]), default="radtan", show_default=True,
+    help="Radial-tangential, or the fisheye model of Kannala and Brandt.",
+)  # fmt: skip
 @options.calib
 @options.workers
 @options.out_folder
@@ -42,6 +46,7 @@ def camera(
     camera: str,
     every: int,
     most: int,
+    model: str,
     calib: str | None,
     workers: int,
     out: Path,
@@ -50,6 +55,7 @@ def camera(
     """Find focal lengths, principal point and distortion of a camera or a stereo pair, and how the pair sits,
     from a recording of a calibration board or a folder with cam0/*.png and cam1/*.png.
 
+    A radtan lens has its fifth coefficient, k3, where the views tell it.
     Exit code 1 where the result is not to be believed; the files are written all the same. A camchain and a
     report that are in DIR are then kept.
 
@@ -73,7 +79,7 @@ def camera(
         to_kalibr(pictures.said.rig, pictures.said)  # what is kept of it must be sound: said before the work
     options.say_another(source, pictures.said, pictures.serial)
     writable_dir(out, CAMCHAIN, REPORT, PICTURE)
-    outcome = _calibrated(source, pictures, target, every, most, workers)
+    outcome = _calibrated(source, pictures, target, every, most, model, workers)
     text = json.dumps(known(camera_report.to_json(outcome)), indent=1)
     files = places(out, outcome.verdict.passed, CAMCHAIN, REPORT, PICTURE)
     chain, report, picture = files
@@ -88,7 +94,7 @@ def camera(
 
 
 def _calibrated(
-    source: str, pictures: Pictures, target: Target, every: int, most: int, workers: int
+    source: str, pictures: Pictures, target: Target, every: int, most: int, model: str, workers: int
 ) -> Outcome:
     from share.calibration.bundle import calibrate
     from share.calibration.coverage import choose, coverage
@@ -99,7 +105,9 @@ def _calibrated(
     from share.io.camera_report import Outcome
 
     with Stages() as stages:
-        views, sizes = find_views(pictures, target, every, partial(stages, "looking for the board"), workers)
+        views, sizes = find_views(
+            pictures, target, every, partial(stages, "looking for the board"), workers, model == "equidistant"
+        )
         if len(set(sizes)) > 1:
             raise DataError(
                 f"{source}: pictures of {sizes[0]} and {sizes[1]}; calibrate one with --camera cam0"
@@ -112,7 +120,7 @@ def _calibrated(
         used = [seen[k] for k in choose(seen, target, sizes[0], most)]
         stages("calibrating", 0, 1)
         try:
-            solution = calibrate(used, target, sizes[0])
+            solution = calibrate(used, target, sizes[0], model)
         except ValueError as error:
             raise DataError(f"{source}: {error}") from None
         stages("calibrating", 1, 1)

@@ -162,5 +162,6 @@ def _text(d: dict[str, Any]) -> str:
 
 def _camera(camera: dict[str, Any]) -> str:
     (width, height), (fx, fy, *_) = camera["resolution"], camera["intrinsics"]
-    distortion = "radial-tangential" if camera["distortion"] else "no distortion"
+    named = "fisheye" if camera["lens"] == "equidistant" else "radial-tangential"
+    distortion = named if camera["distortion"] else "no distortion"
     return f"{width}x{height}, f {fx:.1f} {fy:.1f} px, {camera['fov_deg']:.0f} deg wide, {distortion}"

@@ -13,6 +13,7 @@ from share.geometry import se3
 from share.geometry.camera import Rig
 from share.place.matching import match
 from share.types import F64, U8, Frame
+from share.vision.field import EVEN_DEG, within
 from share.vision.view import orb
 
 MAX_HAMMING = 64  # of 256 bits
@@ -44,7 +45,7 @@ def find(
 
     Twice as many inliers are asked for as tracking needs: nothing else vouches for the answer.
     """
-    px, descriptors = orb(frame.image0, config.view_features)
+    px, descriptors = orb(frame.image0, config.view_features, within=within(rig.cam0, EVEN_DEG))
     uv = rig.cam0.normalise(px.astype(np.float64))
     found = (_against(keyframe, uv, descriptors, rig.cam0.focal, config, seed) for keyframe in keyframes)
     best = max((f for f in found if f is not None), key=lambda f: f.inliers.sum(), default=None)

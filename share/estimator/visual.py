@@ -24,6 +24,7 @@ from share.geometry import se3
 from share.geometry.camera import ImuBias, Rig, rays
 from share.types import F32, F64, I64, U8, Candidate, Footing, Frame, TrackState, View, Wait
 from share.vision import corners, klt
+from share.vision.field import EVEN_DEG, within
 from share.vision.view import depth_at, make_view
 
 RESEMBLANCE = 0.8  # NCC below which a re-found patch is another thing
@@ -174,6 +175,7 @@ class VisualTracker:
         expected = self._project(se3.inverse(T_predicted), rows[rows >= 0])
         guess = np.where(np.isnan(expected), tracks.px, expected).astype(np.float32)
         px, found = klt.follow(self._image, image, tracks.px, guess, levels=2)
+        found &= self._rig.cam0.knows(px.astype(np.float64))
         self._found, self._sought = _Tracks(tracks.ids, px).take(found), len(tracks.ids)
         return self._found
 
@@ -242,12 +244,14 @@ class VisualTracker:
         host_px = self._map.host_px[rows]
         px, found = klt.follow(source, image, host_px, guess, window=15, levels=1, back_check_px=None)
         found &= klt.resemblance(source, image, host_px, px) > RESEMBLANCE
+        found &= self._rig.cam0.knows(px.astype(np.float64))
         return _Tracks(self._map.ids[rows], px).take(found)
 
     def _add_corners(self, frame: Frame, host: int) -> None:
         assert self._T_odom_cam is not None
         wanted = self._config.corners - len(self._tracks.ids)
-        px = corners.strongest(frame.image0, self._tracks.px, wanted, self._config.spacing_px)
+        seen = within(self._rig.cam0, EVEN_DEG)
+        px = corners.strongest(frame.image0, self._tracks.px, wanted, self._config.spacing_px, within=seen)
         uv = self._rig.cam0.normalise(px.astype(np.float64))
         z = depth_at(frame, self._rig, px, uv)
         known = ~np.isnan(z)

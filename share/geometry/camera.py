@@ -1,7 +1,7 @@
-"""Pinhole cameras with radial-tangential distortion, and the rig that holds them.
+"""Cameras with a radial-tangential or a fisheye lens, and the rig that holds them.
 
-Pixel centres are at integers: the centre of the top-left pixel is (0, 0). Distortion is OpenCV's
-plumb-bob model k1 k2 p1 p2 [k3] (Brown 1966), Kalibr's `radtan` and EuRoC's `radial-tangential`.
+Pixel centres are at integers: the centre of the top-left pixel is (0, 0). `share.geometry.lens` has the
+lenses.
 """
 
 from __future__ import annotations
@@ -10,7 +10,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from share.geometry.lens import COUNTS, EQUIDISTANT, RADTAN, Equidistant, Radtan, lens
 from share.types import F64, checked, checked_pose
 
 MOST_TIMESHIFT_S = 1.0
@@ -28,9 +30,15 @@ def rays(uv: F64) -> F64:
     return np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
 
 
+def _either(counts: tuple[int, ...]) -> str:
+    *first, last = (str(count) for count in counts)
+    return " or ".join([", ".join(first), last]) if first else last
+
+
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics in pixels; `distortion` is () or (k1, k2, p1, p2) or (k1, k2, p1, p2, k3)."""
+    """Intrinsics in pixels; `distortion` is () or (k1, k2, p1, p2) or (k1, k2, p1, p2, k3) of the `model`
+    radtan, (k1, k2, k3, k4) of equidistant."""
 
     width: int
     height: int
@@ -39,16 +47,21 @@ class Camera:
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()
+    model: str = RADTAN
 
     def __post_init__(self) -> None:
+        if self.model not in COUNTS:
+            raise ValueError(f"lens model '{self.model:.40}' is not known; known: {', '.join(COUNTS)}")
         if self.width <= 0 or self.height <= 0:
             raise ValueError(f"resolution: {self.width}x{self.height} is not positive")
         if self.width * self.height > MOST_PIXELS:
             raise ValueError(f"resolution: {self.width}x{self.height} is more than a camera has")
         if not (self.fx > 0 and self.fy > 0):
             raise ValueError(f"intrinsics: focal lengths {self.fx}, {self.fy} must be positive")
-        if len(self.distortion) not in (0, 4, 5):
-            raise ValueError(f"distortion: {len(self.distortion)} coefficients, expected 0, 4 or 5")
+        if len(self.distortion) not in (counts := COUNTS[self.model]):
+            raise ValueError(
+                f"distortion: {len(self.distortion)} coefficients, expected {_either(counts)} of {self.model}"
+            )
         if not np.isfinite([self.fx, self.fy, self.cx, self.cy, *self.distortion]).all():
             raise ValueError("intrinsics: has values that are not finite")
         shortest, longest = _FOCAL_PX
@@ -65,8 +78,29 @@ class Camera:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     @property
+    def lens(self) -> Radtan | Equidistant | None:
+        """None without distortion."""
+        return lens(self.model, self.distortion) if self.distortion else None
+
+    @property
+    def fisheye(self) -> bool:
+        """Whether a pixel is much more of the normalised coordinates at the edge than in the middle."""
+        return self.model == EQUIDISTANT
+
+    @property
+    def bounded(self) -> bool:
+        """Whether the lens's range may end within the image: there pixels have no normalised coordinates."""
+        return self.fisheye or ((bends := self.lens) is not None and bends.limit < math.inf)
+
+    @property
     def field_rad(self) -> tuple[float, float]:
-        """Across and upright, as without distortion: 2 atan(size / 2 f)."""
+        """Across and upright: 2 atan(size / 2 f), as without distortion; of a fisheye lens as it has it, as
+        far as there are normalised coordinates."""
+        if isinstance(bends := self.lens, Equidistant):
+            sides = np.array([[self.width / (2 * self.fx), 0.0], [0.0, self.height / (2 * self.fy)]])
+            half = np.arccos(bends.directions(sides)[:, 2])
+            across, upright = (2 * np.fmin(half, bends.widest)).tolist()
+            return across, upright
         return 2 * math.atan(self.width / (2 * self.fx)), 2 * math.atan(self.height / (2 * self.fy))
 
     @property
@@ -75,72 +109,62 @@ class Camera:
         return (self.fx + self.fy) / 2
 
     def project(self, points: F64) -> F64:
-        """Points (..., 3) in the camera frame -> pixels (..., 2). Behind the camera gives NaN."""
+        """Points (..., 3) in the camera frame -> pixels (..., 2). What has no normalised coordinates gives
+        NaN: behind the camera, beyond the lens's range."""
         z = np.where(points[..., 2:] > 1e-6, points[..., 2:], np.nan)
         return self.distort(points[..., :2] / z)
 
+    def project_all(self, points: F64) -> F64:
+        """The same, also of what a fisheye lens sees that has none; NaN beyond the lens's range."""
+        if not isinstance(bends := self.lens, Equidistant):
+            return self.project(points)
+        return bends.bend_points(points) * (self.fx, self.fy) + (self.cx, self.cy)
+
     def distort(self, uv: F64) -> F64:
-        """Normalised coordinates (..., 2) -> pixels (..., 2)."""
+        """Normalised coordinates (..., 2) -> pixels (..., 2); NaN beyond the lens's range."""
         if self.distortion:
-            uv = self._radtan(uv)
+            uv = lens(self.model, self.distortion).bend(uv)
         return uv * (self.fx, self.fy) + (self.cx, self.cy)
 
     def normalise(self, px: F64, about: F64 | None = None) -> F64:
-        """Pixels (..., 2) -> undistorted normalised coordinates (x/z, y/z), to 1e-9 inside the image. about:
-        where they nearly are, from which it is found sooner."""
+        """Pixels (..., 2) -> undistorted normalised coordinates (x/z, y/z), to 1e-9 inside the image; NaN
+        beyond the lens's range. about: where they nearly are, from which it is found sooner."""
         observed = (px - (self.cx, self.cy)) / (self.fx, self.fy)
         if not self.distortion:
             return observed
-        uv = (observed if about is None else about).copy()
-        for k in range(8):  # Newton on the 2x2 system; converges quadratically inside the image
-            if k == 0 or about is None:  # near enough, the first derivative will do
-                J = self._radtan_jacobian(uv)
-                J = J / (J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0])[..., None, None]
-            r = observed - self._radtan(uv)
-            uv[..., 0] += J[..., 1, 1] * r[..., 0] - J[..., 0, 1] * r[..., 1]
-            uv[..., 1] += J[..., 0, 0] * r[..., 1] - J[..., 1, 0] * r[..., 0]
-            if np.nanmax(np.abs(r), initial=0.0) < 1e-6:  # so the step leaves about its square
-                break
-        return uv
+        return lens(self.model, self.distortion).straighten(observed, about)
+
+    def directions(self, px: F64) -> F64:
+        """Pixels (..., 2) -> unit vectors (..., 3) in the camera frame, also of what has no normalised
+        coordinates; NaN beyond the lens's range."""
+        observed = (px - (self.cx, self.cy)) / (self.fx, self.fy)
+        if (bends := self.lens) is not None:
+            return bends.directions(observed)
+        ray = np.concatenate([observed, np.ones((*observed.shape[:-1], 1))], axis=-1)
+        return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
 
     def jacobian(self, uv: F64) -> F64:
         """d(pixel)/d(normalised coordinates) at (..., 2): (..., 2, 2)."""
         scale = np.array([[self.fx], [self.fy]])
         if not self.distortion:
             return np.broadcast_to(scale * np.eye(2), (*uv.shape, 2)).copy()
-        return scale * self._radtan_jacobian(uv)
+        return scale * lens(self.model, self.distortion).jacobian(uv)
+
+    def evened(self, uv: F64) -> F64:
+        """Normalised coordinates (..., 2) to such of which a pixel is as much, 1 / focal, all over the image:
+        of a fisheye lens those in its image plane, of others the same."""
+        return lens(self.model, self.distortion).bend(uv) if self.fisheye else uv
+
+    def knows(self, px: F64) -> NDArray[np.bool_]:
+        """Which pixels (..., 2) have normalised coordinates."""
+        if not self.bounded:
+            return np.ones(px.shape[:-1], bool)
+        return np.asarray(np.isfinite(self.normalise(px)).all(axis=-1))
 
     def inside(self, px: F64, border: float = 0.0) -> np.ndarray:
         """Which pixels (..., 2) lie in the image, at least `border` px from its edge."""
         upper = (self.width - 1 - border, self.height - 1 - border)
         return np.asarray(((px >= border) & (px <= upper)).all(axis=-1))
-
-    def _coefficients(self) -> tuple[float, float, float, float, float]:
-        k1, k2, p1, p2, *k3 = self.distortion
-        return k1, k2, p1, p2, k3[0] if k3 else 0.0
-
-    def _radtan(self, uv: F64) -> F64:
-        k1, k2, p1, p2, k3 = self._coefficients()
-        x, y = uv[..., 0], uv[..., 1]
-        r2 = x * x + y * y
-        xy, radial = 2 * x * y, 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        out = np.empty(uv.shape)
-        out[..., 0] = x * radial + p1 * xy + p2 * (r2 + 2 * x * x)
-        out[..., 1] = y * radial + p1 * (r2 + 2 * y * y) + p2 * xy
-        return out
-
-    def _radtan_jacobian(self, uv: F64) -> F64:
-        """d(distorted)/d(undistorted), (..., 2, 2)."""
-        k1, k2, p1, p2, k3 = self._coefficients()
-        x, y = uv[..., 0], uv[..., 1]
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # d(radial)/d(r2) * 2, so d/dx = slope * x
-        J = np.empty((*uv.shape, 2))
-        J[..., 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-        J[..., 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-        J[..., 0, 1] = J[..., 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
-        return J
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from share.geometry import se3
 from share.geometry.camera import BASELINE_M, Camera, ImuNoise, Rig, rays
+from share.geometry.lens import WIDEST_DEG
 from share.types import F64
 
 _LEAST_PX = 32  # of an image's side: less holds no features
@@ -19,6 +20,7 @@ _SQUARE = 2.0  # times that a pixel may be longer than wide, or a camera's focal
 _GRID = (17, 13)  # of pixels that a lens is tried at
 _EXACT_PX = 0.5  # of the way there and back
 _FOLDED, _SHARED = 0.1, 0.2  # parts of an image: that may have no ray; that another camera has to see
+_USED = 0.4  # part of a fisheye lens's image that has to be of use
 _SEEN_M = (1.0, 5.0)  # what is held before two cameras
 _ROLL_DEG = 30.0  # by which two images may be turned against each other
 _LEVER_M = 10.0  # from the IMU to the camera
@@ -63,6 +65,14 @@ def _of_lens(camera: Camera) -> Iterator[str]:
         yield f"focal lengths {camera.fx:g} and {camera.fy:g} px: pixels are nearly square; calibrate again"
     with np.errstate(all="ignore"):
         uv, known = _tried(camera)
+    if camera.fisheye and (beyond := _beyond(camera)).any():  # of no use, and no fault
+        if 1 - beyond.mean() < _USED:
+            yield (
+                f"{100 * beyond.mean():.0f} % of its image lie beyond {WIDEST_DEG:g} degrees off the axis, "
+                "where nothing is tracked; focal lengths are in pixels of the images that are recorded"
+            )
+            return
+        uv, known = uv[~beyond], known[~beyond]
     folded = 1 - known.mean()
     if folded > _FOLDED:
         yield (
@@ -78,11 +88,22 @@ def _of_lens(camera: Camera) -> Iterator[str]:
         )
 
 
+def _pixels(camera: Camera) -> F64:
+    """(N, 2) all over the image."""
+    x, y = np.linspace(0, camera.width - 1, _GRID[0]), np.linspace(0, camera.height - 1, _GRID[1])
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def _beyond(camera: Camera) -> NDArray[np.bool_]:
+    """Which of the pixels that are tried have a ray, but no normalised coordinates."""
+    z = camera.directions(_pixels(camera))[:, 2]
+    return np.asarray(z < np.cos(np.radians(WIDEST_DEG)))
+
+
 def _tried(camera: Camera) -> tuple[F64, NDArray[np.bool_]]:
     """Of pixels all over the image their normalised coordinates (N, 2), and which (N,) really are: the same
     way up as in the middle, and back to where they came from."""
-    x, y = np.linspace(0, camera.width - 1, _GRID[0]), np.linspace(0, camera.height - 1, _GRID[1])
-    px = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    px = _pixels(camera)
     uv = camera.normalise(px)
     back = np.abs(camera.distort(uv) - px).max(axis=1)
     upright = np.linalg.det(camera.jacobian(uv)) > 0

@@ -93,17 +93,23 @@ def _pictures(folder: Path) -> dict[str, Path]:
 
 
 def find_views(
-    pictures: Pictures, target: Target, every: int, told: Callable[[int, int], None], workers: int = 1
+    pictures: Pictures,
+    target: Target,
+    every: int,
+    told: Callable[[int, int], None],
+    workers: int = 1,
+    fisheye: bool = False,
 ) -> tuple[list[View], list[tuple[int, int]]]:
     """Views of every `every`-th picture, also empty ones, and each camera's size. Finding a board takes
     some hundredths of a second: `workers` processes share that.
 
-    told: how many are done, of how many. Raises DataError where pictures of a camera differ in size.
+    told: how many are done, of how many. fisheye: what the lenses are. Raises DataError where pictures of a
+    camera differ in size.
     """
     sizes: list[tuple[int, int]] = []
     views: dict[int, View] = {}
     count = -(-pictures.count // every)
-    for job, seen in _looked(_jobs(pictures, every, sizes), target, max(1, min(workers, count))):
+    for job, seen in _looked(_jobs(pictures, every, sizes), (target, fisheye), max(1, min(workers, count))):
         views[job.number] = View(job.name, seen)
         told(len(views), count)
     return [views[k] for k in sorted(views)], sizes
@@ -129,23 +135,23 @@ def _jobs(pictures: Pictures, every: int, sizes: list[tuple[int, int]]) -> Itera
 
 
 def _looked(
-    jobs: Iterator[_Job], target: Target, workers: int
+    jobs: Iterator[_Job], what: tuple[Target, bool], workers: int
 ) -> Iterator[tuple[_Job, tuple[Detection, ...]]]:
     """Every job and what its images show, as they are done."""
     if workers == 1:  # a process of its own takes a second to begin
-        _begin(target)
+        _begin(*what)
         yield from ((job, _seen(job)) for job in jobs)
         return
-    with Pool(workers, _begin, (target,)) as pool:
+    with Pool(workers, _begin, what) as pool:
         yield from pool.run(_seen, jobs)
 
 
 _find: Callable[[U8], Detection] | None = None  # of a process
 
 
-def _begin(target: Target) -> None:
+def _begin(target: Target, fisheye: bool) -> None:
     global _find
-    _find = detector(target)
+    _find = detector(target, fisheye)
 
 
 def _seen(job: _Job) -> tuple[Detection, ...]:

@@ -1,8 +1,8 @@
 """Calibration files to a `Rig`: Kalibr's chains, EuRoC's sensor.yaml, and camera.yaml of RGB-D folders.
 
 The body is the IMU's frame where there is an IMU, else cam0's. Cameras are pinhole with
-radial-tangential distortion or none; other models are refused by name. The files are written down
-in docs/data.md.
+radial-tangential or equidistant (fisheye) distortion or none; other models are refused by name. The files
+are written down in docs/data.md.
 """
 
 from __future__ import annotations
@@ -18,12 +18,14 @@ import numpy as np
 from share.errors import ConfigError
 from share.geometry import se3
 from share.geometry.camera import MOST_TIMESHIFT_S, Camera, ImuNoise, Rig
+from share.geometry.lens import COUNTS, EQUIDISTANT, RADTAN
 from share.io.section import Section, read_yaml
 from share.types import F64
 
 CAMCHAIN = "kalibr_imucam_chain.yaml"
 IMU_CHAIN = "kalibr_imu_chain.yaml"
-_RADTAN = ("radtan", "radial-tangential", "plumb_bob")
+_MODELS = dict.fromkeys(("radtan", "radial-tangential", "plumb_bob"), RADTAN)  # by their names in files
+_MODELS |= dict.fromkeys(("equidistant", "kannala_brandt", "fisheye"), EQUIDISTANT)
 TIMESHIFT = "timeshift_cam_imu"
 SERIAL = "serial"
 _AGREE_S = 1e-3  # timeshifts of two cameras that look together
@@ -127,9 +129,9 @@ def read_camera_yaml(path: Path) -> Calibration:
     if "depth_intrinsics" in top:
         fx, fy, cx, cy = top.numbers("depth_intrinsics", (4,))
         width, height = _resolution(top, "depth_resolution" if "depth_resolution" in top else "resolution")
-        depth, T = _make(top, width, height, fx, fy, cx, cy, ()), top.pose("T_depth_cam0")
+        depth, T = _make(top, width, height, (fx, fy, cx, cy)), top.pose("T_depth_cam0")
     else:  # registered: depth lies on the pixels of the undistorted colour image
-        depth, T = replace(cam0, distortion=()), np.eye(4)
+        depth, T = replace(cam0, distortion=(), model=RADTAN), np.eye(4)
     rig = Rig(cam0=cam0, T_body_cam0=np.eye(4), depth=depth, T_depth_cam0=T)
     return Calibration(rig, str(path), top.number("depth_scale", positive=True), eyes=(top,))
 
@@ -157,21 +159,19 @@ def _camera(section: Section) -> Camera:
         raise ConfigError(f"{section.where}: camera_model '{model}' is not supported; supported: pinhole")
     fx, fy, cx, cy = section.numbers("intrinsics", (4,))
     width, height = _resolution(section, "resolution")
-    return _make(section, width, height, fx, fy, cx, cy, _distortion(section))
+    return _make(section, width, height, (fx, fy, cx, cy), *_distortion(section))
 
 
 def _make(
     section: Section,
     width: int,
     height: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    distortion: tuple[float, ...],
+    intrinsics: tuple[float, float, float, float],
+    distortion: tuple[float, ...] = (),
+    model: str = RADTAN,
 ) -> Camera:
     with said_of(section.where):
-        return Camera(width, height, fx, fy, cx, cy, distortion)
+        return Camera(width, height, *intrinsics, distortion, model)
 
 
 def _resolution(section: Section, key: str) -> tuple[int, int]:
@@ -181,17 +181,24 @@ def _resolution(section: Section, key: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _distortion(section: Section) -> tuple[float, ...]:
-    model = section.text("distortion_model", "none")
-    if model == "none":
-        return ()
-    if model not in _RADTAN:
+def _distortion(section: Section) -> tuple[tuple[float, ...], str]:
+    """Coefficients and model."""
+    named = section.text("distortion_model", "none")
+    if named == "none":
+        return (), RADTAN
+    model = lens_model(named)
+    if model is None:
         raise ConfigError(
-            f"{section.where}: distortion_model '{model}' is not supported; supported: {', '.join(_RADTAN)}, "
+            f"{section.where}: distortion_model '{named}' is not supported; supported: {', '.join(_MODELS)}, "
             "none (calibrate again with one of these)"
         )
     key = "distortion_coeffs" if "distortion_coeffs" in section else "distortion_coefficients"
-    return tuple(section.numbers(key, (4, 5)))
+    return tuple(section.numbers(key, tuple(n for n in COUNTS[model] if n))), model
+
+
+def lens_model(named: str) -> str | None:
+    """The model (`share.geometry.lens`) that files give this name; None where there is none."""
+    return _MODELS.get(named)
 
 
 def imu_noise(section: Section, rate: str) -> ImuNoise:

@@ -13,7 +13,7 @@ import yaml
 from share.calibration.bundle import Solution, View
 from share.calibration.corners import kept, reach
 from share.calibration.coverage import Coverage
-from share.calibration.projection import INTRINSICS, intrinsics
+from share.calibration.projection import intrinsics, names
 from share.calibration.verdict import Verdict, residuals
 from share.geometry import se3
 from share.geometry.camera import Rig
@@ -22,8 +22,6 @@ from share.io.kalibr import to_kalibr
 from share.types import F64
 
 REPORT, PICTURE = "camera-report.json", "camera-report.png"
-NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-
 _ARROWS = 1500  # more hide each other
 
 
@@ -84,8 +82,8 @@ def kalibr_text(outcome: Outcome, source: str, report: str) -> str:
 
 
 def to_json(outcome: Outcome) -> dict[str, Any]:
-    """Plain data: verdict, each camera, the mounting, each view. covariance: of `NAMES` of each camera and,
-    of two, xi of T_cam1_cam0 Exp(xi)."""
+    """Plain data: verdict, each camera, the mounting, each view. covariance: of the parameters of each camera
+    and, of two, xi of T_cam1_cam0 Exp(xi)."""
     verdict = outcome.verdict
     out: dict[str, Any] = {
         "passed": verdict.passed,
@@ -111,11 +109,12 @@ def to_json(outcome: Outcome) -> dict[str, Any]:
 
 
 def _camera(outcome: Outcome, eye: int) -> dict[str, Any]:
-    cover, values = outcome.covers[eye], intrinsics(outcome.solution.state.cameras[eye])
-    sigmas = outcome.solution.sigmas[INTRINSICS * eye : INTRINSICS * (eye + 1)]
+    state = outcome.solution.state
+    camera, cover, sigmas = state.cameras[eye], outcome.covers[eye], outcome.solution.sigmas[state.parts[eye]]
     return {
-        "parameters": dict(zip(NAMES, values.tolist(), strict=True)),
-        "sigmas": dict(zip(NAMES, sigmas.tolist(), strict=True)),
+        "lens": camera.model,
+        "parameters": dict(zip(names(camera), intrinsics(camera).tolist(), strict=True)),
+        "sigmas": dict(zip(names(camera), sigmas.tolist(), strict=True)),
         "rms_px": outcome.verdict.rms_px[eye],
         "rms_all_px": outcome.verdict.rms_all_px[eye],
         "corners_left_out": outcome.verdict.wrong[eye],
@@ -131,13 +130,15 @@ def table(outcome: Outcome) -> list[list[str]]:
     rows = [["", "", "found", "sigma", *(["before", "change"] if before else [])]]
     olds = (before.cam0, before.cam1) if before else (None, None)
     for eye, camera in enumerate(state.cameras):
-        old = olds[eye]
-        for k, (name, value) in enumerate(zip(NAMES, intrinsics(camera).tolist(), strict=True)):
-            sigma = outcome.solution.sigmas[INTRINSICS * eye + k]
+        old, sigmas = olds[eye], outcome.solution.sigmas[state.parts[eye]]
+        had = {} if old is None else dict(zip(names(old), intrinsics(old).tolist(), strict=True))
+        same = old is not None and old.model == camera.model
+        for k, (name, value) in enumerate(zip(names(camera), intrinsics(camera).tolist(), strict=True)):
+            sigma = sigmas[k]
             digits = 3 if k < 4 else 5
             row = [f"cam{eye}", name, f"{value:.{digits}f}", f"{sigma:.{digits}f}"]
             if before:
-                was = float(intrinsics(old)[k]) if old else float("nan")
+                was = had.get(name, 0.0) if same or (old is not None and k < 4) else float("nan")
                 row += [f"{was:.{digits}f}", f"{value - was:+.{digits}f}"]
             rows.append(row)
     if len(state.cameras) == 2:

@@ -11,6 +11,7 @@ from share.core.measurement import CAM0, CAM1, IMU, LazyImage, Measurement
 from share.errors import DataError, MisfitError, UsageError
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise
+from share.geometry.lens import EQUIDISTANT
 from share.io.files import atomic_write, check_replaceable, new_folder
 from share.io.images import EncodedImage, encode_png, image_format
 from share.io.mcap import rig as ros_rig
@@ -148,7 +149,8 @@ def _pose(T: F64) -> dict[str, object]:
 
 
 def _camera_yaml(camera: Camera, T_bs: F64, rate_hz: float) -> str:
-    distortion = {"distortion_model": "radial-tangential", "distortion_coefficients": list(camera.distortion)}
+    named = EQUIDISTANT if camera.fisheye else "radial-tangential"
+    distortion = {"distortion_model": named, "distortion_coefficients": list(camera.distortion)}
     return _yaml(
         {
             "sensor_type": "camera",

@@ -64,7 +64,8 @@ def _camera(camera: Camera) -> dict[str, Any]:
         "resolution": [camera.width, camera.height],
         "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
         "distortion": list(camera.distortion),
-        "fov_deg": round(float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx))), 1),
+        "lens": camera.model,
+        "fov_deg": round(float(np.degrees(camera.field_rad[0])), 1),
     }
 
 

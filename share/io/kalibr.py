@@ -55,7 +55,7 @@ def kalibr_texts(rig: Rig, remark: str, serial: str | None = None) -> dict[str, 
 
 def _camera(camera: Camera) -> dict[str, Any]:
     distortion = (
-        {"distortion_model": "radtan", "distortion_coeffs": list(camera.distortion)}
+        {"distortion_model": camera.model, "distortion_coeffs": list(camera.distortion)}
         if camera.distortion
         else {"distortion_model": "none"}
     )

@@ -13,6 +13,7 @@ import numpy as np
 
 from share.errors import ConfigError
 from share.geometry.camera import Camera, ImuNoise, Rig
+from share.geometry.lens import RADTAN
 from share.geometry.se3 import inverse
 from share.types import F64
 
@@ -65,10 +66,12 @@ class ImuFacts:
 
 @dataclass(frozen=True)
 class Lens:
-    """intrinsics: fx fy cx cy, px; distortion: none or k1 k2 p1 p2 [k3] (radtan)."""
+    """intrinsics: fx fy cx cy, px; distortion: none or k1 k2 p1 p2 [k3] of model radtan, k1 k2 k3 k4 of
+    equidistant."""
 
     intrinsics: tuple[float, float, float, float]
     distortion: tuple[float, ...] = ()
+    model: str = RADTAN
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,9 @@ class Mode:
     def cameras(self) -> tuple[Camera, Camera]:
         """Both cameras. Raises ValueError where a lens is none."""
         size = (self.width, self.height)
-        left, right = (Camera(*size, *lens.intrinsics, lens.distortion) for lens in (self.cam0, self.cam1))
+        left, right = (
+            Camera(*size, *eye.intrinsics, eye.distortion, eye.model) for eye in (self.cam0, self.cam1)
+        )
         return left, right
 
 
@@ -267,7 +272,7 @@ class Profile:
                 raise ConfigError(f"profile '{self.name}': {error}") from None
         if self.device.depth is None:
             raise ConfigError(f"profile '{self.name}': its device measures no depth; use stereo, or d435i")
-        return replace(base, depth=replace(left, distortion=()), T_depth_cam0=np.eye(4))
+        return replace(base, depth=replace(left, distortion=(), model=RADTAN), T_depth_cam0=np.eye(4))
 
     @property
     def baseline_m(self) -> float:

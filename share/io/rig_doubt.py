@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from share.calibration.bundle import shared
-from share.calibration.projection import intrinsics
+from share.calibration.projection import intrinsics, names
 from share.errors import DataError
-from share.geometry.camera import Rig
-from share.io.camera_report import NAMES, REPORT
+from share.geometry.camera import Camera, Rig
+from share.geometry.lens import RADTAN
+from share.io.camera_report import REPORT
 from share.io.earlier import failed
 from share.io.json_file import read_json
 from share.types import F64
@@ -54,7 +55,7 @@ def _told(path: Path, rig: Rig) -> RigDoubt | None:
         passed = bool(told["passed"])
     except (KeyError, TypeError, ValueError):
         return None if "covariance" not in told else _damaged(path)
-    size = shared(_eyes(rig))
+    size = shared(_cameras(rig))
     if covariance.shape != (size, size) or not np.isfinite(covariance).all():
         return _damaged(path)
     return RigDoubt(covariance, str(path), passed)
@@ -64,17 +65,21 @@ def _damaged(path: Path) -> RigDoubt:
     raise DataError(f"{path}: is damaged; calibrate the cameras again, or move it away")
 
 
-def _eyes(rig: Rig) -> int:
-    return 1 if rig.cam1 is None else 2
+def _cameras(rig: Rig) -> list[Camera]:
+    return [camera for camera in (rig.cam0, rig.cam1) if camera is not None]
 
 
 def _same(told: dict[str, Any], rig: Rig) -> bool:
     """Whether a report is of these very numbers."""
-    cameras = [camera for camera in (rig.cam0, rig.cam1) if camera is not None]
+    cameras = _cameras(rig)
     if len(told["cameras"]) != len(cameras):
         return False
+    if any(
+        one.get("lens", RADTAN) != camera.model for one, camera in zip(told["cameras"], cameras, strict=True)
+    ):
+        return False
     pairs = [
-        ([one["parameters"][name] for name in NAMES], intrinsics(camera))
+        ([one["parameters"][name] for name in names(camera)], intrinsics(camera))
         for one, camera in zip(told["cameras"], cameras, strict=True)
     ]
     if rig.T_cam1_cam0 is not None:

@@ -80,7 +80,7 @@ def find_stamped(
     source: RigPictures, target: Target, every: int, told: Callable[[int, int], None], workers: int = 1
 ) -> Stamped:
     """told: how many are done, of how many. Raises DataError."""
-    views, sizes = find_views(source.pictures, target, every, told, workers)
+    views, sizes = find_views(source.pictures, target, every, told, workers, source.rig.cam0.fisheye)
     cameras = [camera for camera in (source.rig.cam0, source.rig.cam1) if camera is not None]
     for eye, (size, camera) in enumerate(zip(sizes, cameras, strict=False)):
         _same_size(source.name, eye, size, camera)

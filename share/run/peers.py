@@ -118,6 +118,8 @@ def calibration(source: Source) -> dict[str, Any]:
     rig = source.rig
     if rig.cam1 is None or rig.T_cam1_cam0 is None or rig.imu is None:
         raise UsageError(f"{source.name}: is {rig.kind}; other trackers are run with stereo+imu")
+    if rig.cam0.fisheye or rig.cam1.fisheye:
+        raise UsageError(f"{source.name}: has a fisheye lens; other trackers are run with radtan or none")
     T_body_cam1 = rig.T_body_cam0 @ se3.inverse(rig.T_cam1_cam0)
     return {
         "cameras": [_camera(rig.cam0, rig.T_body_cam0), _camera(rig.cam1, T_body_cam1)],

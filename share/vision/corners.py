@@ -16,8 +16,9 @@ _BORDER = 6  # px
 _CELLS = (8, 6)  # of the image
 
 
-def detect(image: U8, taken: F32, count: int, spacing: float) -> F32:
+def detect(image: U8, taken: F32, count: int, spacing: float, within: U8 | None = None) -> F32:
     """Up to `count` new corners (N, 2) px, at least `spacing` px from each other and from `taken` (M, 2).
+    within (H, W): a mask of where to look.
 
     Minimum-eigenvalue corners (Shi and Tomasi 1994), refined to a fraction of a pixel. Parts of the image
     that have few come first, so that no bright poster takes them all; `taken` ones count.
@@ -25,6 +26,8 @@ def detect(image: U8, taken: F32, count: int, spacing: float) -> F32:
     if count <= 0:
         return np.zeros((0, 2), np.float32)
     px, strength = _peaks(image)
+    if within is not None:
+        px, strength = _masked(px, strength, within)
     order = evenly(px, strength, image.shape[::-1], _CELLS, taken)
     chosen = _apart(px[order], taken, count, spacing, image.shape)
     if len(chosen) == 0:
@@ -32,14 +35,22 @@ def detect(image: U8, taken: F32, count: int, spacing: float) -> F32:
     return _refined(image, chosen)
 
 
-def strongest(image: U8, taken: F32, count: int, spacing: float, quality: float = 0.005) -> F32:
+def _masked(px: I64, strength: F32, within: U8) -> tuple[I64, F32]:
+    seen = within[px[:, 1], px[:, 0]] > 0
+    return px[seen], strength[seen]
+
+
+def strongest(
+    image: U8, taken: F32, count: int, spacing: float, quality: float = 0.005, within: U8 | None = None
+) -> F32:
     """As `detect`, wherever they are: those down to `quality` times the best. Few good ones are worth more
     than many where no IMU helps (0.5 cm less in the kitchen of docs/tracking.md)."""
     if count <= 0:
         return np.zeros((0, 2), np.float32)
-    found = cv2.goodFeaturesToTrack(
-        image, count, quality, spacing, mask=_free(taken, spacing, image.shape), blockSize=_BLOCK
-    )
+    free = _free(taken, spacing, image.shape)
+    if within is not None:
+        free &= within
+    found = cv2.goodFeaturesToTrack(image, count, quality, spacing, mask=free, blockSize=_BLOCK)
     return np.zeros((0, 2), np.float32) if found is None else _refined(image, found)
 
 

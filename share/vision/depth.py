@@ -110,5 +110,21 @@ def _two_rays(rig: Rig, rays0: F64, uv1: F64) -> tuple[F64, F64]:
     z = (A * b).sum(axis=1) / np.maximum((A * A).sum(axis=1), 1e-12)
     p1 = z[:, None] * a + t
     ahead = np.where(p1[:, 2:] > 0, p1[:, 2:], np.nan)
-    error: F64 = np.linalg.norm(p1[:, :2] / ahead - uv1, axis=1) * rig.cam1.focal
+    off = rig.cam1.evened(p1[:, :2] / ahead) - rig.cam1.evened(uv1)
+    error: F64 = np.linalg.norm(off, axis=1) * rig.cam1.focal
     return z, error
+
+
+def disparity_px(rig: Rig, uv: F64, rho: F64) -> F64:
+    """px (N,) by which points on rays uv (N, 2), at inverse depths (N,), move in cam1 for 1/m more. Of a
+    fisheye lens they move less the farther off the axis they are; of others this takes it as it is in the
+    middle."""
+    assert rig.cam1 is not None and rig.T_cam1_cam0 is not None
+    if not rig.cam1.fisheye:
+        return np.full(len(uv), rig.cam1.focal * rig.baseline)
+    R, t = rig.T_cam1_cam0[:3, :3], rig.T_cam1_cam0[:3, 3]
+    q = rays(uv) @ R.T + np.nan_to_num(rho)[:, None] * t
+    by_rho = (t[:2] - q[:, :2] / q[:, 2:] * t[2]) / q[:, 2:]
+    moved = rig.cam1.jacobian(q[:, :2] / q[:, 2:]) @ by_rho[:, :, None]
+    out: F64 = np.linalg.norm(moved[:, :, 0], axis=1)
+    return out

@@ -6,6 +6,7 @@ import numpy as np
 
 from share.geometry.camera import Rig, rays
 from share.types import F32, F64, U8
+from share.vision.depth import disparity_px
 from share.vision.patches import sample
 
 _NEAREST_M = 0.3
@@ -24,23 +25,27 @@ def search(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64) -> F64:
         return np.zeros(0)
     scale = rig.cam0.focal * rig.baseline
     rho = np.arange(0.0, scale / _NEAREST_M, _STEP_PX) / scale
+    if rig.cam1.fisheye:  # steps of as many px at the edge, where they are more of inverse depth
+        rho = rho * (scale / np.maximum(disparity_px(rig, uv, np.zeros(len(uv))), 0.02 * scale))[:, None]
     score = _scores(image0, image1, rig, px, uv, rho)
     best = score.argmax(axis=1)
     top = score[np.arange(len(px)), best]
-    near = np.abs(np.arange(len(rho)) - best[:, None]) < _SAME
+    near = np.abs(np.arange(rho.shape[-1]) - best[:, None]) < _SAME
     clear = (top > _ALIKE) & (np.where(near, -1, score).max(axis=1) < top - _CLEAR)
-    out: F64 = np.where(clear, 1 / np.maximum(rho[best], 0.25 / scale), np.nan)
+    found = rho[best] if rho.ndim == 1 else rho[np.arange(len(px)), best]
+    out: F64 = np.where(clear, 1 / np.maximum(found, 0.25 / scale), np.nan)
     return out
 
 
 def _scores(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, rho: F64) -> F32:
-    """Correlation (N, K) of each patch with that at each inverse depth (K,); -1 outside the image."""
+    """Correlation (N, K) of each patch with that at each inverse depth (K,), or its own (N, K); -1 outside
+    the image."""
     assert rig.cam1 is not None and rig.T_cam1_cam0 is not None
     R, t = rig.T_cam1_cam0[:3, :3], rig.T_cam1_cam0[:3, 3]
-    q = (rays(uv) @ R.T)[:, None] + rho[:, None] * t
+    q = (rays(uv) @ R.T)[:, None] + rho[..., None] * t
     at = rig.cam1.project(q.reshape(-1, 3))
     here = np.nan_to_num(at, nan=-1e3).astype(np.float32)
-    there = _patches(image1, here).reshape(len(px), len(rho), -1)
+    there = _patches(image1, here).reshape(len(px), rho.shape[-1], -1)
     score = np.einsum("nks,ns->nk", there, _patches(image0, px))
     inside = rig.cam1.inside(here.astype(np.float64), 1.0).reshape(score.shape)
     out: F32 = np.where(inside, score, np.float32(-1))

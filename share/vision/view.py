@@ -8,6 +8,7 @@ import numpy as np
 from share.geometry.camera import Rig, rays
 from share.types import F32, F64, U8, Frame, View
 from share.vision import depth as depths
+from share.vision.field import EVEN_DEG, within
 from share.vision.grid import evenly
 
 _BESIDE_PX = 4.0  # of a known point, where nothing measures depth: as deep
@@ -34,7 +35,7 @@ def make_view(frame: Frame, rig: Rig, count: int = 500, known: tuple[F32, F64] |
     """ORB features (Rublee et al. 2011) of cam0 with 3D points where the frame gives depth. known: px (M, 2)
     and depth (M,) m of points whose neighbours will not be much nearer or further; where the frame measures
     nothing, only what is right beside them has a depth."""
-    px, descriptors = orb(frame.image0, count)
+    px, descriptors = orb(frame.image0, count, within=within(rig.cam0, EVEN_DEG))
     uv = rig.cam0.normalise(px.astype(np.float64))
     if known is not None and not measures_depth(frame, rig):
         z = _nearest(px, *known, _BESIDE_PX)
@@ -53,13 +54,14 @@ def _nearest(px: F32, known_px: F32, known_m: F64, within_px: float = np.inf) ->
     return out
 
 
-def orb(image: U8, count: int, grid: tuple[int, int] = (8, 6)) -> tuple[F32, U8]:
-    """Up to `count` ORB keypoints (N, 2) px and descriptors (N, 32), strongest first in each cell.
+def orb(image: U8, count: int, grid: tuple[int, int] = (8, 6), within: U8 | None = None) -> tuple[F32, U8]:
+    """Up to `count` ORB keypoints (N, 2) px and descriptors (N, 32), strongest first in each cell. within
+    (H, W): a mask of where to look.
 
     OpenCV's detector alone crowds them on the strongest texture; pose from a crowd is weak.
     """
     detector = cv2.ORB.create(nfeatures=3 * count, scaleFactor=1.2, nlevels=6, fastThreshold=10)
-    keypoints = detector.detect(image, None)
+    keypoints = detector.detect(image, within)
     if not keypoints:
         return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
     px = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32)

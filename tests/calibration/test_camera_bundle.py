@@ -10,7 +10,7 @@ from share.calibration.coverage import GRID as COVER_GRID
 from share.calibration.coverage import Coverage, choose, coverage
 from share.calibration.detect import Detection
 from share.calibration.epipolar import off_line, typical_miss
-from share.calibration.projection import camera_of, intrinsics, moved, project
+from share.calibration.projection import camera_of, intrinsics, moved, names, project
 from share.calibration.start import enough
 from share.calibration.verdict import judge
 from share.geometry import se3
@@ -21,6 +21,8 @@ from share.types import F64
 SIZE = (752, 480)
 LEFT = Camera(*SIZE, 458.6, 457.3, 367.2, 248.4, (-0.283, 0.074, 2e-4, 2e-5))
 RIGHT = Camera(*SIZE, 457.6, 456.1, 379.9, 255.2, (-0.284, 0.075, -1e-4, -4e-5))
+FIVE = Camera(*SIZE, 458.6, 457.3, 367.2, 248.4, (-0.315, 0.136, 1e-4, -1e-4, -0.032))  # the real EuRoC lens
+FISHEYE = Camera(512, 512, 190.98, 190.97, 254.93, 256.9, (0.0035, 0.0007, -0.002, 0.0002), "equidistant")
 GRID = AprilGrid()
 
 
@@ -42,12 +44,18 @@ def _poses(rng: np.random.Generator, count: int) -> F64:
     return T
 
 
-def _views(rng: np.random.Generator, noise_px: float, count: int = 25, wrong: float = 0.0) -> list[View]:
+def _views(
+    rng: np.random.Generator,
+    noise_px: float,
+    count: int = 25,
+    wrong: float = 0.0,
+    pair: tuple[Camera, Camera] = (LEFT, RIGHT),
+) -> list[View]:
     out = []
     for k, T in enumerate(_poses(rng, count)):
         seen = []
-        for camera, pose in ((LEFT, T), (RIGHT, _mount() @ T)):
-            px = camera.project(se3.transform(pose, GRID.corners))
+        for camera, pose in zip(pair, (T, _mount() @ T), strict=True):
+            px = camera.project_all(se3.transform(pose, GRID.corners))
             ids = np.flatnonzero(camera.inside(px, 3.0))
             noisy = px[ids] + rng.normal(0, noise_px, (len(ids), 2))
             spoilt = rng.random(len(ids)) < wrong
@@ -57,19 +65,22 @@ def _views(rng: np.random.Generator, noise_px: float, count: int = 25, wrong: fl
     return out
 
 
-def test_the_derivatives_of_a_projection_are_those_by_differences(rng: np.random.Generator) -> None:
-    T = se3.exp(np.array([3.0, 0.1, 0.2, -0.2, 0.3, 0.9]))
-    points = GRID.corners[::7]
+@pytest.mark.parametrize("camera", [LEFT, FIVE, FISHEYE], ids=["radtan", "with k3", "equidistant"])
+def test_the_derivatives_of_a_projection_are_those_by_differences(camera: Camera) -> None:
+    T, points = _poses(np.random.default_rng(0), 1)[0], GRID.corners[::7]
+    points = points[np.isfinite(camera.project(se3.transform(T, points))).all(axis=1)]
+    assert len(points) > 10
     at, by_pose = moved(T, points)
-    _, by_intrinsics, by_points = project(LEFT, at)
-    h = 1e-6
-    for k in range(8):
-        step = np.eye(8)[k] * h
-        high, low = (camera_of(intrinsics(LEFT) + s * step, SIZE).project(at) for s in (1, -1))
+    px, by_intrinsics, by_points = project(camera, at)
+    np.testing.assert_allclose(px, camera.project(at), atol=1e-9)
+    h, count = 1e-6, len(names(camera))
+    for k in range(count):
+        step = np.eye(count)[k] * h
+        high, low = (camera_of(intrinsics(camera) + s * step, camera).project(at) for s in (1, -1))
         np.testing.assert_allclose(by_intrinsics[:, :, k], (high - low) / (2 * h), rtol=1e-5, atol=1e-5)
     for k in range(6):
         xi = np.eye(6)[k] * h
-        high, low = (LEFT.project(se3.transform(T @ se3.exp(s * xi), points)) for s in (1, -1))
+        high, low = (camera.project(se3.transform(T @ se3.exp(s * xi), points)) for s in (1, -1))
         predicted = (by_points @ by_pose)[:, :, k]
         np.testing.assert_allclose(predicted, (high - low) / (2 * h), rtol=1e-5, atol=1e-4)
 
@@ -79,6 +90,41 @@ def test_without_noise_a_stereo_pair_is_found_exactly(rng: np.random.Generator) 
     for found, truth in zip(solution.state.cameras, (LEFT, RIGHT), strict=True):
         np.testing.assert_allclose(intrinsics(found), intrinsics(truth), rtol=1e-6, atol=1e-6)
     assert np.linalg.norm(se3.log(se3.inverse(_mount()) @ solution.state.T_cam1_cam0)) < 1e-7
+
+
+def test_k3_is_taken_where_the_views_tell_it(rng: np.random.Generator) -> None:
+    def one_camera(pair: tuple[Camera, Camera]) -> bundle.State:
+        views = [View(view.name, view.seen[:1]) for view in _views(rng, 0.1, 12, pair=pair)]
+        solution = calibrate(views, GRID, SIZE)
+        off = (intrinsics(solution.state.cameras[0]) - intrinsics(pair[0])) / solution.sigmas
+        assert np.abs(off).max() < 4.5
+        return solution.state
+
+    assert len(one_camera((FIVE, FIVE)).cameras[0].distortion) == 5
+    assert len(one_camera((LEFT, RIGHT)).cameras[0].distortion) == 4
+
+
+def test_a_fisheye_pair_is_found(rng: np.random.Generator) -> None:
+    """Also from boards so near that they reach beyond 75 degrees, where a tracker sees nothing."""
+    views = []
+    for k, T in enumerate(_poses(rng, 12)):
+        T[:3, 3] *= 0.4
+        seen = []
+        for pose in (T, _mount() @ T):
+            px = FISHEYE.project_all(se3.transform(pose, GRID.corners))
+            ids = np.flatnonzero(FISHEYE.inside(np.nan_to_num(px, nan=-1.0), 3.0))
+            seen.append(Detection(ids, px[ids] + rng.normal(0, 0.1, (len(ids), 2))))
+        views.append(View(str(k), tuple(seen)))
+    every = np.concatenate([one.px for view in views for one in view.seen])
+    assert np.isnan(FISHEYE.normalise(every)).any()
+    found = calibrate(views, GRID, (512, 512), "equidistant")
+    for camera, part in zip(found.state.cameras, found.state.parts, strict=True):
+        assert camera.model == "equidistant"
+        assert np.abs((intrinsics(camera) - intrinsics(FISHEYE)) / found.sigmas[part]).max() < 4.5
+    assert found.sigma_px == pytest.approx(0.1, rel=0.1)
+    assert np.linalg.norm(se3.log(se3.inverse(_mount()) @ found.state.T_cam1_cam0)) < 1e-3
+    state = found.state
+    assert typical_miss(*state.cameras, state.T_cam1_cam0, views) < 0.2
 
 
 def test_with_corners_of_one_weight_it_is_opencvs_solution(

@@ -227,7 +227,7 @@ def with_moved_cameras(run: Recorded, step: F64) -> Recorded:
     rig = run.rig
     assert rig.cam1 is not None and rig.T_cam1_cam0 is not None
     cam0, cam1 = (
-        camera_of(intrinsics(camera) + part, (camera.width, camera.height))
+        camera_of(intrinsics(camera) + part, camera)
         for camera, part in ((rig.cam0, step[:8]), (rig.cam1, step[8:16]))
     )
     return replace(

@@ -159,10 +159,19 @@ EUROC_DAMAGE = {
         lambda r: edit(r / CAM0 / "sensor.yaml", "T_BS:", "T_unknown:"),
     ),
     "no YAML": (2, "not valid YAML", lambda r: (r / CAM0 / "sensor.yaml").write_text("a: [1")),
-    "fisheye": (
+    "unknown lens": (
         2,
-        "distortion_model 'equidistant' is not supported; supported: radtan",
-        lambda r: edit(r / CAM0 / "sensor.yaml", "radial-tangential", "equidistant"),
+        "distortion_model 'fov' is not supported; supported: radtan",
+        lambda r: edit(r / CAM0 / "sensor.yaml", "radial-tangential", "fov"),
+    ),
+    "a fisheye of five numbers": (
+        2,
+        "distortion_coeffs: expected 4 numbers, found 5",
+        lambda r: edit(
+            r / CAM0 / "sensor.yaml",
+            "radial-tangential\ndistortion_coefficients: [",
+            "equidistant\ndistortion_coeffs: [0.0, ",
+        ),
     ),
     "mono": (2, "stereo, depth or an IMU is needed", lambda r: leave_only_cam0(r / "mav0")),
 }

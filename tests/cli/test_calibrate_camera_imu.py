@@ -12,12 +12,11 @@ from board_pictures import printed
 from camera_imu_sim import NOISE, SHIFT_S, T_IMU_CAM0, Dance, record
 from shell import Done
 
-from share.calibration.projection import intrinsics
+from share.calibration.projection import intrinsics, names
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 from share.geometry.target import CharucoBoard
 from share.io.calibration import read_calibration
-from share.io.camera_report import NAMES
 from share.io.kalibr import to_kalibr
 
 SECONDS, HZ = 7.5, 8.0
@@ -79,7 +78,7 @@ def badly_known(dance: Path, folder: Path) -> Path:
     """bare.yaml and a report beside it, of half a pixel: 2e-3 rad."""
     folder.mkdir()
     (folder / "kalibr_imucam_chain.yaml").write_text((dance / "bare.yaml").read_text())
-    parameters = dict(zip(NAMES, intrinsics(CAMERA).tolist(), strict=True))
+    parameters = dict(zip(names(CAMERA), intrinsics(CAMERA).tolist(), strict=True))
     covariance = np.diag([0.3, 0.3, 0.5, 0.5, 1e-3, 1e-3, 1e-4, 1e-4]) ** 2
     told = {"passed": False, "cameras": [{"parameters": parameters}], "covariance": covariance.tolist()}
     (folder / "camera-report.json").write_text(json.dumps(told))

@@ -24,14 +24,6 @@ def test_projection_is_opencvs(rng):
     assert np.abs(EUROC.project(points) - want.reshape(-1, 2)).max() < 1e-9
 
 
-def test_distortion_jacobian_against_differences(rng):
-    uv, eps = rng.uniform(-0.7, 0.7, (50, 2)), 1e-6
-    J = EUROC._radtan_jacobian(uv)
-    for axis, d in enumerate(np.eye(2) * eps):
-        difference = (EUROC._radtan(uv + d) - EUROC._radtan(uv - d)) / (2 * eps)
-        assert np.abs(J[..., axis] - difference).max() < 1e-8
-
-
 def test_behind_the_camera_is_nowhere():
     assert np.isnan(PLAIN.project(np.array([[0.0, 0, -1], [0, 0, 0]]))).all()
 
@@ -48,6 +40,8 @@ def test_inside_counts_pixel_centres():
         ({"width": 0}, "resolution"),
         ({"fx": -1.0}, "focal"),
         ({"distortion": (0.1,)}, "distortion"),
+        ({"model": "equidistant"}, "0 coefficients, expected 4 of equidistant"),
+        ({"model": "omni"}, "'omni' is not known; known: radtan, equidistant"),
         ({"cx": float("nan")}, "finite"),
     ],
 )

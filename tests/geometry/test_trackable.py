@@ -13,6 +13,11 @@ from share.geometry.trackable import lens_objection, objection
 
 LENS = (-0.28340811, 0.07395907, 0.00019359, 1.76e-05)
 EUROC = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, LENS)
+FISHEYE = (0.00348, 0.000715, -0.00205, 0.000203)
+TUMVI = {
+    **{"width": 512, "height": 512, "fx": 191.0, "fy": 191.0, "cx": 255.0, "cy": 257.0},
+    **{"distortion": FISHEYE, "model": "equidistant"},
+}
 NOISE = ImuNoise(1.7e-4, 2.0e-3, 1.9e-5, 3.0e-3, 200.0)
 RIG = Rig(EUROC, np.eye(4), EUROC, se3.compose(np.eye(3), np.array([-0.11, 0, 0])), imu=NOISE)
 DEPTH = replace(RIG, cam1=None, T_cam1_cam0=None, depth=EUROC, T_depth_cam0=np.eye(4))
@@ -39,6 +44,10 @@ def both(**values: object) -> Rig:
         both(width=64, height=48, fx=40.0, fy=40.0, cx=31.5, cy=23.5),
         both(fx=150.0, fy=150.0, distortion=()),  # 136 degrees
         both(distortion=(-0.4, 0.2, 0.0, 0.0, -0.05)),
+        both(**TUMVI),
+        both(
+            **TUMVI | {"width": 848, "height": 800, "fx": 286.0, "fy": 286.0, "cx": 420.0, "cy": 400.0}
+        ),  # T265
         replace(RIG, T_cam1_cam0=turned(10.0, 2)),
         replace(RIG, T_cam1_cam0=turned(15.0, 1)),
     ],
@@ -55,6 +64,8 @@ def test_what_people_have_is_let_through(rig: Rig) -> None:
         (both(width=16, height=16, cx=8.0, cy=8.0), "16x16 px hold no features"),
         (both(fx=1.0, fy=1.0, distortion=()), "degrees"),
         (both(fx=1e5, fy=1e5), "degrees"),
+        (both(**TUMVI | {"fx": 90.0, "fy": 90.0}), "of its image lie beyond 75 degrees off the axis"),
+        (both(**TUMVI | {"distortion": (-0.3, 0.0, 0.0, 0.0)}), "distortion folds"),
         (both(fx=4.0), "pixels are nearly square"),
         (both(cx=-900.0), "lies outside an image of 752x480"),
         (both(distortion=(-30.0, 0.0, 0.0, 0.0)), "distortion folds"),

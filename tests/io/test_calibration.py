@@ -7,6 +7,7 @@ import pytest
 
 from share.errors import ConfigError
 from share.geometry import se3
+from share.geometry.trackable import objection
 from share.io.calibration import CAMCHAIN, IMU_CHAIN, kalibr, read_calibration, read_camera_yaml
 from share.io.kalibr import kalibr_texts, to_kalibr
 from share.io.section import Section, read_yaml
@@ -69,6 +70,17 @@ def test_kalibr_extrinsics_mean_what_they_are_named(tmp_path, key0, T0, key1, T1
     assert calibration.topics == {"cam0": "/left/image", "imu": "/imu0"}
 
 
+def test_a_fisheye_lens_is_written_as_it_is_read(tmp_path):
+    text = chain(f"  T_cam_imu: {matrix(T_CAM0_IMU)}\n").replace("radtan", "equidistant")
+    rig = read_calibration(write(tmp_path, text)).rig
+    assert (rig.cam0.model, rig.cam0.distortion) == ("equidistant", (-0.28, 0.07, 0.0002, 1e-05))
+    texts = kalibr_texts(rig, "again")
+    assert "distortion_model: equidistant" in texts[CAMCHAIN]
+    for name, again in texts.items():
+        (tmp_path / name).write_text(again)
+    assert read_calibration(tmp_path).rig.cam0 == rig.cam0
+
+
 def test_a_camchain_alone_has_no_imu_and_body_is_cam0(tmp_path):
     path = write(tmp_path, chain(f"  T_cam_imu: {matrix(T_CAM0_IMU)}\n"), None) / CAMCHAIN
     rig = read_calibration(path).rig
@@ -87,7 +99,7 @@ GOOD0 = f"  T_cam_imu: {matrix(T_CAM0_IMU)}\n"
         (chain(GOOD0, ""), "cam1: has no extrinsics to cam0; add T_cn_cnm1"),
         (chain(f"  T_cam_imu: {BAD}\n"), "cam0: T_cam_imu: is not a rigid transform"),
         (chain("  T_cam_imu: [[1, 0, 0], [0, 1, 0]]\n"), "T_cam_imu: expected a 4x4 matrix, found 6"),
-        (chain(GOOD0).replace("radtan", "equidistant"), "'equidistant' is not supported; supported: radtan"),
+        (chain(GOOD0).replace("radtan", "fov"), "'fov' is not supported; supported: radtan, .*equidistant"),
         (chain(GOOD0).replace("pinhole", "omni"), "camera_model 'omni' is not supported; supported: pinhole"),
         (chain(GOOD0).replace("461.0, ", ""), "cam0: intrinsics: expected 4 numbers, found 3"),
         (chain(GOOD0).replace("460.0", "-460.0"), "focal lengths -460.0, 461.0 must be positive"),
@@ -241,8 +253,10 @@ def test_real_calibrations(shared_data):
     euroc = read_calibration(shared_data / "motion" / "euroc" / "calib").rig
     assert euroc.kind == "stereo+imu"
     assert euroc.baseline == pytest.approx(0.110078, abs=1e-6)
-    with pytest.raises(ConfigError, match="equidistant"):
-        read_calibration(shared_data / "motion" / "tumvi" / "calib")
+    tumvi = read_calibration(shared_data / "motion" / "tumvi" / "calib").rig
+    assert (tumvi.kind, tumvi.cam0.model, tumvi.cam1.model) == ("stereo+imu", "equidistant", "equidistant")
+    assert tumvi.cam0.distortion[:2] == pytest.approx((0.003482, 0.000715), abs=1e-6)
+    assert objection(tumvi) is None
     kitchen = read_camera_yaml(shared_data / "real" / "redkitchen_0000_0499" / "camera.yaml").rig
     assert (kitchen.cam0.fx, kitchen.depth.fx) == (525.0, 585.0)
     assert kitchen.T_depth_cam0[0, 3] == 0.025

@@ -164,6 +164,15 @@ def test_the_rigs_timeshift_is_recorded_with_it():
         ros_rig.from_json(ros_rig.to_json(RIG)[:-1] + ', "timeshift_s": 2}', "x")
 
 
+def test_the_record_tells_a_lens_only_where_it_is_not_radtan():
+    """So what reads no lens models still reads the recordings of cameras that it knows."""
+    assert "model" not in ros_rig.to_json(RIG)
+    fisheye = dataclasses.replace(
+        RIG, cam0=dataclasses.replace(CAMERA, distortion=(0.01,) * 4, model="equidistant")
+    )
+    assert_same_rig(ros_rig.from_json(ros_rig.to_json(fisheye), "x"), fisheye)
+
+
 def test_the_rig_survives_as_ros_messages():
     """CameraInfo and /tf_static tell the same rig as our own record, but for rounding."""
     tree = ros_rig.FrameTree([ros_rig.to_tf(RIG, 0)], "here")
@@ -174,6 +183,8 @@ def test_the_rig_survives_as_ros_messages():
     back = ros_rig.from_camera_info(info, "x")
     assert (back.fx, back.fy, back.cx, back.cy) == (50.0, 51.0, 31.5, 23.5)
     assert back.distortion == (*CAMERA.distortion, 0.0)
+    fisheye = dataclasses.replace(CAMERA, distortion=(0.01, 0.002, -0.003, 4e-4), model="equidistant")
+    assert ros_rig.from_camera_info(ros_rig.to_camera_info(fisheye, ros.header(0, "cam0")), "x") == fisheye
     info.d = np.array([0.1] * 8)
     with pytest.raises(ConfigError, match="not supported"):
         ros_rig.from_camera_info(info, "x")

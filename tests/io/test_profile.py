@@ -27,7 +27,7 @@ def changed(tmp_path: Path):
 
 def test_every_shipped_profile_reads_in_every_mode():
     hosts = {"d435i-n100-headset", "d435i-turtlebot4", "laptop-edge"}
-    assert set(shipped()) == {"d435i", "euroc"} | hosts
+    assert set(shipped()) == {"d435i", "euroc", "tumvi"} | hosts
     for name in set(shipped()) - {"laptop-edge"}:
         for mode in profile(name).device.modes:
             for hz in mode.rates_hz:
@@ -52,6 +52,16 @@ def test_the_d435i_agrees_with_the_example_calibration():
     assert rig.cam0 == example.cam0 and rig.cam1 == example.cam1
     assert np.allclose(rig.T_body_cam0, example.T_body_cam0)
     assert np.allclose(rig.T_cam1_cam0, example.T_cam1_cam0)
+
+
+def test_the_tumvi_rig_is_that_of_its_calibration(shared_data: Path):
+    real = read_calibration(shared_data / "motion" / "tumvi" / "calib").rig
+    rig = profile("tumvi").rig()
+    assert rig.cam0.model == rig.cam1.model == "equidistant"
+    for mine, theirs in ((rig.cam0, real.cam0), (rig.cam1, real.cam1)):
+        assert (mine.fx, mine.cy) == pytest.approx((theirs.fx, theirs.cy))
+        assert mine.distortion == pytest.approx(theirs.distortion)
+    assert np.allclose(rig.T_cam1_cam0, real.T_cam1_cam0) and np.allclose(rig.T_body_cam0, real.T_body_cam0)
 
 
 def test_the_euroc_rig_is_that_of_its_calibration(shared_data: Path):

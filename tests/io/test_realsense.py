@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from share.io.profile import profile
 from share.io.realsense import camera as adapter
 from share.io.realsense.camera import RealSense
 from share.io.realsense.devices import Attached, choose
+from share.io.realsense.factory import camera as factory_camera
 from share.io.realsense.frames import metres
 from share.io.realsense.streams import Wanted
 
@@ -277,3 +279,15 @@ def test_a_camera_that_cannot_be_used_is_refused(devices: list[Attached], says: 
 
 def test_firmware_is_compared_by_number_and_not_by_letter() -> None:
     assert choose([attached(firmware="5.12.10.0")], None, replace(FACTS, firmware_oldest="5.12.9.0"))
+
+
+def test_a_fisheye_lens_of_the_factory() -> None:
+    """As a T265 has it: four coefficients, and a fifth number that is 0."""
+    models = SimpleNamespace(brown_conrady=1, kannala_brandt4=2)
+    told = SimpleNamespace(
+        width=848, height=800, fx=286.0, fy=286.1, ppx=420.0, ppy=400.0, model=2,
+        coeffs=[-0.008, 0.045, -0.042, 0.007, 0.0],
+    )  # fmt: skip
+    profile = SimpleNamespace(as_video_stream_profile=lambda: SimpleNamespace(get_intrinsics=lambda: told))
+    camera = factory_camera(SimpleNamespace(distortion=models), profile)
+    assert (camera.model, camera.distortion) == ("equidistant", (-0.008, 0.045, -0.042, 0.007))

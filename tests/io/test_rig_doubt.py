@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from camera_imu_sim import CAM0, CAM1, T_CAM1_CAM0
 
-from share.calibration.projection import intrinsics
+from share.calibration.projection import intrinsics, names
 from share.errors import DataError
 from share.geometry.camera import Rig
-from share.io.camera_report import NAMES
 from share.io.rig_doubt import rig_doubt
 
 RIG = Rig(CAM0, np.eye(4), CAM1, T_CAM1_CAM0)
@@ -20,7 +19,7 @@ COVARIANCE = np.diag(np.arange(1.0, 23)).tolist()
 
 def report(**changed: object) -> str:
     cameras = [
-        {"parameters": dict(zip(NAMES, intrinsics(one).tolist(), strict=True))} for one in (CAM0, CAM1)
+        {"parameters": dict(zip(names(one), intrinsics(one).tolist(), strict=True))} for one in (CAM0, CAM1)
     ]
     whole = {
         "passed": True,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import sys
 from pathlib import Path
@@ -88,6 +89,13 @@ def test_peer_is_told_the_calibration(source, tmp_path):
     )
     assert np.allclose(np.array(right["T_body_cam"]), [[1, 0, 0, 0.11], *np.eye(4)[1:]], atol=1e-12)
     assert told["imu"]["gyro_density"] == 1.7e-4 and told["imu"]["rate_hz"] == 200
+
+
+def test_a_fisheye_lens_is_refused_in_one_line(source):
+    fisheye = dataclasses.replace(source.rig.cam0, distortion=(0.0,) * 4, model="equidistant")
+    object.__setattr__(source, "rig", dataclasses.replace(source.rig, cam0=fisheye))
+    with pytest.raises(UsageError, match="has a fisheye lens"):
+        calibration(source)
 
 
 def test_answers_come_back(source, tmp_path):

@@ -81,7 +81,11 @@ def keyframes(draw: st.DrawFn) -> Keyframe:
 focals, sides = st.floats(1, 1e5), st.integers(1, m.MAX_SIDE)
 coefficients = st.floats(-1e4, 1e4)
 distortions = st.sampled_from([0, 4, 5]).flatmap(lambda n: st.tuples(*[coefficients] * n))
-cameras = st.builds(Camera, sides, sides, focals, focals, finite, finite, distortions)
+fisheye = st.tuples(*[coefficients] * 4), st.just("equidistant")
+cameras = st.one_of(
+    st.builds(Camera, sides, sides, focals, focals, finite, finite, distortions),
+    st.builds(Camera, sides, sides, focals, focals, finite, finite, *fisheye),
+)
 amount = st.floats(0, 1e9)
 late = st.floats(0, min(m.MAX_DELAY_MS, m.MAX_ERROR_CM))
 noise = st.floats(0, 1e3)

@@ -76,7 +76,7 @@ def rig_sensitivity(state: State, sights: Sights, sigmas: Sigmas) -> F64:
     """By how much each segment's gradient (S, LOCAL) falls with the rig's own parameters, (S, LOCAL, P):
     intrinsics and T_cam1_cam0, which are not sought."""
     T, J, segment = pose_derivatives(state, sights.stamps_ns)
-    out: F64 = np.zeros((state.curve.segments, LOCAL, shared(len(sights.cameras))))
+    out: F64 = np.zeros((state.curve.segments, LOCAL, shared(sights.cameras)))
     np.add.at(out, segment, J.swapaxes(1, 2) @ rig_normal(sights, T, sigmas.px, sigmas.huber))
     return out
 

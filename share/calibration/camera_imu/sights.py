@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.calibration.bundle import View, shared
-from share.calibration.projection import INTRINSICS, moved, project
+from share.calibration.projection import moved, names, project
 from share.geometry import se3
 from share.geometry.camera import Camera
 from share.geometry.target import Target
@@ -66,12 +66,13 @@ def seen(sights: Sights, eye: int, T_target_cam0: F64) -> tuple[F64, F64]:
 
 
 def by_rig(sights: Sights, eye: int, T_target_cam0: F64) -> F64:
-    """Derivatives (C, 2, S) of what `seen` predicts, by 8 intrinsics of each camera and, of two, xi of
+    """Derivatives (C, 2, S) of what `seen` predicts, by the intrinsics of each camera and, of two, xi of
     T_cam1_cam0 Exp(xi): the order of `bundle.Solution`."""
     points, by_mount = moved(sights.mounts[eye], _in_cam0(sights, eye, T_target_cam0))
     _, by_intrinsics, by = project(sights.cameras[eye], points)
-    out = np.zeros((len(points), 2, shared(len(sights.cameras))))
-    out[:, :, INTRINSICS * eye : INTRINSICS * (eye + 1)] = by_intrinsics
+    out = np.zeros((len(points), 2, shared(sights.cameras)))
+    begin = sum(len(names(camera)) for camera in sights.cameras[:eye])
+    out[:, :, begin : begin + by_intrinsics.shape[2]] = by_intrinsics
     if eye == 1:
         out[:, :, -6:] = by @ by_mount
     return out
@@ -116,7 +117,7 @@ def pose_normal(sights: Sights, T_target_cam0: F64, sigma_px: float, huber: floa
 def rig_normal(sights: Sights, T_target_cam0: F64, sigma_px: float, huber: float) -> F64:
     """What the normal equations have between each frame's eta and the rig's own parameters, (F, 6, S), by
     the weights of `pose_normal`."""
-    out = np.zeros((len(T_target_cam0), 6, shared(len(sights.cameras))))
+    out = np.zeros((len(T_target_cam0), 6, shared(sights.cameras)))
     for eye, one in enumerate(sights.corners):
         r, J = seen(sights, eye, T_target_cam0)
         weight = (_roots(np.linalg.norm(r, axis=1) / sigma_px, huber) / sigma_px) ** 2

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from scipy.stats import qmc
 
+from share.emulate.render.fisheye import Face, faces
 from share.emulate.render.lens import Lens, lens
 from share.emulate.render.stage import Stage
 from share.emulate.render.view import shifted
@@ -18,6 +20,7 @@ from share.types import F32, F64
 _SAMPLES = 3  # of a pixel, at least
 _DEPTH_ZOOM = 3.0  # of the view in which a lens finds its triangles: fewer slivers are missed
 _lens = lru_cache(maxsize=16)(lens)
+_faces = lru_cache(maxsize=16)(faces)
 
 
 class GlRenderer:
@@ -35,6 +38,8 @@ class GlRenderer:
         """
         if not moments:
             raise ValueError("moments: an image needs at least one")
+        if camera.fisheye:
+            return self._by_faces(camera, moments)
         count = max(_SAMPLES, len(moments))
         optics: Lens | None = _lens(camera) if camera.distortion else None
         view = optics.wide if optics else camera
@@ -48,8 +53,32 @@ class GlRenderer:
         """Exact depth (H, W) m, 0 where nothing is; see `Renderer`."""
         if not camera.distortion:
             return self._stage.depth(camera, moment)
+        if camera.fisheye:
+            return self._depth_by_faces(camera, moment)
         optics = _lens(camera, _DEPTH_ZOOM)
         return optics.depth(*self._stage.faces(optics.wide, moment))
+
+    def _by_faces(self, camera: Camera, moments: Sequence[Moment]) -> F32:
+        """`radiance` of a fisheye lens. Dark where the lens shows nothing."""
+        out = np.zeros((camera.height, camera.width), np.float32)
+        for face in _faces(camera):
+            turned = [_turned(moment, face) for moment in moments]
+            image = face.lens.image(self.radiance(face.lens.wide, turned))
+            out[face.shown] = image[face.shown]
+        return out
+
+    def _depth_by_faces(self, camera: Camera, moment: Moment) -> F32:
+        """`depth` of a fisheye lens; 0 also of what is not ahead of it."""
+        out = np.zeros((camera.height, camera.width), np.float32)
+        for face in _faces(camera, _DEPTH_ZOOM):
+            z = face.lens.depth(*self._stage.faces(face.lens.wide, _turned(moment, face)))
+            out[face.shown] = np.maximum(z * face.axial(), 0)[face.shown]
+        return out
+
+
+def _turned(moment: Moment, face: Face) -> Moment:
+    """What the face's own camera sees."""
+    return replace(moment, T_world_cam=moment.T_world_cam @ face.T_cam_face)
 
 
 @lru_cache

@@ -18,7 +18,7 @@ from share.emulate.types import I32
 from share.geometry.camera import Camera, rays
 from share.types import F32, F64
 
-_MARGIN = 2  # px around what is seen, for interpolation
+MARGIN = 2  # px around what is seen, for interpolation
 _WIDEST = 3.0  # times the camera's own size: beyond it the model is used outside its range
 _EDGE = -1e-9  # how far outside its triangle a ray may pass, in sines
 
@@ -69,7 +69,7 @@ def lens(camera: Camera, zoom: float = 1.0) -> Lens:
     zoom *= max(1.0, _magnification(camera, uv))
     fx, fy = camera.fx * zoom, camera.fy * zoom
     flat = uv * (fx, fy)
-    low, high = np.floor(flat.min(axis=0)) - _MARGIN, np.ceil(flat.max(axis=0)) + _MARGIN
+    low, high = np.floor(flat.min(axis=0)) - MARGIN, np.ceil(flat.max(axis=0)) + MARGIN
     width, height = (int(n) for n in high - low + 1)
     if width * height > (_WIDEST * zoom) ** 2 * camera.width * camera.height:
         raise ValueError(f"camera: its distortion asks for {width}x{height} pixels to be drawn")

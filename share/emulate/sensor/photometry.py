@@ -65,10 +65,15 @@ class Imager:
 
 
 def vignette(camera: Camera, corner_light: float) -> F32:
-    """Light (H, W) float32 against the middle's: cos(field angle)^n, n such that the corner farthest from
-    the axis gets `corner_light`. n = 4 is the natural law; lenses are made to have less of it."""
+    """Light (H, W) float32 against the middle's: cos(field angle)^n, n such that the corner farthest from the
+    axis gets `corner_light`; of a fisheye lens by half that angle. n = 4 is the natural law; lenses are made
+    to have less of it."""
     grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
-    cos2 = 1 / (1 + (camera.normalise(grid.astype(np.float64)) ** 2).sum(axis=-1))
+    if camera.fisheye:  # sees beyond 90 degrees, where the law ends: half the angle in it
+        cos = np.nan_to_num(camera.directions(grid.astype(np.float64))[..., 2], nan=-1.0)
+        cos2 = np.maximum((1 + cos) / 2, 0.1)
+    else:
+        cos2 = 1 / (1 + (camera.normalise(grid.astype(np.float64)) ** 2).sum(axis=-1))
     power = np.log(corner_light) / np.log(cos2.min())
     out: F32 = (cos2**power).astype(np.float32)
     return out

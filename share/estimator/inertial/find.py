@@ -83,6 +83,9 @@ def seek(
     at = expected[todo]
     found = patches.align(images, ahead, looks.patch.take(which[todo]), at, warp[todo])
     good = _good(found, at, config, config.reach_px)
+    for camera, part in zip(cameras, (slice(0, ahead), slice(ahead, None)), strict=False):
+        if camera.bounded:  # it may have strayed to where there is no ray
+            good[part] &= camera.knows(found.px[part].astype(np.float64))
     _put(out, which[todo[:ahead]], found, good, slice(0, ahead))
     if len(cameras) == 1:
         return out
@@ -105,7 +108,8 @@ def rescue(
     if len(todo) == 0:
         return
     found = patches.align((image,), len(todo), looks.patch.take(todo), at, sought.warp[todo])
-    _put(sought, todo, found, _good(found, at, config, _AGREE_PX), slice(None))
+    good = _good(found, at, config, _AGREE_PX) & camera.knows(found.px.astype(np.float64))
+    _put(sought, todo, found, good, slice(None))
 
 
 def _nothing(n: int, which: I64, expected: F64, aim: Aim, warp: F64) -> Sought:

@@ -51,6 +51,18 @@ def predict(
     return Prediction(uv, -lever(DR, q_odom, rho), by_extrinsic, by_rho)
 
 
+def evened(seen: Prediction, camera: Camera, mine: NDArray[np.bool_]) -> Prediction:
+    """Those that are `mine` (N,), a fisheye camera's, in its image plane: see `Camera.evened`."""
+    uv, by_pose, by_extrinsic, by_rho = (
+        part.copy() for part in (seen.uv, seen.by_pose, seen.by_extrinsic, seen.by_rho)
+    )
+    J = camera.jacobian(uv[mine]) / np.array([[camera.fx], [camera.fy]])
+    uv[mine] = camera.evened(uv[mine])
+    by_pose[mine], by_extrinsic[mine] = J @ by_pose[mine], J @ by_extrinsic[mine]
+    by_rho[mine] = (J @ by_rho[mine, :, None])[:, :, 0]
+    return Prediction(uv, by_pose, by_extrinsic, by_rho)
+
+
 @dataclass(frozen=True, eq=False)
 class Aim(Columns):
     """Where to look for N features, and as what: uv (N, 2) normalised coordinates, NaN behind the camera;

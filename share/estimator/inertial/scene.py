@@ -13,12 +13,14 @@ from share.estimator.inertial.features import Looks
 from share.estimator.inertial.find import Sought
 from share.estimator.inertial.guess import Guess, guess
 from share.estimator.inertial.memory import Memory
+from share.estimator.inertial.observe import Prediction
 from share.estimator.inertial.state import State
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
 from share.types import F32, F64, I64, U8, Footing, Frame
 from share.vision import corners, epipolar, patches
-from share.vision.depth import from_depth_camera, from_stereo
+from share.vision.depth import disparity_px, from_depth_camera, from_stereo
+from share.vision.field import within
 from share.vision.view import measures_depth
 
 _DEPTH_SIGMA_PX, _DEPTH_BASELINE = 0.3, 0.05  # of the stereo pair inside a depth camera, m
@@ -120,8 +122,8 @@ class Scene:
         """What moves by itself is astray; looked for only where the IMU alone does not explain the image. uv
         (N, 2): of `measured`."""
         which = np.flatnonzero(sought.found)
-        residual = uv[which] - sought.uv[which]
         camera, config = self._rig.cam0, self._config
+        residual = camera.evened(uv[which]) - camera.evened(sought.uv[which])
         if len(which) == 0 or parsac.as_expected(residual * camera.focal, config.sigma_px, config.lasting_px):
             return
         rows = self.sight(uv, which, rate)
@@ -155,8 +157,19 @@ class Scene:
         if right is not None and self._rig.cam1 is not None:
             focal[right] = self._rig.cam1.focal
         seen = observe.predict(self.state, which, T, right)
+        if self._rig.cam0.fisheye:
+            seen, uv = self._evened(seen, uv, np.zeros(len(which), bool) if right is None else right)
         sigma, lasting = self._config.sigma_px / focal, self._config.lasting_px / focal
         return ekf.sight(self.state, which, seen, uv, sigma, lasting, rate)
+
+    def _evened(self, seen: Prediction, uv: F64, right: NDArray[np.bool_]) -> tuple[Prediction, F64]:
+        """Both in the image planes of fisheye lenses, where a pixel is as much everywhere."""
+        uv = uv.copy()
+        for camera, mine in ((self._rig.cam0, ~right), (self._rig.cam1, right)):
+            if camera is not None and mine.any():
+                uv[mine] = camera.evened(uv[mine])
+                seen = observe.evened(seen, camera, mine)
+        return seen, uv
 
     def _with_doubt(self, rows: ekf.Sight) -> ekf.Sight:
         """While somebody moves in the view, what is new in it counts little."""
@@ -182,7 +195,7 @@ class Scene:
         """px (N, 2) of what may become features of a keyframe, away from those `taken` (M, 2), the most
         wanted first."""
         more = self._config.features if self._room() else 0
-        return corners.detect(frame.image0, taken, more, self._config.spacing_px)
+        return corners.detect(frame.image0, taken, more, self._config.spacing_px, within(self._rig.cam0))
 
     def admit(self, frame: Frame, keyframe: int, px: F32) -> None:
         """New features at px (N, 2) of the frame that is keyframe number `keyframe`; the last frame may be a
@@ -217,12 +230,14 @@ class Scene:
         focal, n = self._rig.cam0.focal, len(px)
         if frame.image1 is not None and self._rig.cam1 is not None:
             z = self._stereo_depth(frame.image0, frame.image1, px, ray)
-            sigma = self._config.stereo_px / focal / self._rig.baseline
+            sigma = np.full(n, self._config.stereo_px / focal / self._rig.baseline)
+            if self._rig.cam1.fisheye:
+                sigma = self._config.stereo_px / disparity_px(self._rig, ray, 1 / z)
         else:
             assert frame.depth is not None
             z = from_depth_camera(frame.depth, self._rig, ray)
-            sigma = _DEPTH_SIGMA_PX / focal / _DEPTH_BASELINE
-        return Guess(1 / z, np.full(n, sigma), np.zeros((n, 0)), np.zeros(n))
+            sigma = np.full(n, _DEPTH_SIGMA_PX / focal / _DEPTH_BASELINE)
+        return Guess(1 / z, sigma, np.zeros((n, 0)), np.zeros(n))
 
     def _stereo_depth(self, image0: U8, image1: U8, px: F32, ray: F64) -> F64:
         """m (N,), NaN where the pair does not agree on one: the clearest place on each line, then to a
@@ -231,6 +246,8 @@ class Scene:
         out, clear = np.full(len(px), np.nan), np.flatnonzero(~np.isnan(about))
         z = from_stereo(image0, image1, self._rig, px[clear], ray[clear], about[clear])
         off_px = np.abs(1 / z - 1 / about[clear]) * self._rig.cam0.focal * self._rig.baseline
+        if self._rig.cam0.fisheye:
+            off_px = np.abs(1 / z - 1 / about[clear]) * disparity_px(self._rig, ray[clear], 1 / about[clear])
         out[clear] = np.where(off_px < _SAME_PLACE_PX, z, np.nan)
         return out
 

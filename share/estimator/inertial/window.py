@@ -79,7 +79,7 @@ class Window:
     def _moved_px(self, s: State, uv: F64) -> float:
         """How far features have moved since their keyframes saw them, less what turning did."""
         q = (hosts_in_camera(s)[:, :3, :3] @ rays(s.ray)[:, :, None])[:, :, 0]
-        moved = np.linalg.norm(q[:, :2] / q[:, 2:] - uv, axis=1)
+        moved = np.linalg.norm(self._camera.evened(q[:, :2] / q[:, 2:]) - self._camera.evened(uv), axis=1)
         return float(np.quantile(moved, 0.75)) * self._camera.focal if len(moved) else 0.0
 
     def _adopt(self, scene: Scene, fit: Fit) -> None:

@@ -17,12 +17,14 @@ from share.core.measurement import CAM0, CAM1, DEPTH, IMU
 from share.errors import ConfigError, DataError
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
+from share.geometry.lens import EQUIDISTANT, RADTAN
 from share.io.json_file import parse_json
 from share.io.mcap import types as ros
 from share.types import F64
 
 BODY = "body"
-_SUPPORTED = ("plumb_bob", "none", "")
+_ROS = {RADTAN: "plumb_bob", EQUIDISTANT: "equidistant"}
+_RADTAN, _FISHEYE = ("plumb_bob", "none", ""), ("equidistant", "fisheye", "kannala_brandt")
 
 
 def cameras(rig: Rig) -> dict[str, Camera]:
@@ -34,11 +36,16 @@ def to_json(rig: Rig) -> str:
     """Every number of the rig, exactly."""
     poses = {k: getattr(rig, k) for k in ("T_body_cam0", "T_cam1_cam0", "T_depth_cam0")}
     return json.dumps(
-        {name: asdict(camera) for name, camera in cameras(rig).items()}
+        {name: _of_camera(camera) for name, camera in cameras(rig).items()}
         | {name: T.tolist() for name, T in poses.items() if T is not None}
         | ({"imu": asdict(rig.imu)} if rig.imu else {})
         | ({"timeshift_s": rig.timeshift_s} if rig.timeshift_s else {})
     )
+
+
+def _of_camera(camera: Camera) -> dict[str, Any]:
+    """The model only where it is not what it was when no record told it."""
+    return {name: value for name, value in asdict(camera).items() if (name, value) != ("model", RADTAN)}
 
 
 def from_json(text: str, where: str) -> Rig:
@@ -57,6 +64,8 @@ def from_json(text: str, where: str) -> Rig:
 
 def to_camera_info(camera: Camera, header: Any) -> Any:
     D = np.array(camera.distortion or (0.0,) * 5)
+    if not camera.fisheye:  # ROS has five of plumb_bob, four of equidistant
+        D = np.pad(D, (0, 5 - len(D)))
     P = np.hstack([camera.K, np.zeros((3, 1))])
     roi = ros.make(
         "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
@@ -66,8 +75,8 @@ def to_camera_info(camera: Camera, header: Any) -> Any:
         header=header,
         height=camera.height,
         width=camera.width,
-        distortion_model="plumb_bob",
-        d=np.pad(D, (0, 5 - len(D))),
+        distortion_model=_ROS[camera.model],
+        d=D,
         k=camera.K.reshape(9),
         r=np.eye(3).reshape(9),
         p=P.reshape(12),
@@ -79,17 +88,18 @@ def to_camera_info(camera: Camera, header: Any) -> Any:
 
 def from_camera_info(info: Any, where: str) -> Camera:
     """Raises ConfigError for an uncalibrated camera or a distortion that we do not model."""
-    D = tuple(float(d) for d in info.d)
-    while len(D) > 5 and D[-1] == 0:
+    D, fisheye = tuple(float(d) for d in info.d), info.distortion_model in _FISHEYE
+    while len(D) > (4 if fisheye else 5) and D[-1] == 0:
         D = D[:-1]
-    if any(D) and (info.distortion_model not in _SUPPORTED or len(D) > 5):
+    if not fisheye and any(D) and (info.distortion_model not in _RADTAN or len(D) > 5):
         raise ConfigError(
             f"{where}: distortion_model '{info.distortion_model}' is not supported; "
-            f"supported: plumb_bob, none"
+            f"supported: plumb_bob, equidistant, none"
         )
     fx, _, cx, _, fy, cy, *_ = (float(k) for k in info.k)
+    model = EQUIDISTANT if fisheye else RADTAN
     try:
-        return Camera(info.width, info.height, fx, fy, cx, cy, D if any(D) else ())
+        return Camera(info.width, info.height, fx, fy, cx, cy, D if any(D) or fisheye else (), model)
     except ValueError as error:
         raise ConfigError(f"{where}: {error}; give the calibration with --calib") from None
 

@@ -11,6 +11,7 @@ from share.core.measurement import CAM0, CAM1, DEPTH
 from share.errors import DataError
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
+from share.geometry.lens import EQUIDISTANT
 from share.types import F64, checked_pose
 
 
@@ -47,6 +48,9 @@ def camera(rs: Any, profile: Any) -> Camera:
     """Intrinsics of a video stream's profile. Raises ValueError for an unknown model of distortion."""
     told = profile.as_video_stream_profile().get_intrinsics()
     coefficients = tuple(float(c) for c in told.coeffs)
+    if told.model == rs.distortion.kannala_brandt4:  # T265; its fifth number is 0
+        intrinsics = (told.fx, told.fy, told.ppx, told.ppy)
+        return Camera(told.width, told.height, *intrinsics, coefficients[:4], EQUIDISTANT)
     if any(coefficients) and told.model != rs.distortion.brown_conrady:
         raise ValueError(
             f"distortion model {told.model} is not known; calibrate with `share calibrate camera`"

@@ -1,0 +1,270 @@
+"""How a lens bends rays: from normalised coordinates (x/z, y/z) to those in the image plane, and back.
+
+Radial-tangential: OpenCV's plumb-bob model k1 k2 p1 p2 [k3] (Brown 1966), Kalibr's `radtan` and EuRoC's
+`radial-tangential`. Equidistant: k1 k2 k3 k4 of Kannala and Brandt (A generic camera model, PAMI 2006),
+OpenCV's fisheye model. A ray beyond the range in which a model grows with the angle gives NaN: it would fold
+back into the image.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from share.types import F64
+
+RADTAN, EQUIDISTANT = "radtan", "equidistant"
+COUNTS = {RADTAN: (0, 4, 5), EQUIDISTANT: (4,)}  # of coefficients
+# Off the axis of a fisheye lens, beyond which a tracker uses nothing: (x/z, y/z) ends at 90 degrees, and here
+# a pixel is 15 times as much of it as in the middle.
+WIDEST_DEG = 75.0
+_TINY = 1e-8  # of a squared radius: below it limits are taken
+_ROUNDS, _EXACT = 20, 1e-12  # of Newton's method for an angle
+
+
+@dataclass(frozen=True)
+class Radtan:
+    """limit: of |uv|, beyond which the radial polynomial falls; inf for most lenses."""
+
+    coefficients: tuple[float, ...]
+    limit: float
+
+    def bend(self, uv: F64) -> F64:
+        """Normalised coordinates (..., 2) -> those in the image plane (..., 2)."""
+        out = self._bend(uv)
+        if self.limit < math.inf:
+            out[(uv**2).sum(axis=-1) > self.limit**2] = np.nan
+        return out
+
+    def _bend(self, uv: F64) -> F64:
+        k1, k2, p1, p2, k3 = self._all()
+        x, y = uv[..., 0], uv[..., 1]
+        r2 = x * x + y * y
+        xy, radial = 2 * x * y, 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        out = np.empty(uv.shape)
+        out[..., 0] = x * radial + p1 * xy + p2 * (r2 + 2 * x * x)
+        out[..., 1] = y * radial + p1 * (r2 + 2 * y * y) + p2 * xy
+        return out
+
+    def jacobian(self, uv: F64) -> F64:
+        """d(bent)/d(uv), (..., 2, 2)."""
+        k1, k2, p1, p2, k3 = self._all()
+        x, y = uv[..., 0], uv[..., 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # d(radial)/d(r2) * 2, so d/dx = slope * x
+        J = np.empty((*uv.shape, 2))
+        J[..., 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+        J[..., 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+        J[..., 0, 1] = J[..., 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
+        return J
+
+    def straighten(self, bent: F64, about: F64 | None = None) -> F64:
+        """The inverse of `bend`, to 1e-9 inside the image. about: where they nearly are, from which it is
+        found sooner."""
+        uv = (bent if about is None else about).copy()
+        if self.limit < math.inf and about is None:  # begin inside, where there is a way
+            r = np.hypot(uv[..., 0], uv[..., 1])[..., None]
+            uv *= np.minimum(1, 0.9 * self.limit / np.maximum(r, 1e-12))
+        for k in range(8):  # Newton on the 2x2 system; converges quadratically inside the image
+            if k == 0 or about is None:  # near enough, the first derivative will do
+                J = self.jacobian(uv)
+                J = J / (J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0])[..., None, None]
+            r = bent - self._bend(uv)
+            uv[..., 0] += J[..., 1, 1] * r[..., 0] - J[..., 0, 1] * r[..., 1]
+            uv[..., 1] += J[..., 0, 0] * r[..., 1] - J[..., 1, 0] * r[..., 0]
+            if np.nanmax(np.abs(r), initial=0.0) < 1e-6:  # so the step leaves about its square
+                break
+        if self.limit < math.inf:  # what fell into the fold, or found no way
+            off = np.abs(bent - self._bend(uv)).max(axis=-1)
+            uv[~(((uv**2).sum(axis=-1) <= self.limit**2) & (off < 1e-6))] = np.nan
+        return uv
+
+    def bend_points(self, points: F64) -> F64:
+        """Points (..., 3) in the camera frame -> image plane (..., 2); NaN behind the camera."""
+        z = np.where(points[..., 2:] > 1e-6, points[..., 2:], np.nan)
+        return self.bend(points[..., :2] / z)
+
+    def jacobian_points(self, points: F64) -> F64:
+        """d(bent)/d(point), (..., 2, 3); NaN behind the camera."""
+        z = np.where(points[..., 2] > 1e-6, points[..., 2], np.nan)
+        uv = points[..., :2] / z[..., None]
+        into = np.zeros((*points.shape[:-1], 2, 3))
+        into[..., 0, 0] = into[..., 1, 1] = 1 / z
+        into[..., :, 2] = -uv / z[..., None]
+        return self.jacobian(uv) @ into
+
+    def by_coefficients(self, points: F64) -> F64:
+        """d(bent)/d(k1, k2, p1, p2, k3) at points (..., 3), (..., 2, 5), or without k3 (..., 2, 4)."""
+        uv = points[..., :2] / points[..., 2:]
+        x, y = uv[..., 0], uv[..., 1]
+        r2 = x * x + y * y
+        rows = [
+            [x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3],
+            [y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3],
+        ]
+        out = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+        return np.asarray(out[..., : max(len(self.coefficients), 4)])
+
+    def directions(self, bent: F64) -> F64:
+        """Image plane (..., 2) -> unit vectors (..., 3) to what is seen there."""
+        uv = self.straighten(bent)
+        ray = np.concatenate([uv, np.ones((*uv.shape[:-1], 1))], axis=-1)
+        return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
+
+    def _all(self) -> tuple[float, float, float, float, float]:
+        k1, k2, p1, p2, *k3 = self.coefficients
+        return k1, k2, p1, p2, k3[0] if k3 else 0.0
+
+
+@dataclass(frozen=True)
+class Equidistant:
+    """limit: of the angle from the axis, rad, up to which it grows; at most pi. Normalised coordinates are of
+    rays up to WIDEST_DEG only, `bend_points` and `directions` are of all."""
+
+    coefficients: tuple[float, ...]
+    limit: float
+
+    @property
+    def widest(self) -> float:
+        """rad off the axis, up to which there are normalised coordinates."""
+        return min(self.limit, math.radians(WIDEST_DEG))
+
+    def bend(self, uv: F64) -> F64:
+        """Normalised coordinates (..., 2) -> those in the image plane (..., 2)."""
+        r2 = (uv**2).sum(axis=-1)
+        theta = np.arctan(np.sqrt(r2))
+        scale = self._by_radius(self._bent(theta), r2)
+        scale[theta > self.widest] = np.nan
+        return np.asarray(uv * scale[..., None])
+
+    def jacobian(self, uv: F64) -> F64:
+        """d(bent)/d(uv), (..., 2, 2)."""
+        r2 = (uv**2).sum(axis=-1)
+        theta = np.arctan(np.sqrt(r2))
+        scale = self._by_radius(self._bent(theta), r2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slope = (self._slope(theta) / (1 + r2) - scale) / r2
+        slope = np.where(r2 < _TINY, 2 * (self.coefficients[0] - 1 / 3), slope)
+        out = slope[..., None, None] * uv[..., :, None] * uv[..., None, :]
+        out[..., 0, 0] += scale
+        out[..., 1, 1] += scale
+        out[theta > self.widest] = np.nan
+        return np.asarray(out)
+
+    def straighten(self, bent: F64, about: F64 | None = None) -> F64:
+        """The inverse of `bend`, to 1e-9. about: is not needed."""
+        radius = np.hypot(bent[..., 0], bent[..., 1])
+        theta = self._angle(radius, self.widest)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = np.where(radius**2 < _TINY, 1.0, np.tan(theta) / radius)
+        return np.asarray(bent * scale[..., None])
+
+    def bend_points(self, points: F64) -> F64:
+        """Points (..., 3) in the camera frame, also behind it, -> image plane (..., 2); NaN beyond
+        `limit`."""
+        theta, across = self._of(points)
+        return np.asarray(points[..., :2] * self._scale(points, theta, across)[..., None])
+
+    def jacobian_points(self, points: F64) -> F64:
+        """d(bent)/d(point), (..., 2, 3)."""
+        theta, across = self._of(points)
+        z, d2 = points[..., 2], (points**2).sum(axis=-1)
+        scale, slope = self._scale(points, theta, across), self._slope(theta)
+        near = across**2 < _TINY * d2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = np.where(near, 0.0, (slope * z / d2 - scale) / across**2)
+        xy = points[..., :2]
+        out = np.zeros((*points.shape[:-1], 2, 3))
+        out[..., :2] = along[..., None, None] * xy[..., :, None] * xy[..., None, :]
+        out[..., 0, 0] += scale
+        out[..., 1, 1] += scale
+        out[..., 2] = -xy * (slope / d2)[..., None]
+        return out
+
+    def by_coefficients(self, points: F64) -> F64:
+        """d(bent)/d(k1, k2, k3, k4) at points (..., 3), (..., 2, 4)."""
+        theta, across = self._of(points)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            way = np.where(across[..., None] > 0, points[..., :2] / across[..., None], 0.0)
+        powers = theta[..., None] ** np.array([3, 5, 7, 9])
+        return np.asarray(way[..., :, None] * powers[..., None, :])
+
+    def directions(self, bent: F64) -> F64:
+        """Image plane (..., 2) -> unit vectors (..., 3) to what is seen there; NaN beyond `limit`."""
+        radius = np.hypot(bent[..., 0], bent[..., 1])
+        theta = self._angle(radius, self.limit)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = np.where(radius**2 < _TINY, 1.0, np.sin(theta) / radius)
+        return np.concatenate([bent * scale[..., None], np.cos(theta)[..., None]], axis=-1)
+
+    def _bent(self, theta: F64) -> F64:
+        k1, k2, k3, k4 = self.coefficients
+        t2 = theta * theta
+        return theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+
+    def _slope(self, theta: F64) -> F64:
+        k1, k2, k3, k4 = self.coefficients
+        t2 = theta * theta
+        return 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+
+    def _by_radius(self, bent: F64, r2: F64) -> F64:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            out = bent / np.sqrt(r2)
+        return np.where(r2 < _TINY, 1 + r2 * (self.coefficients[0] - 1 / 3), out)
+
+    def _of(self, points: F64) -> tuple[F64, F64]:
+        """The angle off the axis (...), rad, and the distance from it (...); NaN beyond `limit`."""
+        across = np.hypot(points[..., 0], points[..., 1])
+        theta = np.arctan2(across, points[..., 2])
+        return np.where(theta > self.limit, np.nan, theta), across
+
+    def _scale(self, points: F64, theta: F64, across: F64) -> F64:
+        """(...) of what the coordinates across the axis are multiplied by."""
+        ahead = (across < 1e-6 * np.abs(points[..., 2])) & (theta < 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(ahead, 1 / points[..., 2], self._bent(theta) / across)
+
+    def _angle(self, radius: F64, most: float) -> F64:
+        """rad (...) off the axis of what is seen at a radius (...) in the image plane; NaN beyond `most`.
+        Newton's method between 0 and `most`, where the radius grows with the angle."""
+        end = float(self._bent(np.asarray(most)))
+        sought = np.where(radius <= end, radius, np.nan)
+        low, high = np.zeros_like(sought), np.full_like(sought, most)
+        theta = np.minimum(sought, most)
+        for _ in range(_ROUNDS):
+            off = self._bent(theta) - sought
+            low, high = np.where(off < 0, theta, low), np.where(off > 0, theta, high)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                step = theta - off / self._slope(theta)
+            step = np.where((step >= low) & (step <= high), step, (low + high) / 2)
+            moved, theta = np.abs(step - theta), np.where(np.isnan(sought), np.nan, step)
+            if np.nanmax(moved, initial=0.0) < _EXACT:
+                break
+        return theta
+
+
+@lru_cache(maxsize=64)
+def lens(model: str, coefficients: tuple[float, ...]) -> Radtan | Equidistant:
+    """The lens of a model of `COUNTS` with as many coefficients as that says, but not none."""
+    if model == RADTAN:
+        k1, k2, _, _, *k3 = coefficients
+        return Radtan(coefficients, math.sqrt(_first_root([3 * k1, 5 * k2, *(7 * k for k in k3)])))
+    k1, k2, k3_, k4 = coefficients
+    return Equidistant(coefficients, min(math.sqrt(_first_root([3 * k1, 5 * k2, 7 * k3_, 9 * k4])), math.pi))
+
+
+def _first_root(by_power: list[float]) -> float:
+    """The least s > 0 with 1 + by_power[0] s + by_power[1] s^2 + ... = 0; inf where there is none."""
+    while by_power and by_power[-1] == 0:
+        by_power = by_power[:-1]
+    if not by_power:
+        return math.inf
+    # 1 / s is a root of the reversed polynomial, which begins with 1 and so loses none to small coefficients
+    found = np.roots([1.0, *by_power])
+    real: NDArray[np.float64] = found.real[(np.abs(found.imag) < 1e-9 * np.abs(found)) & (found.real > 0)]
+    return float(1 / real.max()) if len(real) else math.inf

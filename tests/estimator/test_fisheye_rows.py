@@ -1,0 +1,35 @@
+"""Rows of the filter for a fisheye lens are in its image plane, where all pixels are worth the same."""
+
+import numpy as np
+
+from share.estimator.inertial import observe
+from share.estimator.inertial.observe import Prediction
+from share.geometry.camera import Camera
+
+LENS = (0.00348, 0.000715, -0.00205, 0.000203)
+FISHEYE = Camera(512, 512, 190.0, 190.0, 254.93, 256.90, LENS, "equidistant")
+
+
+def test_a_pixel_is_as_much_everywhere():
+    px = np.array([[255.0, 257], [255 + 240, 257], [100, 400]])
+    one = FISHEYE.evened(FISHEYE.normalise(px + np.array([1.0, 0]))) - FISHEYE.evened(FISHEYE.normalise(px))
+    np.testing.assert_allclose(190.0 * one, [[1, 0]] * 3, atol=1e-6)
+    plain = Camera(640, 480, 400.0, 400.0, 320.0, 240.0)
+    assert plain.evened(px) is px
+
+
+def test_what_is_predicted_keeps_its_derivatives(rng):
+    uv, eps = rng.uniform(-2, 2, (6, 2)), 1e-6
+    by_rho, mine = rng.normal(size=(6, 2)), np.array([True, True, True, True, False, False])
+    by_pose = rng.normal(size=(6, 2, 6))
+    seen = observe.evened(Prediction(uv, by_pose, -by_pose, by_rho), FISHEYE, mine)
+    high, low = (FISHEYE.distort(uv + s * eps * by_rho) for s in (1, -1))
+    np.testing.assert_allclose(seen.by_rho[mine], ((high - low) / (2 * eps * 190.0))[mine], atol=1e-6)
+    for k in range(6):
+        high, low = (FISHEYE.distort(uv + s * eps * by_pose[:, :, k]) for s in (1, -1))
+        np.testing.assert_allclose(seen.by_pose[mine, :, k], ((high - low) / (380.0 * eps))[mine], atol=1e-6)
+    np.testing.assert_allclose(seen.by_extrinsic, -seen.by_pose)
+    np.testing.assert_allclose(seen.uv[mine], (FISHEYE.distort(uv[mine]) - (254.93, 256.90)) / 190.0)
+    for name in ("uv", "by_pose", "by_extrinsic", "by_rho"):  # the others' are as they were
+        theirs = getattr(Prediction(uv, by_pose, -by_pose, by_rho), name)[~mine]
+        np.testing.assert_array_equal(getattr(seen, name)[~mine], theirs)
