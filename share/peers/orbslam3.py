@@ -75,9 +75,9 @@ def settings(calibration: dict[str, Any]) -> str:
 
 
 def _camera(name: str, camera: dict[str, Any]) -> dict[str, float]:
-    K, distortion = camera["K"], [float(k) for k in [*camera["distortion"], *[0.0] * 4][:4]]
+    K, distortion = camera["K"], camera["distortion"] or [0.0] * 4
     values = (K[0][0], K[1][1], K[0][2], K[1][2], *distortion)
-    keys = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+    keys = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")[: len(values)]
     return {f"{name}.{key}": float(value) for key, value in zip(keys, values, strict=True)}
 
 

@@ -38,11 +38,15 @@ def source(tmp_path):
 @pytest.fixture
 def told(source, tmp_path):
     """What the adaptor makes of the recording."""
+    return answered(tmp_path, calibration(source), moments(source))
+
+
+def answered(tmp_path, rig, what):
     from share.peers.peer_wire import write_line, write_moment
 
     with (tmp_path / "moments").open("wb") as file:
-        write_line(file, calibration(source))
-        for moment in moments(source):
+        write_line(file, rig)
+        for moment in what:
             write_moment(file, moment)
     with (tmp_path / "moments").open("rb") as file:
         done = subprocess.run([sys.executable, "-c", SCRIPT], stdin=file, capture_output=True, timeout=60)
@@ -64,8 +68,24 @@ def test_settings_are_the_recordings(told, source):
     T_cam0_cam1 = read.getNode("Stereo.T_c1_c2").mat()
     assert T_cam0_cam1 == pytest.approx(np.linalg.inv(rig.T_cam1_cam0), abs=1e-6)
     assert read.getNode("IMU.T_b_c1").mat() == pytest.approx(rig.T_body_cam0, abs=1e-6)
+    assert read.getNode("Camera1.k3").empty()
     for name in ("IMU.Frequency", "IMU.NoiseGyro", "Stereo.ThDepth", "Viewer.ViewpointX"):
         assert read.getNode(name).isReal()
+
+
+def test_a_fifth_coefficient_is_passed_on(source, tmp_path):
+    rig = calibration(source)
+    rig["cameras"][0]["distortion"] = [0.1, 0.2, 0.3, 0.4, 0.5]
+    settings = answered(tmp_path, rig, [])["settings"]
+    read = cv2.FileStorage(settings, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    assert [read.getNode(f"Camera1.{key}").real() for key in ("k1", "k2", "p1", "p2", "k3")] == [
+        0.1,
+        0.2,
+        0.3,
+        0.4,
+        0.5,
+    ]
+    assert read.getNode("Camera2.k3").empty()
 
 
 def test_each_frame_has_the_samples_since_the_one_before(told, source):
