@@ -13,7 +13,8 @@ from share.types import F64, TrackState, Wait
 class TrackResult:
     """What one frame came to. T_odom_body is None where there is no pose to be had.
 
-    keyframe: this frame became one; the tracker's `keyframe` gives what it shows. points: how many the pose
+    keyframe: this frame became one, or one before it whose view is made by now: the tracker's `keyframe`
+    gives what that shows. points: how many the pose
     rests on. new_stretch: odometry broke before this keyframe. cov (6, 6): of T_odom_body, perturbed on the
     right, where the tracker knows it. sound: False while images and IMU contradict each other. waits: for
     what, where there is no pose yet. found: how many features were, also those that were not believed.

@@ -99,9 +99,10 @@ def test_keyframes_tell_the_motion_as_it_is_known_by_now(walk):
     """The first ones were told with a tilt that is off by a degree; what was learnt of it is no turn."""
     frames, rig, truth = walk
     tracker, shown = InertialTracker(rig, InertialConfig(), TrackerConfig()), []
-    for frame in frames:
+    for k, frame in enumerate(frames):
         if tracker.track(frame).keyframe:
-            shown.append((frame.stamp_ns, tracker.keyframe(frame)))
+            candidate = tracker.keyframe(frame)
+            shown.append((frames[k - candidate.frames_ago].stamp_ns, candidate))
     stamps = np.array([stamp for stamp, _ in shown])
     _, true = interpolate(truth.stamps_ns, truth.T, stamps)
     true = se3.inverse(true[:-1]) @ true[1:]
@@ -116,28 +117,32 @@ def test_keyframes_tell_the_motion_as_it_is_known_by_now(walk):
 
 
 def test_a_keyframe_brings_one_slice_of_work_a_frame_and_nothing_depends_on_when(walk, tracked):
-    """Its features come with the third, one later where it is shown to others, whether anybody calls `settle`
-    or the next frame does it first."""
+    """Its features come with the second, or with the third where others are told of it, three frames after
+    its own; whether anybody calls `settle` or the next frame does it first."""
     frames, rig, _ = walk
-    tracker, poses, shown, grown = InertialTracker(rig, InertialConfig(), TrackerConfig()), [], [], []
+    tracker, poses, shown = InertialTracker(rig, InertialConfig(), TrackerConfig()), [], {}
+    begun, hosts = {}, []  # when each keyframe came; which have features after each frame
     for k, frame in enumerate(frames):
-        keyframes = 0 if tracker.state is None else len(tracker.state.keyframes)
         result = tracker.track(frame)
         poses.append(result.T_odom_body)
         if result.keyframe:
-            shown.append(tracker.keyframe(frame))
-        if len(tracker.state.keyframes) > keyframes > 0:
-            grown.append((k + result.keyframe, tracker.state.keyframes[-1]))
+            candidate = tracker.keyframe(frame)
+            assert candidate.frames_ago == (3 if shown else 0)
+            shown[k - candidate.frames_ago] = candidate
+        for keyframe in tracker.state.keyframes.tolist():
+            begun.setdefault(keyframe, k)
         tracker.settle()
         tracker.settle()  # once a frame is enough
-        for due, keyframe in grown[-1:]:
-            has = (tracker.state.keyframes[tracker.state.host] == keyframe).any()
-            assert has == (k >= due + 2)
+        hosts.append(set(tracker.state.keyframes[tracker.state.host].tolist()))
+    later = {keyframe: k for keyframe, k in begun.items() if 0 < k < len(frames) - 3}
+    for keyframe, k in later.items():
+        due = k + (2 if k in shown else 1)
+        assert [keyframe in at for at in hosts[k : due + 1]] == [False] * (due - k) + [True]
+    assert len(later) >= 2 and set(shown) & set(later.values())
     results, candidates, _ = tracked
-    assert len(grown) >= 3
     for mine, result in zip(poses, results, strict=True):
         np.testing.assert_array_equal(mine, result.T_odom_body)
-    for mine, candidate in zip(shown, candidates, strict=True):
+    for mine, candidate in zip(shown.values(), candidates, strict=True):
         np.testing.assert_array_equal(mine.view.points, candidate.view.points)
         np.testing.assert_array_equal(mine.cov, candidate.cov)
 

@@ -327,6 +327,11 @@ def _widened(cov: F64, at: int, more: int) -> F64:
     return out
 
 
+def number_of(state: State, keyframe: int) -> int:
+    """Of the keyframe with this id, which the state has."""
+    return int(np.flatnonzero(state.keyframes == keyframe)[0])
+
+
 def motion(state: State, a: int, b: int) -> F64:
     """T_a_b (4, 4) between keyframes number a and b of the state."""
     return se3.orthonormal(se3.inverse(state.poses[a]) @ state.poses[b])
@@ -369,6 +374,15 @@ def scale_sigma(state: State) -> float:
 
 def pose_cov(state: State) -> F64:
     """Of T_odom_body (6, 6), perturbed on the right as everywhere else (`share.geometry.se3`)."""
-    Ad = se3.adjoint(se3.inverse(state.T))
-    out: F64 = Ad @ state.cov[POSE, POSE] @ Ad.T
+    return _on_the_right(state, state.T, POSE)
+
+
+def keyframe_cov(state: State, k: int) -> F64:
+    """The same of keyframe number k's."""
+    return _on_the_right(state, state.poses[k], state.keyframe(k))
+
+
+def _on_the_right(state: State, T: F64, at: slice) -> F64:
+    Ad = se3.adjoint(se3.inverse(T))
+    out: F64 = Ad @ state.cov[at, at] @ Ad.T
     return out
