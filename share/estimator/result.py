@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from share.estimator.middle import median
 from share.types import F64, TrackState, Wait
 
 
@@ -36,4 +37,4 @@ class TrackResult:
 def typical(surprise: F64) -> float:
     """The median of squared distances (N,), NaN unknown, in sigmas; 0 without any."""
     known = surprise[np.isfinite(surprise)]
-    return float(np.median(known)) if len(known) else 0.0
+    return median(known) if len(known) else 0.0

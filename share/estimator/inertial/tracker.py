@@ -30,6 +30,7 @@ from share.estimator.inertial.scene import Scene
 from share.estimator.inertial.state import State
 from share.estimator.inertial.window import Window, window_for, without_force
 from share.estimator.localmap import LocalMap
+from share.estimator.middle import median
 from share.estimator.result import TrackResult, typical
 from share.geometry import se3
 from share.geometry.camera import ImuBias, ImuNoise, Rig
@@ -305,12 +306,13 @@ class InertialTracker:
         self, s: State, rows: ekf.Sight, rows_now: Callable[[], ekf.Sight]
     ) -> tuple[ekf.Sight, NDArray[np.bool_], F64, F64]:
         """Rows at the best linearisation, which of them the filter believes, and its `ekf.gains`."""
-        if np.median(np.abs(rows.residual)) * self._rig.cam0.focal > _FAR_OFF_PX:
+        if median(np.abs(rows.residual).ravel()) * self._rig.cam0.focal > _FAR_OFF_PX:
             rows = ekf.relinearised(s, rows_now, self._common)
         HP, S = ekf.gains(s, rows, self._common)
         self._surprise = ekf.surprise(rows, S)
-        doubted = rows.which[self._surprise >= self._config.gate]
-        return rows, ~np.isin(rows.which, doubted), HP, S  # one camera's doubt is enough
+        believed = np.ones(len(s.ids), bool)
+        believed[rows.which[self._surprise >= self._config.gate]] = False  # one camera's doubt is enough
+        return rows, believed[rows.which], HP, S
 
     def _agreed(self, s: State, left: find.Sought) -> bool:
         """Whether nearly all that cam0 shows agrees among itself."""
@@ -338,6 +340,8 @@ class InertialTracker:
 
     def _pose(self, s: State) -> F64:
         """At the frame's stamp, IMU time: the state is where the image was taken."""
+        if s.offset_s == 0:
+            return self._pivot.told(s.T)
         return self._pivot.told(se3.exp(-ekf.twist(s, self._rate) * s.offset_s) @ s.T)
 
     # ------------------------------------------------------------------ beginnings and losses
