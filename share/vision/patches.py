@@ -29,8 +29,8 @@ _MOST_ROWS = 30_000  # of what cv2.remap gives at a time (SHRT_MAX)
 class Patches(Columns):
     """N patches of S samples. contrast (N,): the norm that gray levels had;
     slope (N, 2, S): derivatives by x and y less what gain and bias explain, in gray levels a pixel;
-    inverse (N, 2, 2): of their normal matrix. probe (N, 3, S): `gray`, and what gives the shift: times samples
-    of zero mean and unit norm, how alike they are and how far off, px."""
+    inverse (N, 2, 2): of their normal matrix. probe (N, 3, S): `gray`, and what gives the shift: times
+    samples of zero mean and unit norm, how alike they are and how far off, px."""
 
     contrast: F32
     slope: F32

@@ -100,12 +100,12 @@ class Keyframes:
         number = scene.add_keyframe(rate)
         self._newest.stamp_ns, self._newest.T = frame.stamp_ns, scene.state.T
         self._making = _Making(frame, number, scene.taken())
-        seek, admit = (self._recall, self._corners), (self._admit,)
-        self._slices = deque([seek + admit] if urgent else [seek, admit])
+        steps = self._recall, self._corners, self._admit
+        self._slices = deque([steps] if urgent else [(step,) for step in steps])
 
     def offer(self, scene: Scene, at_once: bool) -> None:
-        """Others are to be told of the newest, which is the frame just tracked. at_once: now; else with the
-        third frame from here, by when its view is made."""
+        """Others are to be told of the newest, which is the frame just tracked. at_once: now; else some
+        frames from here, when its features are in and its view is made."""
         made = self._making
         assert made is not None
         self._shown_ns = made.frame.stamp_ns
@@ -113,9 +113,7 @@ class Keyframes:
         if at_once:
             made.is_due = True
         else:
-            first, *others = self._slices
-            then = tuple(step for one in others for step in one)
-            self._slices = deque([first, (self._detect,), (*then, self._describe)])
+            self._slices.extend([(self._detect,), (self._describe,)])
 
     def may_show(self, stamp_ns: int) -> bool:
         """Whether it is time to tell others of one."""

@@ -44,7 +44,6 @@ _GAP_NS = 250_000_000  # between frames: more than an IMU of this sort is modell
 _DOUBT = 0.02, 0.1, 0.3  # rad, m, m/s: how wrong the filter may be after it that believes nobody
 _REST_RATE, _REST_M_S = 0.03, 0.02  # rad/s of a body at rest; m/s of its velocity
 _SLOW_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to a filter that knows it moves
-_LITTLE = 0.5  # of the features that there may be: then a keyframe's come at once
 _PATIENCE = 10  # frames without a sample of the IMU, after which we begin without
 _LEVEL_RAD = np.radians(3.0)  # sigma of tilt up to which others are told what is up
 
@@ -223,7 +222,7 @@ class InertialTracker:
             self._pivot.after(s)
         pose, cov = self._pose(s), ekf.pose_cov(s)
         if wanted or first:
-            self._keyframes.begin(frame, scene, self._rate, count < _LITTLE * self._config.features)
+            self._keyframes.begin(frame, scene, self._rate, urgent=count < self._config.weak)
             if first or self._keyframes.may_show(frame.stamp_ns):
                 self._keyframes.offer(scene, at_once=first)
         is_due = self._keyframes.is_due
