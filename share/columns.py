@@ -17,7 +17,8 @@ class Columns:
 
     def take(self, rows: NDArray[np.bool_] | I64) -> Self:
         """These rows, by a mask (N,) or by their numbers."""
-        return type(self)(*[_rows(getattr(self, name), rows) for name in _names(type(self))])
+        numbers = np.flatnonzero(rows) if rows.dtype == np.bool_ else np.asarray(rows, np.int64)
+        return type(self)(*[_rows(getattr(self, name), numbers) for name in _names(type(self))])
 
     def join(self, *others: Self) -> Self:
         """All rows, one table after the other."""
@@ -34,8 +35,8 @@ def _names(table: type[Columns]) -> tuple[str, ...]:
     return _NAMES[table]
 
 
-def _rows(value: Any, rows: NDArray[np.bool_] | I64) -> Any:
-    return value.take(rows) if isinstance(value, Columns) else value[rows]
+def _rows(value: Any, numbers: I64) -> Any:
+    return value.take(numbers) if isinstance(value, Columns) else value.take(numbers, axis=0)
 
 
 def _joined(values: list[Any]) -> Any:

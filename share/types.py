@@ -303,7 +303,8 @@ class Candidate:
     which the difference of the two T_odom_body was when each was told; of the first of a stretch it is
     T_odom_body. cov (6, 6): of T_last_body. up (3,): unit vector against gravity in the body frame, zeros
     if unknown; up_sigma: of both its angles, rad. new_stretch: odometry broke before this keyframe, so
-    nothing relates it to the ones before.
+    nothing relates it to the ones before. frames_ago: how many frames have been tracked since its own, while
+    its view was made.
     """
 
     T_odom_body: F64
@@ -313,6 +314,7 @@ class Candidate:
     up_sigma: float
     view: View
     new_stretch: bool = False
+    frames_ago: int = 0
 
     def __post_init__(self) -> None:
         _set(

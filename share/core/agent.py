@@ -6,7 +6,7 @@ give the same effects. Odometry passes through untouched: the edge only moves th
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -37,6 +37,7 @@ _COUNTED = (
     *("corrections", "corrections_stale"),
 )
 _BOOKED = ("sent", "resent", "acknowledged", "drop_oldest_acknowledged", "drop_oldest", "bad_acks")
+_RECENT = 8  # frames: a candidate is of one of the last few
 _LEAST_HZ = 0.1  # keyframes that an edge cannot forbid: without any it would learn of no reason to allow more
 
 
@@ -56,6 +57,7 @@ class Agent:
         self._bucket = TokenBucket(config.agent.rate_burst)
         self._worth = Worth()
         self._where = Whereabouts(config.agent)
+        self._recent: deque[ev.FrameTracked] = deque(maxlen=_RECENT)
         self._error = OwnError(config.agent.tell_placement)
         self._streaming = Streaming(config.stream) if hello.streams else None
         self._pings = Pings(link, config.clock)
@@ -149,6 +151,7 @@ class Agent:
 
     def _frame_tracked(self, frame: ev.FrameTracked, now_ns: int) -> None:
         self._status.tracked(frame, now_ns)
+        self._recent.append(frame)
         if frame.new_stretch:
             self._chain.break_off()
             self._where.break_off()
@@ -164,18 +167,21 @@ class Agent:
             self._offer(frame, candidate, now_ns)
 
     def _offer(self, frame: ev.FrameTracked, candidate: Candidate, now_ns: int) -> None:
-        """Makes a keyframe of a candidate, if the rate allows (drop_rate)."""
+        """Makes a keyframe of a candidate that came with `frame`, if the rate allows (drop_rate)."""
+        own = self._recent[-1 - candidate.frames_ago]
         self._counts["candidates"] += 1
-        self._error.processed((now_ns - frame.arrived_ns) / 1e6)
+        self._error.processed((now_ns - own.arrived_ns) / 1e6)
         self._chain.extend(candidate)
         sent = self._bucket.take(now_ns, self._worth.is_rather_high(candidate.view))
         if sent:
-            self._add(self._chain.keyframe(candidate, frame.stamp_ns), frame, now_ns)
+            keyframe = self._chain.keyframe(candidate, own.stamp_ns)
+            self._add(keyframe, own, frame.error_cm, now_ns)
         else:
             self._counts["drop_rate"] += 1
         self._frame_done(frame, sent)
 
-    def _add(self, keyframe: Keyframe, frame: ev.FrameTracked, now_ns: int) -> None:
+    def _add(self, keyframe: Keyframe, frame: ev.FrameTracked, error_cm: float | None, now_ns: int) -> None:
+        """A keyframe made of `frame`, and how wrong odometry is by now, where that is known."""
         self._ledger.add(Entry(keyframe, frame.index, frame.arrived_ns))
         self._error.drift.sent(keyframe, frame.arrived_ns)
         if self._connected and (clock := self._pings.clock).rtt_ms is not None:
@@ -183,7 +189,7 @@ class Agent:
                 self._error.evaluation(
                     keyframe.id,
                     clock.rtt_ms,
-                    frame.error_cm,
+                    error_cm,
                     self._where.T_odom_body,
                     self._where.frame,
                     now_ns,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from share.estimator.middle import median
 from share.types import F64, TrackState, Wait
 
 
@@ -13,7 +14,8 @@ from share.types import F64, TrackState, Wait
 class TrackResult:
     """What one frame came to. T_odom_body is None where there is no pose to be had.
 
-    keyframe: this frame became one; the tracker's `keyframe` gives what it shows. points: how many the pose
+    keyframe: this frame became one, or one before it whose view is made by now: the tracker's `keyframe`
+    gives what that shows. points: how many the pose
     rests on. new_stretch: odometry broke before this keyframe. cov (6, 6): of T_odom_body, perturbed on the
     right, where the tracker knows it. sound: False while images and IMU contradict each other. waits: for
     what, where there is no pose yet. found: how many features were, also those that were not believed.
@@ -35,4 +37,4 @@ class TrackResult:
 def typical(surprise: F64) -> float:
     """The median of squared distances (N,), NaN unknown, in sigmas; 0 without any."""
     known = surprise[np.isfinite(surprise)]
-    return float(np.median(known)) if len(known) else 0.0
+    return median(known) if len(known) else 0.0

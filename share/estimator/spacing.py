@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from share.geometry import se3
 from share.types import F64
 
 
@@ -16,7 +15,8 @@ class Spacing:
     """
 
     def __init__(self, gap_s: float, m: float, rad: float, left: float) -> None:
-        self._gap_ns, self._m, self._rad, self._left = gap_s * 1e9, m, rad, left
+        self._gap_ns, self._m, self._left = gap_s * 1e9, m, left
+        self._least_cosine = np.cos(min(rad, np.pi))
         self.stamp_ns = self.features = 0  # of the newest
         self.T = np.eye(4)
 
@@ -24,9 +24,9 @@ class Spacing:
         """Whether a frame with so many features seen is to be one: moved, turned, or little left in view."""
         if stamp_ns - self.stamp_ns < self._gap_ns:
             return False
-        motion = se3.log(se3.inverse(self.T) @ T)
+        cosine = ((self.T[:3, :3] * T[:3, :3]).sum() - 1) / 2  # of the angle between the two
         return bool(
-            np.linalg.norm(motion[3:]) > self._m
-            or np.linalg.norm(motion[:3]) > self._rad
+            np.linalg.norm(T[:3, 3] - self.T[:3, 3]) > self._m
+            or cosine < self._least_cosine
             or seen < self._left * self.features
         )

@@ -12,6 +12,7 @@ import numpy as np
 
 from share.types import F64
 
+_EYE: F64 = np.eye(3)
 _SMALL = 1e-6  # rad; below, Taylor series replace sin(x)/x and its kin
 
 
@@ -27,8 +28,11 @@ def hat(v: F64) -> F64:
 
 def _coefficients(phi: F64) -> tuple[F64, F64, F64]:
     """sin(a)/a, (1 - cos a)/a^2, (a - sin a)/a^3 for a = |phi|, each (..., 1, 1)."""
-    a = np.linalg.norm(phi, axis=-1)[..., None, None]
+    a = np.sqrt((phi * phi).sum(axis=-1))[..., None, None]
     small = a < _SMALL
+    if not small.any():
+        sine = np.sin(a)
+        return sine / a, (1 - np.cos(a)) / a**2, (a - sine) / a**3
     s = np.where(small, 1.0, a)
     return (
         np.where(small, 1 - a**2 / 6, np.sin(s) / s),
@@ -41,7 +45,7 @@ def so3_exp(phi: F64) -> F64:
     """Rodrigues' formula: (..., 3) rad -> (..., 3, 3)."""
     A, B, _ = _coefficients(phi)
     K = hat(phi)
-    return np.eye(3) + A * K + B * (K @ K)
+    return _EYE + A * K + B * (K @ K)
 
 
 def so3_log(R: F64) -> F64:
@@ -58,7 +62,7 @@ def so3_right_jacobian(phi: F64) -> F64:
     """Jr with Exp(phi + d) = Exp(phi) Exp(Jr d) to first order: (..., 3) -> (..., 3, 3)."""
     _, B, C = _coefficients(phi)
     K = hat(phi)
-    return np.eye(3) - B * K + C * (K @ K)
+    return _EYE - B * K + C * (K @ K)
 
 
 def quat_from_matrix(R: F64) -> F64:
@@ -86,7 +90,7 @@ def matrix_from_quat(q: F64) -> F64:
     """Rotations (..., 3, 3) of quaternions (..., 4) in order x y z w, normalised here."""
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     K = hat(q[..., :3])
-    return np.eye(3) + 2 * (q[..., 3, None, None] * K + K @ K)
+    return _EYE + 2 * (q[..., 3, None, None] * K + K @ K)
 
 
 def compose(R: F64, t: F64) -> F64:
@@ -113,8 +117,8 @@ def exp(xi: F64) -> F64:
     A, B, C = _coefficients(phi)
     K = hat(phi)
     KK = K @ K
-    V = np.eye(3) + B * K + C * KK
-    return compose(np.eye(3) + A * K + B * KK, (V @ rho[..., None])[..., 0])
+    V = _EYE + B * K + C * KK
+    return compose(_EYE + A * K + B * KK, (V @ rho[..., None])[..., 0])
 
 
 def log(T: F64) -> F64:
@@ -122,7 +126,7 @@ def log(T: F64) -> F64:
     phi = so3_log(T[..., :3, :3])
     _, B, C = _coefficients(phi)
     K = hat(phi)
-    V = np.eye(3) + B * K + C * (K @ K)
+    V = _EYE + B * K + C * (K @ K)
     rho = np.linalg.solve(V, T[..., :3, 3, None])[..., 0]
     return np.concatenate([phi, rho], axis=-1)
 

@@ -27,19 +27,23 @@ _MOST_ROWS = 30_000  # of what cv2.remap gives at a time (SHRT_MAX)
 
 @dataclass(frozen=True, eq=False)
 class Patches(Columns):
-    """N patches of S samples. gray (N, S): zero mean, unit norm; contrast (N,): the norm that it had.
+    """N patches of S samples. contrast (N,): the norm that gray levels had;
     slope (N, 2, S): derivatives by x and y less what gain and bias explain, in gray levels a pixel;
-    inverse (N, 2, 2): of their normal matrix. probe (N, 3, S): gray, and what gives the shift: times samples
-    of zero mean and unit norm, how alike they are and how far off, px."""
+    inverse (N, 2, 2): of their normal matrix. probe (N, 3, S): `gray`, and what gives the shift: times
+    samples of zero mean and unit norm, how alike they are and how far off, px."""
 
-    gray: F32
     contrast: F32
     slope: F32
     inverse: F32
     probe: F32
 
     def __len__(self) -> int:
-        return len(self.gray)
+        return len(self.probe)
+
+    @property
+    def gray(self) -> F32:
+        """(N, S) zero mean, unit norm."""
+        return self.probe[:, 0]
 
     @property
     def sigma_px(self) -> F32:
@@ -50,7 +54,7 @@ class Patches(Columns):
 
 def empty() -> Patches:
     s = len(OFFSETS)
-    shapes = ((0, s), (0,), (0, 2, s), (0, 2, 2), (0, 3, s))
+    shapes = ((0,), (0, 2, s), (0, 2, 2), (0, 3, s))
     return Patches(*(np.zeros(shape, np.float32) for shape in shapes))
 
 
@@ -71,7 +75,7 @@ def cut(image: U8, px: F32) -> Patches:
     normal = slope @ slope.transpose(0, 2, 1) + np.float32(1e-3) * np.eye(2, dtype=np.float32)
     inverse = np.linalg.inv(normal)
     probe = np.concatenate([gray[:, None], contrast[:, None, None] * (inverse @ slope)], axis=1)
-    return Patches(gray, contrast, slope, inverse, probe)
+    return Patches(contrast, slope, inverse, probe)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,25 +94,26 @@ class Found:
 def align(
     images: tuple[U8, ...],
     first: int,
-    patches: Patches,
+    probe: F32,
     px: F64,
     warp: F64,
     most: int = 4,
     settled_px: float = 0.02,
 ) -> Found:
-    """From px (N, 2), the patches being warped by (N, 2, 2): d px here / d px there. At most `most` steps.
+    """From px (N, 2), the patches, of which probe (N, 3, S) tells, being warped by (N, 2, 2): d px here /
+    d px there. At most `most` steps.
     The first so many are sought in the first of one or two images, the others in the second."""
-    n = len(patches)
+    n, every = len(probe), probe
     at, W = px.astype(np.float32), warp.astype(np.float32)
     alike, step = np.zeros(n, np.float32), np.full(n, np.inf, np.float32)
-    samples, shift = np.zeros_like(patches.gray), np.zeros((n, 2), np.float32)
+    samples, shift = np.zeros((n, len(OFFSETS)), np.float32), np.zeros((n, 2), np.float32)
     x, y = W[:, 0] @ OFFSETS.T, W[:, 1] @ OFFSETS.T
-    probe, todo = patches.probe, np.arange(n)
+    todo = np.arange(n)
     for _ in range(most):
         if len(todo) == 0:
             break
         if len(todo) < n:
-            probe, X, Y = patches.probe[todo], x[todo], y[todo]
+            probe, X, Y = every[todo], x[todo], y[todo]
         else:
             X, Y = x, y
         here = at[todo]

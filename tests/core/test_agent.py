@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
 import pytest
-from model_edge import COV, HELLO, MS, S, handle, tracked
+from model_edge import COV, HELLO, MS, UP, S, handle, tracked
 
 from share.config import AgentConfig, ClockConfig, Config
 from share.core import events as ev
 from share.core.agent import Agent
 from share.errors import UsageError
 from share.geometry import se3
-from share.types import Correction, Keyframe, TrackState, View
+from share.types import Candidate, Correction, Keyframe, TrackState, View
 from share.wire import messages as m
 from share.wire.codec import VERSION, decode, encode, size
 
@@ -237,6 +238,23 @@ def test_a_keyframe_that_could_not_be_made_leaves_a_frame_that_is_done() -> None
     [after] = only(Keyframe, handle(agent, tracked(2, pose(2), candidate=True), 100 * MS), messages=True)
     assert (after.id, after.reference, agent.report()["candidates"]) == (1, 0, 2)
     np.testing.assert_allclose(after.T_ref_body, pose(2))
+
+
+def test_a_candidate_whose_view_took_some_frames_is_a_keyframe_of_its_own_frame() -> None:
+    """Its stamp is that frame's, and a correction that answers it is as old as that; the frame that it came
+    with is the one that is done."""
+    agent = welcomed()
+    for k in range(3):
+        handle(agent, tracked(k, pose(k)), 50 * k * MS)
+    frame = replace(tracked(3, pose(3)), keyframe=True)
+    candidate = Candidate(pose(1), pose(1), COV, UP, 0.01, seen_at(2.0), True, frames_ago=2)
+    effects = agent.handle(frame, 154 * MS) + agent.handle(ev.KeyframeMade(frame, candidate), 160 * MS)
+    [made] = only(Keyframe, effects, messages=True)
+    assert made.stamp_ns == tracked(1).stamp_ns
+    [done] = only(ev.FrameDone, effects)
+    assert (done.stamp_ns, done.keyframe, done.sent) == (frame.stamp_ns, True, True)
+    [applied] = only(ev.CorrectionApplied, tell(agent, correction(pose(0), 1, answers=0), 250 * MS))
+    assert (applied.stamp_ns, applied.corrected_ms) == (made.stamp_ns, pytest.approx(200.0))
 
 
 def test_poses_go_relative_to_the_last_keyframe_that_the_edge_has() -> None:

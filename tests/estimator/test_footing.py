@@ -43,7 +43,7 @@ def walk(request, plain_session):
 
 def test_what_a_pose_rests_on_is_counted_and_in_the_image(walk):
     rig, told = walk
-    assert len(told) >= 3
+    assert len(told) >= 2
     for _, footing, result in told[1:]:
         assert footing.believed.sum() == result.points > 20
         assert len(footing.px) == result.found
@@ -56,7 +56,7 @@ def test_what_a_pose_rests_on_is_counted_and_in_the_image(walk):
 def test_depths_are_those_that_stereo_measures(walk):
     rig, told = walk
     off = []
-    for frame, footing, _ in told[2:]:
+    for frame, footing, _ in told[1:]:
         known = footing.believed & np.isfinite(footing.depth)
         assert known.sum() > 0.5 * footing.believed.sum()
         px = footing.px[known]

@@ -99,9 +99,10 @@ def test_keyframes_tell_the_motion_as_it_is_known_by_now(walk):
     """The first ones were told with a tilt that is off by a degree; what was learnt of it is no turn."""
     frames, rig, truth = walk
     tracker, shown = InertialTracker(rig, InertialConfig(), TrackerConfig()), []
-    for frame in frames:
+    for k, frame in enumerate(frames):
         if tracker.track(frame).keyframe:
-            shown.append((frame.stamp_ns, tracker.keyframe(frame)))
+            candidate = tracker.keyframe(frame)
+            shown.append((frames[k - candidate.frames_ago].stamp_ns, candidate))
     stamps = np.array([stamp for stamp, _ in shown])
     _, true = interpolate(truth.stamps_ns, truth.T, stamps)
     true = se3.inverse(true[:-1]) @ true[1:]
@@ -116,28 +117,31 @@ def test_keyframes_tell_the_motion_as_it_is_known_by_now(walk):
 
 
 def test_a_keyframe_brings_one_slice_of_work_a_frame_and_nothing_depends_on_when(walk, tracked):
-    """Its features come with the third, one later where it is shown to others, whether anybody calls `settle`
-    or the next frame does it first."""
+    """Its features come with the third; others are told of it five frames after its own. Whether anybody
+    calls `settle` or the next frame does it first."""
     frames, rig, _ = walk
-    tracker, poses, shown, grown = InertialTracker(rig, InertialConfig(), TrackerConfig()), [], [], []
+    tracker, poses, shown = InertialTracker(rig, InertialConfig(), TrackerConfig()), [], {}
+    begun, hosts = {}, []  # when each keyframe came; which have features after each frame
     for k, frame in enumerate(frames):
-        keyframes = 0 if tracker.state is None else len(tracker.state.keyframes)
         result = tracker.track(frame)
         poses.append(result.T_odom_body)
         if result.keyframe:
-            shown.append(tracker.keyframe(frame))
-        if len(tracker.state.keyframes) > keyframes > 0:
-            grown.append((k + result.keyframe, tracker.state.keyframes[-1]))
+            candidate = tracker.keyframe(frame)
+            assert candidate.frames_ago == (5 if shown else 0)
+            shown[k - candidate.frames_ago] = candidate
+        for keyframe in tracker.state.keyframes.tolist():
+            begun.setdefault(keyframe, k)
         tracker.settle()
         tracker.settle()  # once a frame is enough
-        for due, keyframe in grown[-1:]:
-            has = (tracker.state.keyframes[tracker.state.host] == keyframe).any()
-            assert has == (k >= due + 2)
+        hosts.append(set(tracker.state.keyframes[tracker.state.host].tolist()))
+    later = {keyframe: k for keyframe, k in begun.items() if 0 < k < len(frames) - 5}
+    for keyframe, k in later.items():
+        assert [keyframe in at for at in hosts[k : k + 3]] == [False, False, True]
+    assert len(later) >= 2 and set(shown) & set(later.values())
     results, candidates, _ = tracked
-    assert len(grown) >= 3
     for mine, result in zip(poses, results, strict=True):
         np.testing.assert_array_equal(mine, result.T_odom_body)
-    for mine, candidate in zip(shown, candidates, strict=True):
+    for mine, candidate in zip(shown.values(), candidates, strict=True):
         np.testing.assert_array_equal(mine.view.points, candidate.view.points)
         np.testing.assert_array_equal(mine.cov, candidate.cov)
 
@@ -248,11 +252,11 @@ def test_waits_for_something_to_see(walk):
 
 
 def test_memory_is_bounded(walk):
-    config = InertialConfig(max_keyframes=4, keyframe_m=0.02, keyframe_rad=0.02)
+    config = InertialConfig(max_keyframes=2, keyframe_m=0.02, keyframe_rad=0.02)
     results, _, tracker = run(walk, walk[0], config)
-    assert tracker.state.keyframes[-1] > 6
-    assert len(tracker.state.keyframes) <= 4 + 1  # one whose features are still to come
-    assert tracker.state.size <= 22 + 6 * 5 + config.features
+    assert tracker.state.keyframes[-1] >= 4
+    assert len(tracker.state.keyframes) <= 2 + 1  # one whose features are still to come
+    assert tracker.state.size <= 22 + 6 * 3 + config.features
     assert results[-1].state is OK
 
 

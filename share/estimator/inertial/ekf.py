@@ -71,7 +71,8 @@ def propagate(state: State, imu: ImuBatch, to_ns: int, noise: ImuNoise, gravity:
 def twist(state: State, rate: F64) -> F64:
     """How the body's pose moves with time, (6,): T(t + dt) = Exp(twist dt) T(t). rate (3,): rad/s, body."""
     turning = state.T[:3, :3] @ rate
-    return np.concatenate([turning, state.v - np.cross(turning, state.T[:3, 3])])
+    (a, b, c), (x, y, z) = turning.tolist(), state.T[:3, 3].tolist()
+    return np.concatenate([turning, state.v - (b * z - c * y, c * x - a * z, a * y - b * x)])
 
 
 def sight(state: State, which: I64, seen: Prediction, uv: F64, sigma: F64, lasting: F64, rate: F64) -> Sight:
@@ -88,15 +89,16 @@ def gains(state: State, rows: Sight, common: F64 | None = None) -> tuple[F64, F6
     entries. common (6, 6): covariance of an error that all rows share, as one of the pose, on its right."""
     P, M = state.cov, len(rows.which)
     core, by_host = rows.core.reshape(2 * M, CORE), rows.by_host.reshape(2 * M, 6)
-    by_rho, at_rho = rows.by_rho.ravel(), np.repeat(state.features_at + rows.which, 2)
+    feature = state.features_at + rows.which
     groups = [
         (state.keyframe(int(h)), slice(2 * a, 2 * b)) for h, a, b in zip(*_runs(rows.host), strict=True)
     ]
     HP = core @ P[:CORE]
-    HP += by_rho[:, None] * P[at_rho]
+    HP.reshape(M, 2, -1)[:] += rows.by_rho[:, :, None] * P.take(feature, axis=0)[:, None, :]
     for columns, part in groups:
         HP[part] += by_host[part] @ P[columns]
-    S = HP[:, :CORE] @ core.T + HP[:, at_rho] * by_rho
+    S = HP[:, :CORE] @ core.T
+    S.reshape(2 * M, M, 2)[:] += HP.take(feature, axis=1)[:, :, None] * rows.by_rho
     for columns, part in groups:
         S[:, part] += HP[:, columns] @ by_host[part].T
     S[np.diag_indices(2 * M)] += np.repeat(rows.sigma**2 + AS_ONE * rows.lasting**2, 2)
@@ -228,13 +230,14 @@ def _gain(HP: F64, S: F64, residual: F64, exactly: bool) -> tuple[F64, F64 | F32
 
 def move(state: State, error: F64) -> None:
     """Means by an error (n,)."""
-    by = se3.exp(np.concatenate([error[POSE][None], error[CORE : state.features_at].reshape(-1, 6)]))
+    poses = error[CORE : state.features_at].reshape(-1, 6)
+    by = se3.exp(np.concatenate([error[POSE][None], error[EXTRINSIC][None], poses]))
     turn = by[0, :3, :3]
     state.v = turn @ state.v + error[VELOCITY]
     state.T = by[0] @ state.T
-    state.poses = by[1:] @ state.poses
+    state.poses = by[2:] @ state.poses
     state.bg, state.ba = state.bg + error[GYRO_BIAS], state.ba + error[ACCEL_BIAS]
-    state.T_body_cam = state.T_body_cam @ se3.exp(error[EXTRINSIC])
+    state.T_body_cam = state.T_body_cam @ by[1]
     state.offset_s += float(error[OFFSET])
     state.rho = state.rho + error[state.features_at :]
 
@@ -327,6 +330,11 @@ def _widened(cov: F64, at: int, more: int) -> F64:
     return out
 
 
+def number_of(state: State, keyframe: int) -> int:
+    """Of the keyframe with this id, which the state has."""
+    return int(np.flatnonzero(state.keyframes == keyframe)[0])
+
+
 def motion(state: State, a: int, b: int) -> F64:
     """T_a_b (4, 4) between keyframes number a and b of the state."""
     return se3.orthonormal(se3.inverse(state.poses[a]) @ state.poses[b])
@@ -369,6 +377,15 @@ def scale_sigma(state: State) -> float:
 
 def pose_cov(state: State) -> F64:
     """Of T_odom_body (6, 6), perturbed on the right as everywhere else (`share.geometry.se3`)."""
-    Ad = se3.adjoint(se3.inverse(state.T))
-    out: F64 = Ad @ state.cov[POSE, POSE] @ Ad.T
+    return _on_the_right(state, state.T, POSE)
+
+
+def keyframe_cov(state: State, k: int) -> F64:
+    """The same of keyframe number k's."""
+    return _on_the_right(state, state.poses[k], state.keyframe(k))
+
+
+def _on_the_right(state: State, T: F64, at: slice) -> F64:
+    Ad = se3.adjoint(se3.inverse(T))
+    out: F64 = Ad @ state.cov[at, at] @ Ad.T
     return out

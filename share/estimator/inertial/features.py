@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from share.columns import Columns
+from share.estimator.middle import median
 from share.geometry.camera import Camera
 from share.types import F32, F64, I64, U8
 from share.vision import patches
@@ -69,7 +70,7 @@ def runaways(looks: Looks, which: I64, residual: F64) -> NDArray[np.bool_]:
         return np.zeros(len(which), bool)
     lag, quarter = looks.lag[which], len(which) // 4
     still = np.argpartition(np.hypot(lag[:, 0], lag[:, 1]), quarter)[: quarter + 1]
-    own = residual - np.median(residual[still], axis=0)
+    own = residual - [median(axis) for axis in residual[still].T]
     looks.lag[which] = lag = lag + _LATELY * (own - lag)
     far = np.hypot(lag[:, 0], lag[:, 1])
     out: NDArray[np.bool_] = far > max(_RUN_PX, _UNUSUAL * float(np.partition(far, quarter)[quarter]))

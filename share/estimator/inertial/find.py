@@ -50,7 +50,7 @@ class Sought:
 
     def due(self, camera: Camera) -> int:
         """How many should be in view."""
-        return int(camera.inside(np.nan_to_num(self.expected, nan=-1e6), 0.0).sum())
+        return int(camera.inside(self.expected, 0.0).sum())
 
 
 def seek(
@@ -71,17 +71,18 @@ def seek(
     parts = [slice(0, first), slice(first, None)][: len(cameras)]
     expected = np.concatenate([c.distort(aim.uv[part]) for c, part in zip(cameras, parts, strict=True)])
     jacobian = np.concatenate([c.jacobian(aim.uv[part]) for c, part in zip(cameras, parts, strict=True)])
-    warp, known = jacobian @ aim.warp, np.nan_to_num(expected, nan=-1e6)
+    warp = jacobian @ aim.warp
     inside = np.concatenate(
-        [c.inside(known[part], _BORDER_PX) for c, part in zip(cameras, parts, strict=True)]
+        [c.inside(expected[part], _BORDER_PX) for c, part in zip(cameras, parts, strict=True)]
     )
     todo = np.flatnonzero(inside)
-    out = _nothing(n, which[:first], expected[:first], aim.take(np.arange(first)), warp[:first])
+    left = Aim(aim.uv[:first], aim.warp[:first], aim.by_rho[:first])
+    out = _nothing(n, which[:first], expected[:first], left, warp[:first])
     if len(todo) == 0:
         return out
     ahead = int(np.searchsorted(todo, first))
     at = expected[todo]
-    found = patches.align(images, ahead, looks.patch.take(which[todo]), at, warp[todo])
+    found = patches.align(images, ahead, looks.patch.probe[which[todo]], at, warp[todo])
     good = _good(found, at, config, config.reach_px)
     for camera, part in zip(cameras, (slice(0, ahead), slice(ahead, None)), strict=False):
         if camera.bounded:  # it may have strayed to where there is no ray
@@ -98,7 +99,7 @@ def rescue(
     before: U8, image: U8, camera: Camera, looks: Looks, sought: Sought, config: InertialConfig
 ) -> None:
     """Where many of cam0 were not found, these are followed from the image before to wherever they went."""
-    inside = camera.inside(np.nan_to_num(sought.expected, nan=-1e6), _BORDER_PX)
+    inside = camera.inside(sought.expected, _BORDER_PX)
     todo = np.flatnonzero(~sought.found & inside)
     if len(todo) <= _MANY * inside.sum():
         return
@@ -107,7 +108,7 @@ def rescue(
     todo, at = todo[ok], px[ok].astype(np.float64)
     if len(todo) == 0:
         return
-    found = patches.align((image,), len(todo), looks.patch.take(todo), at, sought.warp[todo])
+    found = patches.align((image,), len(todo), looks.patch.probe[todo], at, sought.warp[todo])
     good = _good(found, at, config, _AGREE_PX) & camera.knows(found.px.astype(np.float64))
     _put(sought, todo, found, good, slice(None))
 
@@ -119,7 +120,7 @@ def _nothing(n: int, which: I64, expected: F64, aim: Aim, warp: F64) -> Sought:
     warps, along = np.zeros((n, 2, 2)), np.zeros((n, 2))
     warps[which], along[which] = warp, _along(aim)
     no, s = np.zeros(n, bool), len(patches.OFFSETS)
-    px = np.nan_to_num(where, nan=-1e6).astype(np.float32)
+    px = np.where(np.isnan(where), -1e6, where).astype(np.float32)
     samples, shift = np.zeros((n, s), np.float32), np.zeros((n, 2), np.float32)
     return Sought(px, no, no.copy(), where, uv, warps, along, samples, shift)
 

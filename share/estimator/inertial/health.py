@@ -7,6 +7,7 @@ import numpy as np
 from share.config import InertialConfig
 from share.estimator.inertial import ekf
 from share.estimator.inertial.state import State
+from share.estimator.middle import median
 from share.types import F64
 
 _OVER_S, _LEAST_S = 5.0, 1.0  # averaged over; of frames, before anything is said
@@ -34,7 +35,7 @@ class Agreement:
         if heard <= 0:
             return
         share = min(seconds / min(heard, _OVER_S), 1.0)
-        self._mean += share * (float(np.median(surprise)) - self._mean)
+        self._mean += share * (median(surprise) - self._mean)
 
     @property
     def sound(self) -> bool:

@@ -37,8 +37,10 @@ def integrate(
     first and last are held where they do not reach its ends. Raises ValueError without any."""
     dt, gyro, accel = _intervals(imu, from_ns, to_ns)
     gyro, accel = gyro - bg, accel - ba
-    R = _rotations(T[:3, :3], gyro * dt[:, None])
-    middle = R[:-1] @ se3.so3_exp(gyro * dt[:, None] / 2)
+    turns = gyro * dt[:, None]
+    steps = se3.so3_exp(np.concatenate([turns, turns / 2]))
+    R = _rotations(T[:3, :3], steps[: len(dt)])
+    middle = R[:-1] @ steps[len(dt) :]
     g = np.array([0.0, 0.0, -gravity])
     a = (middle @ accel[:, :, None])[:, :, 0] + g
     v_at = v + _sums(a * dt[:, None])
@@ -75,11 +77,11 @@ def _intervals(imu: ImuBatch, from_ns: int, to_ns: int) -> tuple[F64, F64, F64]:
     return np.diff(at), means[:, :3], means[:, 3:]
 
 
-def _rotations(R: F64, turns: F64) -> F64:
-    """R and what it becomes by each of the turns (N, 3): (N + 1, 3, 3)."""
-    out = np.empty((len(turns) + 1, 3, 3))
+def _rotations(R: F64, steps: F64) -> F64:
+    """R and what it becomes by each of the steps (N, 3, 3): (N + 1, 3, 3)."""
+    out = np.empty((len(steps) + 1, 3, 3))
     out[0] = R
-    for k, step in enumerate(se3.so3_exp(turns)):
+    for k, step in enumerate(steps):
         np.matmul(out[k], step, out=out[k + 1])
     return out
 

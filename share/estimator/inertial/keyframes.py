@@ -3,45 +3,70 @@ brings, in slices.
 
 A keyframe's pose joins the filter's state at once. All else is done after the poses of this frame and the
 next ones are out, one slice a frame, so that no frame waits for the whole of it: features seen from about
-here before, free corners, their depth. What is new is sought from a fixed frame on, however long a slice
-takes.
+here before, free corners, their depth, and, where others are told of it, the view that they are shown. What
+is new is sought from a fixed frame on, and a view is told at a fixed frame, however long a slice takes.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from share.config import InertialConfig
+from share.estimator.inertial import ekf
+from share.estimator.inertial.readiness import tilt
 from share.estimator.inertial.scene import Scene
 from share.estimator.inertial.shown import Shown
 from share.estimator.spacing import Spacing
 from share.geometry.camera import Rig
 from share.types import F32, F64, Frame, View
-from share.vision.view import make_view
+from share.vision.view import ViewInSteps
 
 _SHOWN_GAP_NS = 400_000_000  # between keyframes that others are told of
 
-Slice = Callable[[Scene, Frame, F64], None]  # with the frame just tracked, and its rate
-
 
 class Showing(NamedTuple):
-    """Of a keyframe: its view, T_last_body (4, 4) since the one shown before, and its covariance (6, 6)."""
+    """Of a keyframe: its view, its pose T (4, 4) and the sigma of what is up there, rad, as the filter knows
+    them now; T_last_body (4, 4) since the one shown before, and its covariance (6, 6). frames_ago: how many
+    frames have been tracked since its own."""
 
     view: View
+    T: F64
+    tilt: float
     T_last_body: F64
     cov: F64
+    frames_ago: int
 
 
 class Unsettled(NamedTuple):
-    """A keyframe whose candidate was made, and that others are told of unless something fails."""
+    """A keyframe, by id, whose candidate was made, and that others are told of unless something fails."""
 
     frame: Frame
+    keyframe: int
     view: View
+
+
+@dataclass(eq=False)
+class _Making:
+    """Of keyframe number `number`, whose frame this is: px (N, 2) near which nothing new is sought, and of
+    new corners; `ago` frames have been settled since. view: if others are to be told of it, and not yet
+    are."""
+
+    frame: Frame
+    number: int
+    taken: F32
+    corners: F32 = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    ago: int = 0
+    view: ViewInSteps | None = None
+    is_due: bool = False  # what it shows is for the next who asks
+
+
+Step = Callable[[_Making, Scene, Frame, F64], None]  # with the frame just tracked, and its rate
+Slice = tuple[Step, ...]
 
 
 class Keyframes:
@@ -54,12 +79,13 @@ class Keyframes:
         self._shown = Shown()
         self._shown_ns = 0
         self._unsettled: Unsettled | None = None
+        self._making: _Making | None = None
         self._slices: deque[Slice] = deque()
-        self._urgent = False
 
     def wanted(self, stamp_ns: int, T_odom_body: F64, seen: int) -> bool:
         """Whether a frame with so many features seen is to be one."""
-        return not self._slices and self._newest.wanted(stamp_ns, T_odom_body, seen)
+        busy = self._slices or self.is_due
+        return not busy and self._newest.wanted(stamp_ns, T_odom_body, seen)
 
     def anchor(self, frame: Frame, scene: Scene, rate: F64) -> None:
         """Make the frame just tracked one, all at once: where no pose is told yet. rate (3,): rad/s."""
@@ -67,62 +93,91 @@ class Keyframes:
         self._work(scene, frame, rate)
 
     def begin(self, frame: Frame, scene: Scene, rate: F64, urgent: bool) -> None:
-        """Make the frame just tracked one, if it is not: its pose; the rest is for `settle`. urgent: all of
-        it at once, for there is little to go by."""
-        self._urgent = urgent
-        if self.is_newest(frame):
+        """Make the frame just tracked one, if it is not: its pose; the rest is for `settle`. urgent: all new
+        features with the first slice, for there is little to go by."""
+        if frame.stamp_ns == self._newest.stamp_ns:
             return
         number = scene.add_keyframe(rate)
         self._newest.stamp_ns, self._newest.T = frame.stamp_ns, scene.state.T
-        self._slices = deque([partial(self._recall, frame, number, scene.taken())])
+        self._making = _Making(frame, number, scene.taken())
+        steps = self._recall, self._corners, self._admit
+        self._slices = deque([steps] if urgent else [(step,) for step in steps])
 
-    def is_newest(self, frame: Frame) -> bool:
-        return frame.stamp_ns == self._newest.stamp_ns
+    def offer(self, scene: Scene, at_once: bool) -> None:
+        """Others are to be told of the newest, which is the frame just tracked. at_once: now; else some
+        frames from here, when its features are in and its view is made."""
+        made = self._making
+        assert made is not None
+        self._shown_ns = made.frame.stamp_ns
+        made.view = ViewInSteps(made.frame, self._rig, self._view_features, scene.depths(made.frame))
+        if at_once:
+            made.is_due = True
+        else:
+            self._slices.extend([(self._detect,), (self._describe,)])
 
     def may_show(self, stamp_ns: int) -> bool:
         """Whether it is time to tell others of one."""
         return stamp_ns - self._shown_ns >= _SHOWN_GAP_NS
 
-    def show(self, frame: Frame, scene: Scene, new_stretch: bool) -> Showing:
-        """Of the frame just tracked, the newest keyframe."""
-        self._shown_ns = frame.stamp_ns
-        view = make_view(frame, self._rig, self._view_features, scene.depths(frame))
-        self._unsettled = Unsettled(frame, view)
-        return Showing(view, *self._shown.motion(scene.state, new_stretch))
+    @property
+    def is_due(self) -> bool:
+        """Whether there is one that others are to be told of now."""
+        return self._making is not None and self._making.is_due
+
+    def show(self, scene: Scene, new_stretch: bool) -> Showing:
+        """The one that is due. Raises ValueError where none is."""
+        made, s = self._making, scene.state
+        if made is None or made.view is None or not made.is_due:
+            raise ValueError("no keyframe is due")
+        view = made.view.finish()
+        self._unsettled = Unsettled(made.frame, made.number, view)
+        k = ekf.number_of(s, made.number)
+        T_last_body, cov = self._shown.motion(s, k, new_stretch)
+        return Showing(view, s.poses[k], tilt(s, s.keyframe(k)), T_last_body, cov, made.ago)
 
     def settle(self, scene: Scene, frame: Frame, rate: F64) -> Unsettled | None:
         """A slice of what is left to do, once a frame, of which `frame` is the last. The keyframe that was
         shown, if there was one."""
         done, self._unsettled = self._unsettled, None
         if done is not None:
-            self._shown.told(scene.state)  # only now: before, making its candidate might have failed
-        if done is None or self._urgent:  # a view is work enough for one frame
-            self._work(scene, frame, rate)
+            self._shown.told(scene.state, done.keyframe)  # not before: making its candidate might have failed
+        made = self._making
+        if made is not None:
+            if made.is_due:  # others have it, or nobody asked
+                made.view, made.is_due = None, False
+            made.ago += 1
+        self._work(scene, frame, rate)
         return done
 
     def forget(self) -> None:
         """The filter begins anew, and numbers its keyframes anew. What is left to do is void."""
-        self._unsettled = None
+        self._unsettled = self._making = None
         self._slices.clear()
         self._shown.forget()
 
     # ------------------------------------------------------------------ slices
 
     def _work(self, scene: Scene, last: Frame, rate: F64) -> None:
-        while self._slices:
-            self._slices.popleft()(scene, last, rate)
-            if not self._urgent:
-                break
+        if self._slices and self._making is not None:
+            for step in self._slices.popleft():
+                step(self._making, scene, last, rate)
 
-    def _recall(self, frame: Frame, number: int, taken: F32, scene: Scene, last: Frame, rate: F64) -> None:
+    def _recall(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
         woken = scene.wake(last, rate)
-        taken = np.concatenate([taken, woken])
-        self._slices.append(partial(self._corners, frame, number, taken))
+        made.taken = np.concatenate([made.taken, woken])
 
-    def _corners(self, frame: Frame, number: int, taken: F32, scene: Scene, last: Frame, rate: F64) -> None:
-        px = scene.corners(frame, taken)
-        self._slices.append(partial(self._admit, frame, number, px))
+    def _corners(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
+        made.corners = scene.corners(made.frame, made.taken)
 
-    def _admit(self, frame: Frame, number: int, px: F32, scene: Scene, last: Frame, rate: F64) -> None:
-        scene.admit(frame, number, px)
+    def _admit(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
+        scene.admit(made.frame, made.number, made.corners)
         self._newest.features = len(scene.state.ids)
+
+    def _detect(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
+        if made.view is not None:
+            made.view.detect()
+
+    def _describe(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
+        if made.view is not None:
+            made.view.describe()
+            made.is_due = True

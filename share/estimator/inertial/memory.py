@@ -36,7 +36,7 @@ class Memory:
     """By keyframe id. Memory is bounded by the keyframes of the state."""
 
     def __init__(self) -> None:
-        self._of: dict[int, Asleep] = {}
+        self._of: dict[int, list[Asleep]] = {}  # in the order in which they fell asleep
         self._new: list[tuple[I64, Asleep]] = []  # ids of their hosts; sorted only where somebody asks
 
     def sleep(self, state: State, looks: Looks, which: I64) -> None:
@@ -51,19 +51,26 @@ class Memory:
             self._new.append((state.keyframes[hosts], asleep))
 
     def _sort(self) -> None:
-        """By keyframe, the best of each."""
+        """By keyframe."""
         if not self._new:
             return
         keys = np.concatenate([keys for keys, _ in self._new])
         first, *others = (asleep for _, asleep in self._new)
         new, self._new = first.join(*others), []
         for key in np.unique(keys).tolist():
-            mine, old = new.take(keys == key), self._of.get(key)
-            asleep = mine if old is None else old.join(mine)
-            if len(asleep.ids) > _MOST:
-                best = np.argsort(asleep.sigma, kind="stable")[:_MOST]
-                asleep = asleep.take(np.sort(best))
-            self._of[key] = asleep
+            self._of.setdefault(key, []).append(new.take(keys == key))
+
+    def _best(self, keyframe: int) -> Asleep | None:
+        """Of one keyframe."""
+        if keyframe not in self._of:
+            return None
+        first, *others = self._of[keyframe]
+        asleep = first.join(*others) if others else first
+        if len(asleep.ids) > _MOST:
+            best = np.argsort(asleep.sigma, kind="stable")[:_MOST]
+            asleep = asleep.take(np.sort(best))
+        self._of[keyframe] = [asleep]
+        return asleep
 
     def has(self, keyframes: I64) -> NDArray[np.bool_]:
         """Of which keyframes (K,) there are any."""
@@ -82,8 +89,10 @@ class Memory:
         (far,), (turned,) = se3.apart(state.T[None], state.poses)
         out: list[Asleep] = []
         for k in np.argsort(far + turned, kind="stable").tolist():
-            mine = self._of.get(int(state.keyframes[k]))
-            if mine is None or far[k] >= max_m or turned[k] >= max_rad:
+            if far[k] >= max_m or turned[k] >= max_rad:
+                continue
+            mine = self._best(int(state.keyframes[k]))
+            if mine is None:
                 continue
             mine = mine.take(observe.in_view(state, camera, k, mine.ray, mine.rho))
             if len(mine.ids) == 0:
@@ -96,9 +105,14 @@ class Memory:
     def wake(self, ids: I64) -> None:
         """These are features of the state again."""
         self._sort()
-        for keyframe, asleep in list(self._of.items()):
-            keep = ~np.isin(asleep.ids, ids)
-            if not keep.any():
+        gone = set(ids.tolist())
+        for keyframe, parts in list(self._of.items()):
+            left = [_without(part, gone) for part in parts]
+            self._of[keyframe] = [part for part in left if len(part.ids)]
+            if not self._of[keyframe]:
                 del self._of[keyframe]
-            elif not keep.all():
-                self._of[keyframe] = asleep.take(keep)
+
+
+def _without(asleep: Asleep, ids: set[int]) -> Asleep:
+    keep = [n for n, feature in enumerate(asleep.ids.tolist()) if feature not in ids]
+    return asleep if len(keep) == len(asleep.ids) else asleep.take(np.array(keep, np.int64))

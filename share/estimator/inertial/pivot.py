@@ -34,9 +34,12 @@ class Pivot:
 
     def after(self, s: State) -> None:
         """Whatever has been learnt since the last call."""
-        _, was, now = np.intersect1d(self._keyframes, s.keyframes, return_indices=True)
-        if len(now):
-            turned = _small_turn((s.poses[now, :3, :3] @ self._R[was].swapaxes(1, 2)).mean(axis=0))
+        R, before = s.poses[:, :3, :3], self._R
+        if not np.array_equal(self._keyframes, s.keyframes):
+            _, was, now = np.intersect1d(self._keyframes, s.keyframes, return_indices=True)
+            R, before = R[now], before[was]
+        if len(R):
+            turned = _small_turn((R @ before.swapaxes(1, 2)).mean(axis=0))
             turned[_UP] = 0.0  # about the vertical nothing is ever learnt; what turns keeps its place
             arm = s.T[:3, 3] - self._about
             self.shift = self.shift - (arm - se3.so3_exp(-turned) @ arm)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from share.config import InertialConfig
-from share.estimator.inertial.state import ACCEL_BIAS, GYRO_BIAS, VELOCITY, State
+from share.estimator.inertial.state import ACCEL_BIAS, GYRO_BIAS, POSE, VELOCITY, State
 from share.geometry.camera import ImuBias
 from share.types import Wait
 
@@ -14,9 +14,9 @@ _CARRIED_M_S, _CARRIED_S = 0.03, 0.9  # a tilt carries nobody off faster than th
 _LEARNT = 0.3  # of the sigma that a bias has which nobody knows
 
 
-def tilt(s: State) -> float:
-    """Sigma of what is up, rad."""
-    return float(np.sqrt(s.cov[0, 0] + s.cov[1, 1]))
+def tilt(s: State, at: slice = POSE) -> float:
+    """Sigma of what is up, rad; of the pose that has these columns."""
+    return float(np.sqrt(s.cov[at.start, at.start] + s.cov[at.start + 1, at.start + 1]))
 
 
 def converged(s: State) -> bool:

@@ -200,7 +200,7 @@ class Scene:
     def admit(self, frame: Frame, keyframe: int, px: F32) -> None:
         """New features at px (N, 2) of the frame that is keyframe number `keyframe`; the last frame may be a
         later one. Keyframes that nothing is left of make room."""
-        host, room = int(np.flatnonzero(self.state.keyframes == keyframe)[0]), self._room()
+        host, room = ekf.number_of(self.state, keyframe), self._room()
         self._add_features(frame, host, px[:room])
         self._forget()
 

@@ -26,18 +26,17 @@ class Shown:
         """The filter's keyframes are numbered anew."""
         self._keyframe = -1
 
-    def told(self, s: State) -> None:
-        """The newest keyframe is the last one from now on: others have it."""
-        self._keyframe, self._T_odom_body = int(s.keyframes[-1]), s.T
+    def told(self, s: State, keyframe: int) -> None:
+        """The one with this id is the last one from now on: others have it."""
+        self._keyframe, self._T_odom_body = keyframe, s.poses[ekf.number_of(s, keyframe)]
 
-    def motion(self, s: State, new_stretch: bool) -> tuple[F64, F64]:
-        """T_last_body (4, 4) of the newest keyframe and its covariance (6, 6): as the state knows both now.
+    def motion(self, s: State, k: int, new_stretch: bool) -> tuple[F64, F64]:
+        """T_last_body (4, 4) of keyframe number k and its covariance (6, 6): as the state knows both now.
         Where it has the last one no longer, after a loss, as they were told, and as unsure as the place where
         the body was found again."""
-        newest = len(s.keyframes) - 1
-        known = np.flatnonzero(s.keyframes[:-1] == self._keyframe)
+        known = np.flatnonzero(s.keyframes[:k] == self._keyframe)
         if new_stretch:
-            return s.T, ekf.pose_cov(s)
+            return s.poses[k], ekf.keyframe_cov(s, k)
         if len(known):
-            return ekf.motion(s, int(known[0]), newest), ekf.motion_cov(s, int(known[0]), newest)
-        return se3.inverse(self._T_odom_body) @ s.T, ekf.pose_cov(s) + _FOUND_COV
+            return ekf.motion(s, int(known[0]), k), ekf.motion_cov(s, int(known[0]), k)
+        return se3.inverse(self._T_odom_body) @ s.poses[k], ekf.keyframe_cov(s, k) + _FOUND_COV

@@ -24,12 +24,13 @@ from share.estimator.inertial.imu import integrate
 from share.estimator.inertial.keyframes import Keyframes
 from share.estimator.inertial.noise import louder, shaken, without
 from share.estimator.inertial.pivot import Pivot
-from share.estimator.inertial.readiness import converged, learnt_bias, tilt, waits_for, worth_telling
+from share.estimator.inertial.readiness import converged, learnt_bias, waits_for, worth_telling
 from share.estimator.inertial.samples import Samples, coasting, mean_rate, unclipped
 from share.estimator.inertial.scene import Scene
 from share.estimator.inertial.state import State
 from share.estimator.inertial.window import Window, window_for, without_force
 from share.estimator.localmap import LocalMap
+from share.estimator.middle import median
 from share.estimator.result import TrackResult, typical
 from share.geometry import se3
 from share.geometry.camera import ImuBias, ImuNoise, Rig
@@ -43,7 +44,6 @@ _GAP_NS = 250_000_000  # between frames: more than an IMU of this sort is modell
 _DOUBT = 0.02, 0.1, 0.3  # rad, m, m/s: how wrong the filter may be after it that believes nobody
 _REST_RATE, _REST_M_S = 0.03, 0.02  # rad/s of a body at rest; m/s of its velocity
 _SLOW_M_S = 0.3  # a smooth ride looks like rest to an IMU, but not to a filter that knows it moves
-_LITTLE = 0.5  # of the features that there may be: then a keyframe's come at once
 _PATIENCE = 10  # frames without a sample of the IMU, after which we begin without
 _LEVEL_RAD = np.radians(3.0)  # sigma of tilt up to which others are told what is up
 
@@ -113,14 +113,14 @@ class InertialTracker:
         return result
 
     def keyframe(self, frame: Frame) -> Candidate:
-        """What the frame just tracked shows to others; call it where `track` said that it is a keyframe."""
-        scene = self._scene
-        assert scene is not None
+        """What there is to show to others; call it where `track` said so of this frame. It is of a frame or
+        two before, whose view was made meanwhile."""
+        assert self._scene is not None
         new_stretch, self._new_stretch = self._new_stretch, False
-        view, T_last_body, cov = self._keyframes.show(frame, scene, new_stretch)
-        s, unsure = scene.state, tilt(scene.state)
-        up = s.T[2, :3] if self._knows_up and unsure < _LEVEL_RAD else np.zeros(3)
-        return Candidate(self._pivot.told(s.T), T_last_body, cov, up, unsure / np.sqrt(2), view, new_stretch)
+        view, T, unsure, T_last_body, cov, ago = self._keyframes.show(self._scene, new_stretch)
+        up = T[2, :3] if self._knows_up and unsure < _LEVEL_RAD else np.zeros(3)
+        sigma = unsure / np.sqrt(2)
+        return Candidate(self._pivot.told(T), T_last_body, cov, up, sigma, view, new_stretch, ago)
 
     def settle(self) -> None:
         """A slice of what keyframes leave to do, and nobody waits for: new features, and places to find
@@ -131,7 +131,8 @@ class InertialTracker:
         self._settled = True
         s, done = self._scene.state, self._keyframes.settle(self._scene, self._last, self._rate)
         if done is not None and not self._straying.suspected:
-            self._places.add_keyframe(done.frame.image0, s.T @ s.T_body_cam)
+            T_odom_body = s.poses[ekf.number_of(s, done.keyframe)]
+            self._places.add_keyframe(done.frame.image0, T_odom_body @ s.T_body_cam)
             self._places.set_view(done.view)
 
     def footing(self) -> Footing:
@@ -220,10 +221,12 @@ class InertialTracker:
         else:
             self._pivot.after(s)
         pose, cov = self._pose(s), ekf.pose_cov(s)
-        shown = first or (wanted and self._keyframes.may_show(frame.stamp_ns))
         if wanted or first:
-            self._keyframes.begin(frame, scene, self._rate, count < _LITTLE * self._config.features)
-        return TrackResult(state, pose, shown, count, new_stretch, cov, self._agreement.sound)
+            self._keyframes.begin(frame, scene, self._rate, urgent=count < self._config.weak)
+            if first or self._keyframes.may_show(frame.stamp_ns):
+                self._keyframes.offer(scene, at_once=first)
+        is_due = self._keyframes.is_due
+        return TrackResult(state, pose, is_due, count, new_stretch, cov, self._agreement.sound)
 
     def _look(self, frame: Frame, scene: Scene) -> tuple[find.Sought, NDArray[np.bool_]]:
         """Where cam0 shows the features, and which (N,) were seen and believed."""
@@ -302,12 +305,13 @@ class InertialTracker:
         self, s: State, rows: ekf.Sight, rows_now: Callable[[], ekf.Sight]
     ) -> tuple[ekf.Sight, NDArray[np.bool_], F64, F64]:
         """Rows at the best linearisation, which of them the filter believes, and its `ekf.gains`."""
-        if np.median(np.abs(rows.residual)) * self._rig.cam0.focal > _FAR_OFF_PX:
+        if median(np.abs(rows.residual).ravel()) * self._rig.cam0.focal > _FAR_OFF_PX:
             rows = ekf.relinearised(s, rows_now, self._common)
         HP, S = ekf.gains(s, rows, self._common)
         self._surprise = ekf.surprise(rows, S)
-        doubted = rows.which[self._surprise >= self._config.gate]
-        return rows, ~np.isin(rows.which, doubted), HP, S  # one camera's doubt is enough
+        believed = np.ones(len(s.ids), bool)
+        believed[rows.which[self._surprise >= self._config.gate]] = False  # one camera's doubt is enough
+        return rows, believed[rows.which], HP, S
 
     def _agreed(self, s: State, left: find.Sought) -> bool:
         """Whether nearly all that cam0 shows agrees among itself."""
@@ -335,6 +339,8 @@ class InertialTracker:
 
     def _pose(self, s: State) -> F64:
         """At the frame's stamp, IMU time: the state is where the image was taken."""
+        if s.offset_s == 0:
+            return self._pivot.told(s.T)
         return self._pivot.told(se3.exp(-ekf.twist(s, self._rate) * s.offset_s) @ s.T)
 
     # ------------------------------------------------------------------ beginnings and losses
