@@ -182,6 +182,10 @@ class Scene:
         out: NDArray[np.bool_] = self.looks.age[which] >= self._probation
         return out
 
+    def is_static(self, fewest: int) -> bool:
+        """False while something moves in the view and fewer than `fewest` features have proven not to."""
+        return self._wary == 0 or int(self.proven(np.arange(len(self.state.ids))).sum()) >= fewest
+
     def _vague(self) -> NDArray[np.bool_]:
         """Which features' depth (N,) is hardly known, nor therefore where they should be."""
         out: NDArray[np.bool_] = self.state.rho_variance > _VAGUE**2

@@ -322,7 +322,7 @@ class InertialTracker:
 
     def _judge(self, s: State, count: int, heard: bool) -> TrackState:
         config = self._config
-        if self._window is not None or (heard and not self._ready and not self._worth_telling(s)):
+        if self._window is not None or (heard and not self._ready and not self._is_ready(s)):
             return TrackState.INITIALISING
         if count < config.blind:
             return TrackState.INERTIAL_ONLY if heard else TrackState.LOST
@@ -330,11 +330,16 @@ class InertialTracker:
             return TrackState.VISION_ONLY
         return TrackState.OK if count >= config.weak else TrackState.WEAK
 
-    def _worth_telling(self, s: State) -> bool:
-        return worth_telling(s, (s.stamp_ns - self._begun_ns) * 1e-9, self._new_stretch)
+    def _is_ready(self, s: State) -> bool:
+        """For a first pose. What moves in the view must not be all that the velocity is known by."""
+        waited_s = (s.stamp_ns - self._begun_ns) * 1e-9
+        return self._is_static() and worth_telling(s, waited_s, self._new_stretch)
+
+    def _is_static(self) -> bool:
+        return self._scene is None or self._scene.is_static(self._config.weak // 2)
 
     def _initialising(self, s: State) -> TrackResult:
-        waits = Wait.SCALE if self._window is not None else waits_for(s)
+        waits = Wait.SCALE if self._window is not None else waits_for(s) if self._is_static() else Wait.VIEW
         return TrackResult(TrackState.INITIALISING, None, waits=waits)
 
     def _pose(self, s: State) -> F64:
@@ -373,7 +378,7 @@ class InertialTracker:
         if found is None:
             self._places = LocalMap(self._places_config.max_keyframes)
         self._lost_ns = None
-        if self._window is not None or not self._worth_telling(state):
+        if self._window is not None or not self._is_ready(state):
             return self._initialising(state)
         return self._told(frame, scene, TrackState.OK, True, len(state.ids))
 

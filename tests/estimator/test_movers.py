@@ -1,0 +1,61 @@
+"""While something moves in the view, a new filter waits for features that have proven static."""
+
+import numpy as np
+import pytest
+
+from share.config import Config, InertialConfig
+from share.core.sequencer import SequencerCounters
+from share.estimator.inertial import find
+from share.estimator.inertial.scene import Scene
+from share.estimator.inertial.state import CORE, begin
+from share.io.source import open_source
+from share.run.pipeline import frames_of
+
+CONFIG, STILL = InertialConfig(), np.zeros(3)
+ENOUGH = CONFIG.weak // 2
+
+
+@pytest.fixture(scope="module")
+def source(plain_session):
+    return open_source(f"{plain_session}/ar1")
+
+
+@pytest.fixture(scope="module")
+def frames(source):
+    """Of a body at rest."""
+    return list(frames_of(source, Config(), SequencerCounters()))[:12]
+
+
+@pytest.fixture
+def scene(source, frames):
+    state = begin(0, np.eye(4), STILL, STILL, STILL, source.rig.T_body_cam0, np.full(CORE, 1e-3))
+    scene = Scene(state, source.rig, CONFIG)
+    keyframe = scene.add_keyframe(STILL)
+    scene.admit(frames[0], keyframe, scene.corners(frames[0], scene.taken()))
+    return scene
+
+
+def look(scene, rig, frame, movers=0):
+    """At a frame in which the first few features went their own way."""
+    scene.step(1 / 15)
+    sought = find.seek(frame, rig, scene.state, scene.looks, CONFIG)
+    sought.astray[:movers] = True
+    scene.seen(sought, sought.found & ~sought.astray)
+
+
+def test_a_view_in_which_nothing_moves_is_static_at_once(source, frames, scene):
+    assert scene.is_static(ENOUGH)
+    look(scene, source.rig, frames[1])
+    assert scene.is_static(ENOUGH)
+
+
+def test_with_movers_it_is_once_enough_features_have_proven_static(source, frames, scene):
+    look(scene, source.rig, frames[1], movers=6)
+    assert not scene.is_static(ENOUGH)
+    for frame in frames[2:5]:
+        look(scene, source.rig, frame)
+        assert not scene.is_static(ENOUGH)
+    for frame in frames[5:8]:
+        look(scene, source.rig, frame)
+    assert scene.is_static(ENOUGH)
+    assert not scene.is_static(len(scene.state.ids) + 1)
