@@ -39,7 +39,7 @@ from share.emulate.demo import FALLBACK, SCENE  # noqa: E402
 from share.emulate.recipe import Recipe  # noqa: E402
 from share.emulate.render.context import missing  # noqa: E402
 from share.emulate.session import cached_session, make_session  # noqa: E402
-from share.estimator.inertial import ekf, features, find, keyframes, observe  # noqa: E402
+from share.estimator.inertial import ekf, features, find, observe  # noqa: E402
 from share.estimator.inertial.scene import Scene  # noqa: E402
 from share.estimator.inertial.tracker import InertialTracker  # noqa: E402
 from share.estimator.visual import VisualTracker  # noqa: E402
@@ -47,6 +47,7 @@ from share.io.source import Source, open_source  # noqa: E402
 from share.run.pipeline import frames_of, tracker_for  # noqa: E402
 from share.types import F64  # noqa: E402
 from share.vision import corners, patches  # noqa: E402
+from share.vision.view import ViewInSteps  # noqa: E402
 
 STEREO = {"euroc_752x480": ("euroc", 20), "d435i_848x480": ("d435i:848x480@30", 30)}  # profile, Hz
 NEEDS_LENS = "euroc_752x480"  # which the plain room does not have
@@ -68,7 +69,9 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (Scene, "_forget", "keyframe: forget"),
     (Scene, "_inverse_depths", "keyframe: depth"),
     (features, "looks", "keyframe: patches"),
-    (keyframes, "make_view", "keyframe: view"),
+    (ViewInSteps, "detect", "view: features"),
+    (ViewInSteps, "describe", "view: descriptors"),
+    (ViewInSteps, "finish", "view: depth"),
     (corners, "detect", "keyframe: corners"),
     (VisualTracker, "_find", "klt"),
     (VisualTracker, "_pose", "pose"),

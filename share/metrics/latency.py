@@ -12,6 +12,22 @@ from numpy.typing import ArrayLike
 NOTICED_MS = 20.0  # a headset wearer notices more
 
 
+class Queue:
+    """How long a frame of a recording would wait if frames came at the recording's pace: for what the one
+    before left to do."""
+
+    def __init__(self) -> None:
+        self._stamp_ns, self._spent_ms = 0, 0.0
+
+    def wait_ms(self, stamp_ns: int) -> float:
+        """Of the next frame."""
+        return max(0.0, self._spent_ms - (stamp_ns - self._stamp_ns) * 1e-6)
+
+    def served(self, stamp_ns: int, spent_ms: float) -> None:
+        """spent_ms: on this frame, what comes after its pose included."""
+        self._stamp_ns, self._spent_ms = stamp_ns, spent_ms
+
+
 @dataclass(frozen=True)
 class Summary:
     """Of n values; all NaN where n is 0. Percentiles interpolate linearly."""

@@ -17,6 +17,7 @@ from share.estimator.result import TrackResult
 from share.io.source import Source
 from share.io.trajectory import Trajectory
 from share.metrics.ate import Ate, ate
+from share.metrics.latency import Queue
 from share.metrics.runlog import RunLog
 from share.run.guard import Guard
 from share.run.guarded_tracker import GuardedTracker
@@ -44,14 +45,15 @@ def track(
     check_trackable(source.name, source.rig)
     guard, memory = Guard(say), ImuMemory(source, settings.inertial, say)
     tracker = GuardedTracker(source.rig, settings, guard, memory.bias)
-    log, counters = RunLog(), SequencerCounters()
+    log, counters, queue = RunLog(), SequencerCounters(), Queue()
     stamps, poses = [], []
     for frame in frames_of(source, settings, counters, spent=log.add_decode, say=say):
         began, cpu = time.perf_counter(), time.process_time()
         result = tracker.track(frame)
-        track_ms = 1e3 * (time.perf_counter() - began)
+        track_ms = queue.wait_ms(frame.stamp_ns) + 1e3 * (time.perf_counter() - began)
         log.add_result(result.new_stretch, result.sound, result.waits)
         tracker.finish(frame, result.keyframe)
+        queue.served(frame.stamp_ns, 1e3 * (time.perf_counter() - began))
         log.cpu_s += time.process_time() - cpu
         log.add(frame.stamp_ns, track_ms, result.state, result.keyframe)
         if result.T_odom_body is not None:

@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from share.metrics.latency import latency, summary
+from share.metrics.latency import Queue, latency, summary
 
 
 def test_mean_is_over_the_multiset_of_both():
@@ -27,3 +27,11 @@ def test_nothing_is_null_in_json_and_nan_is_refused():
     }  # fmt: skip
     with pytest.raises(ValueError, match="finite"):
         latency([1.0, math.nan], [])
+
+
+def test_a_frame_waits_for_what_the_one_before_left_to_do():
+    queue = Queue()
+    assert queue.wait_ms(5) == 0
+    queue.served(5, 40.0)
+    assert queue.wait_ms(5 + 30_000_000) == pytest.approx(10)
+    assert queue.wait_ms(5 + 50_000_000) == 0
