@@ -170,7 +170,7 @@ class Agent:
         """Makes a keyframe of a candidate that came with `frame`, if the rate allows (drop_rate)."""
         own = self._recent[-1 - candidate.frames_ago]
         self._counts["candidates"] += 1
-        self._error.processed((now_ns - own.arrived_ns) / 1e6)
+        self._error.processed((now_ns - frame.arrived_ns) / 1e6)  # a view that is made later delays nobody
         self._chain.extend(candidate)
         sent = self._bucket.take(now_ns, self._worth.is_rather_high(candidate.view))
         if sent:

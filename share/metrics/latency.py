@@ -17,15 +17,15 @@ class Queue:
     before left to do."""
 
     def __init__(self) -> None:
-        self._stamp_ns, self._spent_ms = 0, 0.0
+        self._stamp_ns, self._busy_ms = 0, 0.0
 
     def wait_ms(self, stamp_ns: int) -> float:
         """Of the next frame."""
-        return max(0.0, self._spent_ms - (stamp_ns - self._stamp_ns) * 1e-6)
+        return max(0.0, self._busy_ms - (stamp_ns - self._stamp_ns) * 1e-6)
 
-    def served(self, stamp_ns: int, spent_ms: float) -> None:
-        """spent_ms: on this frame, what comes after its pose included."""
-        self._stamp_ns, self._spent_ms = stamp_ns, spent_ms
+    def served(self, stamp_ns: int, busy_ms: float) -> None:
+        """busy_ms: from when the frame came until all work on it was done, its wait included."""
+        self._stamp_ns, self._busy_ms = stamp_ns, busy_ms
 
 
 @dataclass(frozen=True)

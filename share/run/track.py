@@ -50,10 +50,11 @@ def track(
     for frame in frames_of(source, settings, counters, spent=log.add_decode, say=say):
         began, cpu = time.perf_counter(), time.process_time()
         result = tracker.track(frame)
-        track_ms = queue.wait_ms(frame.stamp_ns) + 1e3 * (time.perf_counter() - began)
+        waited_ms = queue.wait_ms(frame.stamp_ns)
+        track_ms = waited_ms + 1e3 * (time.perf_counter() - began)
         log.add_result(result.new_stretch, result.sound, result.waits)
         tracker.finish(frame, result.keyframe)
-        queue.served(frame.stamp_ns, 1e3 * (time.perf_counter() - began))
+        queue.served(frame.stamp_ns, waited_ms + 1e3 * (time.perf_counter() - began))
         log.cpu_s += time.process_time() - cpu
         log.add(frame.stamp_ns, track_ms, result.state, result.keyframe)
         if result.T_odom_body is not None:

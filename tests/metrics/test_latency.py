@@ -35,3 +35,11 @@ def test_a_frame_waits_for_what_the_one_before_left_to_do():
     queue.served(5, 40.0)
     assert queue.wait_ms(5 + 30_000_000) == pytest.approx(10)
     assert queue.wait_ms(5 + 50_000_000) == 0
+
+
+def test_who_is_too_slow_falls_behind_ever_more():
+    queue = Queue()
+    for k in range(60):
+        stamp = k * 33_000_000
+        queue.served(stamp, queue.wait_ms(stamp) + 50)
+    assert queue.wait_ms(60 * 33_000_000) == pytest.approx(60 * 17)

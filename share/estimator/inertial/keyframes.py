@@ -52,9 +52,8 @@ class Unsettled(NamedTuple):
 
 @dataclass(eq=False)
 class _Making:
-    """Of keyframe number `number`, whose frame this is: px (N, 2) near which nothing new is sought, and of
-    new corners; `ago` frames have been settled since. view: if others are to be told of it, and not yet
-    are."""
+    """Of the keyframe with id `number`, whose frame this is: px (N, 2) near which nothing new is sought, and
+    of new corners; `ago` frames have been settled since. view: if others are to be told of it."""
 
     frame: Frame
     number: int
@@ -66,7 +65,7 @@ class _Making:
 
 
 Step = Callable[[_Making, Scene, Frame, F64], None]  # with the frame just tracked, and its rate
-Slice = tuple[Step, ...]
+Slice = list[tuple[Step, _Making]]
 
 
 class Keyframes:
@@ -79,13 +78,14 @@ class Keyframes:
         self._shown = Shown()
         self._shown_ns = 0
         self._unsettled: Unsettled | None = None
-        self._making: _Making | None = None
+        self._newest_made: _Making | None = None
+        self._showing: _Making | None = None  # of which others are told next
         self._slices: deque[Slice] = deque()
 
     def wanted(self, stamp_ns: int, T_odom_body: F64, seen: int) -> bool:
         """Whether a frame with so many features seen is to be one."""
-        busy = self._slices or self.is_due
-        return not busy and self._newest.wanted(stamp_ns, T_odom_body, seen)
+        steps = (step for part in self._slices for step, _ in part)
+        return self._admit not in steps and self._newest.wanted(stamp_ns, T_odom_body, seen)
 
     def anchor(self, frame: Frame, scene: Scene, rate: F64) -> None:
         """Make the frame just tracked one, all at once: where no pose is told yet. rate (3,): rad/s."""
@@ -93,40 +93,46 @@ class Keyframes:
         self._work(scene, frame, rate)
 
     def begin(self, frame: Frame, scene: Scene, rate: F64, urgent: bool) -> None:
-        """Make the frame just tracked one, if it is not: its pose; the rest is for `settle`. urgent: all new
-        features with the first slice, for there is little to go by."""
+        """Make the frame just tracked one, if it is not: its pose; the rest is for `settle`, after what an
+        earlier one's view still takes. urgent: all new features with the next slice, for there is little to
+        go by."""
         if frame.stamp_ns == self._newest.stamp_ns:
             return
         number = scene.add_keyframe(rate)
         self._newest.stamp_ns, self._newest.T = frame.stamp_ns, scene.state.T
-        self._making = _Making(frame, number, scene.taken())
-        steps = self._recall, self._corners, self._admit
-        self._slices = deque([steps] if urgent else [(step,) for step in steps])
+        made = self._newest_made = _Making(frame, number, scene.taken())
+        steps: Slice = [(step, made) for step in (self._recall, self._corners, self._admit)]
+        if not urgent:
+            self._slices.extend([step] for step in steps)
+        elif self._slices:
+            self._slices[0][:0] = steps
+        else:
+            self._slices.append(steps)
 
     def offer(self, scene: Scene, at_once: bool) -> None:
         """Others are to be told of the newest, which is the frame just tracked. at_once: now; else some
         frames from here, when its features are in and its view is made."""
-        made = self._making
+        made = self._showing = self._newest_made
         assert made is not None
         self._shown_ns = made.frame.stamp_ns
         made.view = ViewInSteps(made.frame, self._rig, self._view_features, scene.depths(made.frame))
         if at_once:
             made.is_due = True
         else:
-            self._slices.extend([(self._detect,), (self._describe,)])
+            self._slices.extend([[(self._detect, made)], [(self._describe, made)]])
 
     def may_show(self, stamp_ns: int) -> bool:
         """Whether it is time to tell others of one."""
-        return stamp_ns - self._shown_ns >= _SHOWN_GAP_NS
+        return self._showing is None and stamp_ns - self._shown_ns >= _SHOWN_GAP_NS
 
     @property
     def is_due(self) -> bool:
         """Whether there is one that others are to be told of now."""
-        return self._making is not None and self._making.is_due
+        return self._showing is not None and self._showing.is_due
 
     def show(self, scene: Scene, new_stretch: bool) -> Showing:
         """The one that is due. Raises ValueError where none is."""
-        made, s = self._making, scene.state
+        made, s = self._showing, scene.state
         if made is None or made.view is None or not made.is_due:
             raise ValueError("no keyframe is due")
         view = made.view.finish()
@@ -141,26 +147,24 @@ class Keyframes:
         done, self._unsettled = self._unsettled, None
         if done is not None:
             self._shown.told(scene.state, done.keyframe)  # not before: making its candidate might have failed
-        made = self._making
-        if made is not None:
-            if made.is_due:  # others have it, or nobody asked
-                made.view, made.is_due = None, False
-            made.ago += 1
+        if self._showing is not None:
+            self._showing.ago += 1
+            if self._showing.is_due:  # others have it, or nobody asked
+                self._showing = None
         self._work(scene, frame, rate)
         return done
 
     def forget(self) -> None:
         """The filter begins anew, and numbers its keyframes anew. What is left to do is void."""
-        self._unsettled = self._making = None
+        self._unsettled = self._newest_made = self._showing = None
         self._slices.clear()
         self._shown.forget()
 
     # ------------------------------------------------------------------ slices
 
     def _work(self, scene: Scene, last: Frame, rate: F64) -> None:
-        if self._slices and self._making is not None:
-            for step in self._slices.popleft():
-                step(self._making, scene, last, rate)
+        for step, made in self._slices.popleft() if self._slices else ():
+            step(made, scene, last, rate)
 
     def _recall(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
         woken = scene.wake(last, rate)
@@ -170,7 +174,8 @@ class Keyframes:
         made.corners = scene.corners(made.frame, made.taken)
 
     def _admit(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
-        scene.admit(made.frame, made.number, made.corners)
+        held = self._shown.keyframe, -1 if self._showing is None else self._showing.number
+        scene.admit(made.frame, made.number, made.corners, held)
         self._newest.features = len(scene.state.ids)
 
     def _detect(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:

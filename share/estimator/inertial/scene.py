@@ -201,12 +201,12 @@ class Scene:
         more = self._config.features if self._room() else 0
         return corners.detect(frame.image0, taken, more, self._config.spacing_px, within(self._rig.cam0))
 
-    def admit(self, frame: Frame, keyframe: int, px: F32) -> None:
-        """New features at px (N, 2) of the frame that is keyframe number `keyframe`; the last frame may be a
-        later one. Keyframes that nothing is left of make room."""
+    def admit(self, frame: Frame, keyframe: int, px: F32, held: tuple[int, ...] = ()) -> None:
+        """New features at px (N, 2) of the frame that is the keyframe with that id; the last frame may be a
+        later one. Keyframes that nothing is left of make room, but for those with ids in `held`."""
         host, room = ekf.number_of(self.state, keyframe), self._room()
         self._add_features(frame, host, px[:room])
-        self._forget()
+        self._forget(held)
 
     def _room(self) -> int:
         """For so many features more."""
@@ -290,20 +290,24 @@ class Scene:
         """What is out of sight was remembered for nothing."""
         self._memory = Memory()
 
-    def _forget(self) -> None:
+    def _forget(self, held: tuple[int, ...]) -> None:
         """Keyframes whose features are all gone, and, where there are too many, the most redundant ones.
-        Never the newest two: others are told of the motion between them."""
+        Never the newest two, nor those with ids in `held`: others are told of the motion between them."""
         s = self.state
         busy = np.isin(np.arange(len(s.keyframes)), s.host)
         leave = ~busy & ~self._memory.has(s.keyframes)
-        leave[-2:] = False
+        stay = np.isin(s.keyframes, held)
+        stay[-2:] = True
+        leave &= ~stay
         while len(s.keyframes) - leave.sum() > self._config.max_keyframes:
             left = np.flatnonzero(~leave)
             distance, angle = se3.apart(s.poses[left], s.poses[left])
             cost = distance + angle
             cost[np.diag_indices(len(left))] = np.inf
             nearest = cost.min(axis=1) + _FAR * busy[left]
-            nearest[-2:] = np.inf
+            nearest[stay[left]] = np.inf
+            if not np.isfinite(nearest).any():
+                break
             leave[left[np.argmin(nearest)]] = True
         if not leave.any():
             return

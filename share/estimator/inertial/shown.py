@@ -17,24 +17,24 @@ _FOUND_COV = np.diag(np.repeat([0.01**2, 0.03**2], 3))  # rad, m: of a place fou
 
 
 class Shown:
-    """The keyframe that others were told of last."""
+    """The keyframe that others were told of last: its id; -1 where the filter has none."""
 
     def __init__(self) -> None:
-        self._keyframe, self._T_odom_body = -1, np.eye(4)
+        self.keyframe, self._T_odom_body = -1, np.eye(4)
 
     def forget(self) -> None:
         """The filter's keyframes are numbered anew."""
-        self._keyframe = -1
+        self.keyframe = -1
 
     def told(self, s: State, keyframe: int) -> None:
         """The one with this id is the last one from now on: others have it."""
-        self._keyframe, self._T_odom_body = keyframe, s.poses[ekf.number_of(s, keyframe)]
+        self.keyframe, self._T_odom_body = keyframe, s.poses[ekf.number_of(s, keyframe)]
 
     def motion(self, s: State, k: int, new_stretch: bool) -> tuple[F64, F64]:
         """T_last_body (4, 4) of keyframe number k and its covariance (6, 6): as the state knows both now.
         Where it has the last one no longer, after a loss, as they were told, and as unsure as the place where
         the body was found again."""
-        known = np.flatnonzero(s.keyframes[:k] == self._keyframe)
+        known = np.flatnonzero(s.keyframes[:k] == self.keyframe)
         if new_stretch:
             return s.poses[k], ekf.keyframe_cov(s, k)
         if len(known):

@@ -113,8 +113,8 @@ class InertialTracker:
         return result
 
     def keyframe(self, frame: Frame) -> Candidate:
-        """What there is to show to others; call it where `track` said so of this frame. It is of a frame or
-        two before, whose view was made meanwhile."""
+        """What there is to show to others; call it where `track` said so of this frame. It is of this frame,
+        or of one up to five before, whose view was made meanwhile."""
         assert self._scene is not None
         new_stretch, self._new_stretch = self._new_stretch, False
         view, T, unsure, T_last_body, cov, ago = self._keyframes.show(self._scene, new_stretch)
