@@ -158,6 +158,19 @@ def test_ping_and_pong_give_round_trip_and_clock() -> None:
     assert abs(report["clock_drift_ppm"]) < 1
 
 
+def test_the_wait_for_a_view_is_no_delay() -> None:
+    """It is made while nobody waits, so the scheduler is told only what its last frame took."""
+    agent = welcomed()
+    [ping] = only(m.Ping, handle(agent, ev.Tick(), 500 * MS), messages=True)
+    tell(agent, m.Pong(ping.sequence, ping.sent_ns, 0, 0, SESSION), 503 * MS)
+    for k in (11, 12, 13):
+        handle(agent, tracked(k, pose(1)), (50 * k + 4) * MS)
+    frame = replace(tracked(14, pose(1)), keyframe=True)
+    candidate = Candidate(pose(1), pose(1), COV, UP, 0.01, seen_at(2.0), True, frames_ago=3)
+    effects = agent.handle(frame, 704 * MS) + agent.handle(ev.KeyframeMade(frame, candidate), 710 * MS)
+    assert [told.delay_ms for told in only(m.Evaluation, effects, messages=True)] == [3.0 + 10.0]
+
+
 def latencies(edge_ns: Callable[[int], int], claim_ms: float = 1.0) -> tuple[list[float], Agent]:
     """All that is called latency or delay in 30 s of keyframes, each corrected 27 ms after its frame came,
     with an edge whose clock shows `edge_ns` of the agent's."""
