@@ -52,8 +52,7 @@ class State:
     @property
     def parts(self) -> tuple[slice, ...]:
         """Where each camera's intrinsics are among the shared parameters."""
-        ends = np.cumsum([0, *(len(names(camera)) for camera in self.cameras)]).tolist()
-        return tuple(slice(a, b) for a, b in pairwise(ends))
+        return parts(self.cameras)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,9 +196,15 @@ def _block(state: State, view: View, k: int, target: Target) -> tuple[F64, F64]:
     return np.concatenate(rs), np.concatenate(Js)
 
 
+def parts(cameras: Sequence[Camera]) -> tuple[slice, ...]:
+    """Where each camera's intrinsics are among the parameters that the views share."""
+    ends = np.cumsum([0, *(len(names(camera)) for camera in cameras)]).tolist()
+    return tuple(slice(a, b) for a, b in pairwise(ends))
+
+
 def shared(cameras: Sequence[Camera]) -> int:
     """How many parameters the views share: intrinsics of each camera, and xi of T_cam1_cam0."""
-    return sum(len(names(camera)) for camera in cameras) + 6 * (len(cameras) - 1)
+    return int(parts(cameras)[-1].stop) + 6 * (len(cameras) - 1)
 
 
 def _solve(views: Sequence[View], target: Target, state: State, cameras_fixed: bool = False) -> Solution:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from share.calibration.bundle import View, shared
-from share.calibration.projection import moved, names, project
+from share.calibration.bundle import View, parts, shared
+from share.calibration.projection import moved, project
 from share.geometry import se3
 from share.geometry.camera import Camera
 from share.geometry.target import Target
@@ -71,8 +71,7 @@ def by_rig(sights: Sights, eye: int, T_target_cam0: F64) -> F64:
     points, by_mount = moved(sights.mounts[eye], _in_cam0(sights, eye, T_target_cam0))
     _, by_intrinsics, by = project(sights.cameras[eye], points)
     out = np.zeros((len(points), 2, shared(sights.cameras)))
-    begin = sum(len(names(camera)) for camera in sights.cameras[:eye])
-    out[:, :, begin : begin + by_intrinsics.shape[2]] = by_intrinsics
+    out[:, :, parts(sights.cameras)[eye]] = by_intrinsics
     if eye == 1:
         out[:, :, -6:] = by @ by_mount
     return out
