@@ -116,9 +116,9 @@ def test_keyframes_tell_the_motion_as_it_is_known_by_now(walk):
     assert np.sqrt((off**2).mean()) < 0.2 * np.sqrt((before**2).mean())
 
 
-def test_a_keyframe_brings_one_slice_of_work_a_frame_and_nothing_depends_on_when(walk, tracked):
-    """Its features come with the third, or the fifth where the view of the one before is being made; others
-    are told of it five frames after its own. Whether anybody calls `settle`, or the next frame does it."""
+def test_a_keyframe_brings_two_slices_of_work_a_frame_and_nothing_depends_on_when(walk, tracked):
+    """Its features come with the second, and others are told of it three frames after its own. Whether
+    anybody calls `settle`, or the next frame does it."""
     frames, rig, _ = walk
     tracker, poses, shown = InertialTracker(rig, InertialConfig(), TrackerConfig()), [], {}
     begun, hosts = {}, []  # when each keyframe came; which have features after each frame
@@ -127,17 +127,17 @@ def test_a_keyframe_brings_one_slice_of_work_a_frame_and_nothing_depends_on_when
         poses.append(result.T_odom_body)
         if result.keyframe:
             candidate = tracker.keyframe(frame)
-            assert candidate.frames_ago == (5 if shown else 0)
+            assert candidate.frames_ago == (3 if shown else 0)
             shown[k - candidate.frames_ago] = candidate
         for keyframe in tracker.state.keyframes.tolist():
             begun.setdefault(keyframe, k)
         tracker.settle()
         tracker.settle()  # once a frame is enough
         hosts.append(set(tracker.state.keyframes[tracker.state.host].tolist()))
-    later = {keyframe: k for keyframe, k in begun.items() if 0 < k < len(frames) - 5}
+    later = {keyframe: k for keyframe, k in begun.items() if 0 < k < len(frames) - 3}
     for keyframe, k in later.items():
-        assert [keyframe in at for at in hosts[k : k + 2]] == [False, False]
-        assert keyframe in hosts[k + 2] or (keyframe in hosts[k + 4] and k - 3 in shown)
+        assert keyframe not in hosts[k]
+        assert keyframe in hosts[k + 1]
     assert len(later) >= 2 and set(shown) & set(later.values())
     results, candidates, _ = tracked
     for mine, result in zip(poses, results, strict=True):
@@ -145,6 +145,20 @@ def test_a_keyframe_brings_one_slice_of_work_a_frame_and_nothing_depends_on_when
     for mine, candidate in zip(shown.values(), candidates, strict=True):
         np.testing.assert_array_equal(mine.view.points, candidate.view.points)
         np.testing.assert_array_equal(mine.cov, candidate.cov)
+
+
+@pytest.mark.parametrize(("every", "frames_ago"), [(2, 2), (3, 1)])  # of 15 Hz
+def test_where_frames_are_rare_each_brings_more_slices(walk, every, frames_ago):
+    """Others are told of a keyframe after about as long, and of as many."""
+    frames, rig, _ = walk
+    rare, samples = [], ImuBatch.empty()
+    for k, frame in enumerate(frames):
+        samples = samples.join(frame.imu)
+        if k % every == 0:
+            rare.append(dataclasses.replace(frame, index=len(rare), imu=samples))
+            samples = ImuBatch.empty()
+    _, candidates, _ = run((None, rig, None), rare)
+    assert {c.frames_ago for c in candidates[1:]} == {frames_ago}
 
 
 class Late:

@@ -2,9 +2,10 @@
 brings, in slices.
 
 A keyframe's pose joins the filter's state at once. All else is done after the poses of this frame and the
-next ones are out, one slice a frame, so that no frame waits for the whole of it: features seen from about
-here before, free corners, their depth, and, where others are told of it, the view that they are shown. What
-is new is sought from a fixed frame on, and a view is told at a fixed frame, however long a slice takes.
+next ones are out, one slice a frame (more where frames are rare), so that no frame waits for the whole of
+it: features seen from about here before, free corners, their depth, and, where others are told of it, the
+view that they are shown. What is new is sought from a fixed frame on, and a view is told at a fixed frame,
+however long a slice takes.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from share.types import F32, F64, Frame, View
 from share.vision.view import ViewInSteps
 
 _SHOWN_GAP_NS = 400_000_000  # between keyframes that others are told of
+_SLICE_NS = 30_000_000  # of the time between frames: two slices a frame at 15 Hz, one at 20 and at 30
 
 
 class Showing(NamedTuple):
@@ -76,7 +78,7 @@ class Keyframes:
         c = config
         self._newest = Spacing(c.keyframe_gap_s, c.keyframe_m, c.keyframe_rad, c.keyframe_seen)
         self._shown = Shown()
-        self._shown_ns = 0
+        self._shown_ns = self._settled_ns = 0
         self._unsettled: Unsettled | None = None
         self._newest_made: _Making | None = None
         self._showing: _Making | None = None  # of which others are told next
@@ -142,8 +144,8 @@ class Keyframes:
         return Showing(view, s.poses[k], tilt(s, s.keyframe(k)), T_last_body, cov, made.ago)
 
     def settle(self, scene: Scene, frame: Frame, rate: F64) -> Unsettled | None:
-        """A slice of what is left to do, once a frame, of which `frame` is the last. The keyframe that was
-        shown, if there was one."""
+        """A slice of what is left to do, or as many as there is time for between frames, once a frame, of
+        which `frame` is the last. The keyframe that was shown, if there was one."""
         done, self._unsettled = self._unsettled, None
         if done is not None:
             self._shown.told(scene.state, done.keyframe)  # not before: making its candidate might have failed
@@ -151,7 +153,11 @@ class Keyframes:
             self._showing.ago += 1
             if self._showing.is_due:  # others have it, or nobody asked
                 self._showing = None
-        self._work(scene, frame, rate)
+        since_ns, self._settled_ns = frame.stamp_ns - self._settled_ns, frame.stamp_ns
+        for _ in range(max(1, since_ns // _SLICE_NS)):
+            if not self._slices:
+                break
+            self._work(scene, frame, rate)
         return done
 
     def forget(self) -> None:
@@ -163,7 +169,7 @@ class Keyframes:
     # ------------------------------------------------------------------ slices
 
     def _work(self, scene: Scene, last: Frame, rate: F64) -> None:
-        for step, made in self._slices.popleft() if self._slices else ():
+        for step, made in self._slices.popleft():
             step(made, scene, last, rate)
 
     def _recall(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
