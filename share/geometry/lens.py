@@ -23,7 +23,7 @@ COUNTS = {RADTAN: (0, 4, 5), EQUIDISTANT: (4,)}  # of coefficients
 # a pixel is 15 times as much of it as in the middle.
 WIDEST_DEG = 75.0
 _TINY = 1e-8  # of a squared radius: below it limits are taken
-_ROUNDS, _EXACT = 20, 1e-12  # of Newton's method for an angle
+_ROUNDS, _EXACT = 60, 1e-12  # of Newton's method for an angle
 
 
 @dataclass(frozen=True)
@@ -70,19 +70,26 @@ class Radtan:
         if self.limit < math.inf and about is None:  # begin inside, where there is a way
             r = np.hypot(uv[..., 0], uv[..., 1])[..., None]
             uv *= np.minimum(1, 0.9 * self.limit / np.maximum(r, 1e-12))
-        for k in range(8):  # Newton on the 2x2 system; converges quadratically inside the image
-            if k == 0 or about is None:  # near enough, the first derivative will do
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # a lens that no glass has
+            found = self._newton(bent, uv, about is not None)
+            if self.limit < math.inf or not found:  # what fell into the fold, or found no way
+                off = np.abs(bent - self._bend(uv)).max(axis=-1)
+                uv[~(((uv**2).sum(axis=-1) <= self.limit**2) & (off < 1e-6))] = np.nan
+        return uv
+
+    def _newton(self, bent: F64, uv: F64, near: bool) -> bool:
+        """Move uv (..., 2) to where its image is bent (..., 2); whether all of them arrived. near: they are
+        nearly there, so that the first derivative will do."""
+        for k in range(8):  # converges quadratically inside the image
+            if k == 0 or not near:
                 J = self.jacobian(uv)
                 J = J / (J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0])[..., None, None]
             r = bent - self._bend(uv)
             uv[..., 0] += J[..., 1, 1] * r[..., 0] - J[..., 0, 1] * r[..., 1]
             uv[..., 1] += J[..., 0, 0] * r[..., 1] - J[..., 1, 0] * r[..., 0]
             if np.nanmax(np.abs(r), initial=0.0) < 1e-6:  # so the step leaves about its square
-                break
-        if self.limit < math.inf:  # what fell into the fold, or found no way
-            off = np.abs(bent - self._bend(uv)).max(axis=-1)
-            uv[~(((uv**2).sum(axis=-1) <= self.limit**2) & (off < 1e-6))] = np.nan
-        return uv
+                return True
+        return False
 
     def bend_points(self, points: F64) -> F64:
         """Points (..., 3) in the camera frame -> image plane (..., 2); NaN behind the camera."""
@@ -231,17 +238,19 @@ class Equidistant:
 
     def _angle(self, radius: F64, most: float) -> F64:
         """rad (...) off the axis of what is seen at a radius (...) in the image plane; NaN beyond `most`.
-        Newton's method between 0 and `most`, where the radius grows with the angle."""
+        Newton's method between 0 and `most`, where the radius grows with the angle; the interval is halved
+        where a step would leave it or is more than half of the one before."""
         end = float(self._bent(np.asarray(most)))
         sought = np.where(radius <= end, radius, np.nan)
         low, high = np.zeros_like(sought), np.full_like(sought, most)
-        theta = np.minimum(sought, most)
+        theta, moved = np.minimum(sought, most), np.full_like(sought, 2 * most)
         for _ in range(_ROUNDS):
             off = self._bent(theta) - sought
             low, high = np.where(off < 0, theta, low), np.where(off > 0, theta, high)
             with np.errstate(divide="ignore", invalid="ignore"):
                 step = theta - off / self._slope(theta)
-            step = np.where((step >= low) & (step <= high), step, (low + high) / 2)
+            fits = (step >= low) & (step <= high) & (np.abs(step - theta) <= moved / 2)
+            step = np.where(fits, step, (low + high) / 2)
             moved, theta = np.abs(step - theta), np.where(np.isnan(sought), np.nan, step)
             if np.nanmax(moved, initial=0.0) < _EXACT:
                 break

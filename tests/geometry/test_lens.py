@@ -1,5 +1,7 @@
 """Both lens models against OpenCV's, and against differences; nothing folds back into the image."""
 
+import warnings
+
 import cv2
 import numpy as np
 import pytest
@@ -116,3 +118,24 @@ def test_field_of_view():
     assert np.degrees(TUMVI.field_rad) == pytest.approx([150.0, 150.0])
     narrow = Camera(320, 240, 190.98, 190.97, 160.0, 120.0, TUMVI.distortion, "equidistant")
     assert np.degrees(narrow.field_rad[0]) == pytest.approx(2 * np.degrees(160 / 190.98), abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [
+        ("equidistant", (30.0, -30.0, 1e-3, 1e-3)),
+        ("equidistant", (1.0, -0.3, 1e-3, -0.3)),
+        ("radtan", (0.0, 0.0, -1.0, 1.0, 0.0)),
+        ("radtan", (0.0, 0.0, 30.0, 0.0, 0.0)),
+        ("radtan", (1e4, 1e4, 30.0, 1e4)),
+    ],
+)
+def test_a_lens_that_no_glass_has_gives_no_wrong_ray(model, coefficients):
+    """What it gives is right, and where it finds none there is NaN, without a warning."""
+    camera = Camera(64, 48, 30.0, 30.0, 31.5, 23.5, coefficients, model)
+    px = np.stack(np.meshgrid(np.arange(64.0), np.arange(48.0)), axis=-1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        uv = camera.normalise(px)
+        known = np.isfinite(uv).all(axis=-1)
+        np.testing.assert_allclose(camera.distort(uv[known]), px[known], atol=1e-3)
