@@ -70,7 +70,7 @@ def run(sequence: Sequence, seed: int, options: argparse.Namespace, code: str) -
     options.out.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
         file.with_suffix(".npz"),
-        t_s=(found.stamps_ns - told.log.rows[0].stamp_ns) * 1e-9,
+        t_s=(found.stamps_ns - told.log.frames().stamp_ns[0]) * 1e-9,
         errors=found.deviations.errors,
         sigmas=found.deviations.sigmas,
         stretch=found.stretch,

@@ -122,7 +122,8 @@ def play(made: KeyframeSet, config: Config, link: str, seed: int, modelled: bool
         row["error_cm"] = errors_cm.get(name, float("nan"))
     metres = sum(float(np.linalg.norm(np.diff(a.T_world_body[:, :3, 3], axis=0), axis=1).sum()) for a in who)
     joined = max(Counter(own["map_id"] for own in report["agents"].values()).values())
-    late_ms = [r.corrected_ms for log in world.logs.values() for r in log.rows if r.corrected_ms > 0]
+    corrected_ms = np.concatenate([log.frames().corrected_ms for log in world.logs.values()])
+    late_ms = corrected_ms[corrected_ms > 0]
     whole = {
         "metres": metres,
         "joined": joined,

@@ -3,8 +3,8 @@ brings, in slices.
 
 A keyframe's pose joins the filter's state at once. All else is done after the poses of this frame and the
 next ones are out, one slice a frame (more where frames are rare), so that no frame waits for the whole of
-it: features seen from about here before, free corners, their depth, and, where others are told of it, the
-view that they are shown. What is new is sought from a fixed frame on, and a view is told at a fixed frame,
+it: the view that others are shown, if they are told of it, features seen from about here before, free
+corners, and their depth. A view is told at a fixed frame, and what is new is sought from a fixed frame on,
 however long a slice takes.
 """
 
@@ -94,34 +94,38 @@ class Keyframes:
         self.begin(frame, scene, rate, urgent=True)
         self._work(scene, frame, rate)
 
-    def begin(self, frame: Frame, scene: Scene, rate: F64, urgent: bool) -> None:
+    def begin(self, frame: Frame, scene: Scene, rate: F64, urgent: bool, to_show: bool = False) -> None:
         """Make the frame just tracked one, if it is not: its pose; the rest is for `settle`, after what an
-        earlier one's view still takes. urgent: all new features with the next slice, for there is little to
-        go by."""
+        earlier one still takes. to_show: others are to be told of it, when its view is made, which is what
+        comes first. urgent: all new features with the next slice, for there is little to go by."""
         if frame.stamp_ns == self._newest.stamp_ns:
             return
         number = scene.add_keyframe(rate)
         self._newest.stamp_ns, self._newest.T = frame.stamp_ns, scene.state.T
         made = self._newest_made = _Making(frame, number, scene.taken())
-        steps: Slice = [(step, made) for step in (self._recall, self._corners, self._admit)]
+        features: Slice = [(step, made) for step in (self._recall, self._corners, self._admit)]
+        view: Slice = [(step, made) for step in (self._detect, self._describe)] if to_show else []
+        if to_show:
+            self._offer(scene)
         if not urgent:
-            self._slices.extend([step] for step in steps)
-        elif self._slices:
-            self._slices[0][:0] = steps
+            self._slices.extend([step] for step in [*view, *features])
+            return
+        if self._slices:
+            self._slices[0][:0] = features
         else:
-            self._slices.append(steps)
+            self._slices.append(features)
+        self._slices.extend([step] for step in view)
 
-    def offer(self, scene: Scene, at_once: bool) -> None:
-        """Others are to be told of the newest, which is the frame just tracked. at_once: now; else some
-        frames from here, when its features are in and its view is made."""
+    def show_at_once(self, scene: Scene) -> None:
+        """Others are to be told of the newest, which is the frame just tracked, now."""
+        self._offer(scene).is_due = True
+
+    def _offer(self, scene: Scene) -> _Making:
         made = self._showing = self._newest_made
         assert made is not None
         self._shown_ns = made.frame.stamp_ns
         made.view = ViewInSteps(made.frame, self._rig, self._view_features, scene.depths(made.frame))
-        if at_once:
-            made.is_due = True
-        else:
-            self._slices.extend([[(self._detect, made)], [(self._describe, made)]])
+        return made
 
     def may_show(self, stamp_ns: int) -> bool:
         """Whether it is time to tell others of one."""

@@ -114,7 +114,7 @@ class InertialTracker:
 
     def keyframe(self, frame: Frame) -> Candidate:
         """What there is to show to others; call it where `track` said so of this frame. It is of this frame,
-        or of one up to five before, whose view was made meanwhile."""
+        or of one shortly before, whose view was made meanwhile."""
         assert self._scene is not None
         new_stretch, self._new_stretch = self._new_stretch, False
         view, T, unsure, T_last_body, cov, ago = self._keyframes.show(self._scene, new_stretch)
@@ -222,9 +222,10 @@ class InertialTracker:
             self._pivot.after(s)
         pose, cov = self._pose(s), ekf.pose_cov(s)
         if wanted or first:
-            self._keyframes.begin(frame, scene, self._rate, urgent=count < self._config.weak)
-            if first or self._keyframes.may_show(frame.stamp_ns):
-                self._keyframes.offer(scene, at_once=first)
+            to_show = not first and self._keyframes.may_show(frame.stamp_ns)
+            self._keyframes.begin(frame, scene, self._rate, count < self._config.weak, to_show)
+            if first:
+                self._keyframes.show_at_once(scene)
         is_due = self._keyframes.is_due
         return TrackResult(state, pose, is_due, count, new_stretch, cov, self._agreement.sound)
 
