@@ -206,16 +206,25 @@ class ImuBatch:
 
     def take(self, which: slice | I64 | NDArray[np.bool_]) -> ImuBatch:
         """These samples, by numbers or a mask (N,)."""
-        return ImuBatch(self.stamps_ns[which], self.gyro[which], self.accel[which])
+        return ImuBatch._checked(self.stamps_ns[which], self.gyro[which], self.accel[which])
 
     def join(self, *others: ImuBatch) -> ImuBatch:
         """All samples, one batch after the other."""
         parts = (self, *others)
-        return ImuBatch(
+        return ImuBatch._checked(
             np.concatenate([part.stamps_ns for part in parts]),
             np.concatenate([part.gyro for part in parts]),
             np.concatenate([part.accel for part in parts]),
         )
+
+    @staticmethod
+    def _checked(stamps_ns: I64, gyro: F64, accel: F64) -> ImuBatch:
+        """Of what has been in batches before, and was checked then."""
+        out = object.__new__(ImuBatch)
+        for array in (stamps_ns, gyro, accel):
+            array.flags.writeable = False
+        _set(out, stamps_ns=stamps_ns, gyro=gyro, accel=accel)
+        return out
 
     @staticmethod
     def empty() -> ImuBatch:

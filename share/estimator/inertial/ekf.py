@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,13 +29,16 @@ from share.estimator.inertial.state import (
 )
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
-from share.types import F32, F64, I64, ImuBatch
+from share.types import F64, I64, ImuBatch
 
+KNOWN = slice(EXTRINSIC.start, CORE)  # what rows see of the core beside poses
 _UNSURE = np.array([0, 1, 6, 7, 8])  # tilt and velocity,
 _LOOSE = np.array([3e-4, 3e-4, 1e-2, 1e-2, 1e-2])  # rad^2, (m/s)^2: where single precision is too little
 _MOVING = 15  # columns that propagation changes
 _LEAST_COV = 1e-10  # what differences of covariances lose
 AS_ONE = 16.0  # sights of an error that lasts; chosen by NEES
+Gain = NDArray[np.floating[Any]]  # in double or in single precision
+Float = TypeVar("Float", bound=np.floating[Any])
 _SETTLED = 1e-4  # rad, m, 1/m: a correction that changes no derivative
 
 
@@ -84,33 +88,59 @@ def sight(state: State, which: I64, seen: Prediction, uv: F64, sigma: F64, lasti
     return Sight(which, state.host[which], uv - seen.uv, core, -seen.by_pose, seen.by_rho, sigma, lasting)
 
 
-def gains(state: State, rows: Sight, common: F64 | None = None) -> tuple[F64, F64]:
+def gains(state: State, rows: Sight, common: F64 | None = None, exactly: bool = False) -> tuple[Gain, Gain]:
     """H cov (2 M, n) and H cov H' + R (2 M, 2 M) of rows sorted by host. H is not formed: a row has 29
-    entries. common (6, 6): covariance of an error that all rows share, as one of the pose, on its right."""
-    P, M = state.cov, len(rows.which)
-    core, by_host = rows.core.reshape(2 * M, CORE), rows.by_host.reshape(2 * M, 6)
-    feature = state.features_at + rows.which
+    entries. common (6, 6): covariance of an error that all rows share, as one of the pose, on its right.
+
+    Rows know of a keyframe's pose only less the body's. With that difference taken first, what both are
+    unsure of together is gone, and single precision is enough; but where all is vague, or `exactly`.
+    """
+    M, n = len(rows.which), state.size
+    kind: type[np.floating[Any]] = np.float64 if exactly or _is_vague(state) else np.float32
+    P = _less_body(state).astype(kind, copy=False)
+    known = rows.core[:, :, KNOWN].reshape(2 * M, -1).astype(kind, copy=False)
+    by_host, by_rho = rows.by_host.astype(kind, copy=False), rows.by_rho.astype(kind, copy=False)
+    by_host, feature = by_host.reshape(2 * M, 6), state.features_at + rows.which
     groups = [
-        (state.keyframe(int(h)), slice(2 * a, 2 * b)) for h, a, b in zip(*_runs(rows.host), strict=True)
+        (state.keyframe(h), slice(2 * a, 2 * b))
+        for h, a, b in zip(*(part.tolist() for part in _runs(rows.host)), strict=True)
     ]
-    HP = core @ P[:CORE]
-    HP.reshape(M, 2, -1)[:] += rows.by_rho[:, :, None] * P.take(feature, axis=0)[:, None, :]
+    HP = known @ P[KNOWN]
+    HP.reshape(M, 2, n)[:] += by_rho[:, :, None] * P.take(feature, axis=0)[:, None, :]
     for columns, part in groups:
         HP[part] += by_host[part] @ P[columns]
-    S = HP[:, :CORE] @ core.T
-    S.reshape(2 * M, M, 2)[:] += HP.take(feature, axis=1)[:, :, None] * rows.by_rho
+    S = known @ HP[:, KNOWN].T
+    S.reshape(M, 2, 2 * M)[:] += by_rho[:, :, None] * HP.T.take(feature, axis=0)[:, None, :]
     for columns, part in groups:
-        S[:, part] += HP[:, columns] @ by_host[part].T
-    S[np.diag_indices(2 * M)] += np.repeat(rows.sigma**2 + AS_ONE * rows.lasting**2, 2)
+        S[part] += by_host[part] @ HP[:, columns].T
+    S.reshape(-1)[:: 2 * M + 1] += np.repeat(rows.sigma**2 + AS_ONE * rows.lasting**2, 2).astype(kind)
     left, right = _pairs(rows.which)
     for axis in (0, 1):
         both = 2 * left + axis, 2 * right + axis
-        S[both] += AS_ONE * rows.lasting[left] * rows.lasting[right]
+        S[both] += (AS_ONE * rows.lasting[left] * rows.lasting[right]).astype(kind)
         S[both[::-1]] = S[both]
     if common is not None:
-        B = core[:, POSE] @ se3.adjoint(state.T)
-        S += B @ common @ B.T
+        B = (by_host @ se3.adjoint(state.T).astype(kind)).astype(kind)
+        S += B @ common.astype(kind) @ B.T
+    poses = HP[:, CORE : state.features_at].reshape(2 * M, -1, 6)
+    poses += HP[:, None, POSE]
     return HP, S
+
+
+def _is_vague(state: State) -> bool:
+    """Whether so much of what is unknown may go at once that single precision is too little."""
+    return bool((state.cov.diagonal()[_UNSURE] > _LOOSE).any())
+
+
+def _less_body(state: State) -> F64:
+    """cov with the errors of keyframes' poses less that of the body's in their place."""
+    P, n = state.cov.copy(), state.size
+    poses = slice(CORE, state.features_at)
+    rows = P[poses].reshape(-1, 6, n)
+    rows -= P[POSE]
+    columns = P[:, poses].reshape(n, -1, 6)
+    columns -= P[:, None, POSE]
+    return P
 
 
 def _pairs(which: I64) -> tuple[I64, I64]:
@@ -126,7 +156,7 @@ def _runs(host: I64) -> tuple[I64, I64, I64]:
     return host[first], first, np.r_[first[1:], len(host)]
 
 
-def surprise(rows: Sight, S: F64) -> F64:
+def surprise(rows: Sight, S: Gain) -> F64:
     """Squared Mahalanobis distance (M,) of each residual on its own, 2 degrees of freedom; inf where nothing
     was predicted."""
     M = len(rows.which)
@@ -151,8 +181,7 @@ def relinearised(
     for _ in range(rounds):
         rows = rows_at()
         rows.residual[:] += times(state, rows, error)
-        HP, S = gains(state, rows, common)
-        step = _gain(HP, S, rows.residual.ravel(), exactly=True)[0] - error
+        step = _gain(*gains(state, rows, common, exactly=True), rows.residual.ravel())[0] - error
         error += step
         state.restore(before)
         move(state, error)
@@ -172,16 +201,16 @@ def times(state: State, rows: Sight, error: F64) -> F64:
     return out
 
 
-def update(state: State, rows: Sight, HP: F64, S: F64) -> float:
+def update(state: State, rows: Sight, HP: Gain, S: Gain) -> float:
     """Apply rows with their `gains`. The squared Mahalanobis distance of all of them together.
 
     Raises numpy.linalg.LinAlgError where S is not positive definite."""
     return apply(state, rows.residual.ravel(), HP, S)
 
 
-def apply(state: State, residual: F64, HP: F64, S: F64) -> float:
+def apply(state: State, residual: F64, HP: Gain, S: Gain) -> float:
     """residual (m,), H cov (m, n), its covariance S (m, m)."""
-    error, W, white = _gain(HP, S, residual, exactly=bool((np.diag(state.cov)[_UNSURE] > _LOOSE).any()))
+    error, W, white = _gain(HP, S, residual)
     state.cov -= W.T @ W  # numpy makes this one symmetric to the last bit
     move(state, error)
     return float(white @ white)
@@ -212,20 +241,17 @@ def doubt(state: State, turn: float, shift: float, speed: float) -> None:
     state.cov[VELOCITY, VELOCITY] += speed**2 * np.eye(3)
 
 
-def _gain(HP: F64, S: F64, residual: F64, exactly: bool) -> tuple[F64, F64 | F32, F64]:
-    """The error (n,) that the residual tells of, L^-1 H cov (m, n), L^-1 residual (m,) with L L' = S. Half as
-    long where not `exactly`: what is taken from the covariance is then right to seven digits, which is too
-    little only where nearly all of a large variance goes at once."""
-    L, failed = lapack.dpotrf(S, lower=1, clean=1)
+def _gain(HP: Gain, S: Gain, residual: F64) -> tuple[F64, Gain, Gain]:
+    """The error (n,) that the residual tells of, L^-1 H cov (m, n), L^-1 residual (m,) with L L' = S; in
+    the precision that HP and S have."""
+    short = HP.dtype == np.float32
+    factor, solve = (lapack.spotrf, blas.strsm) if short else (lapack.dpotrf, blas.dtrsm)
+    L, failed = factor(S, lower=1, clean=1)
     if failed:
         raise np.linalg.LinAlgError("innovation covariance is not positive definite")
-    white: F64 = blas.dtrsm(1.0, L, residual[:, None], lower=1)[:, 0]
-    if exactly:
-        W: F64 = blas.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1).T  # as Fortran has it: no copy
-        return W.T @ white, W, white
-    short: F32 = blas.strsm(1.0, L.astype(np.float32), HP.T.astype(np.float32), side=1, lower=1, trans_a=1).T
-    gain: F64 = blas.dtrsm(1.0, L, white[:, None], lower=1, trans_a=1)[:, 0]
-    return gain @ HP, short, white
+    white: Gain = solve(1.0, L, residual[:, None].astype(HP.dtype), lower=1)[:, 0]
+    W: Gain = solve(1.0, L, HP.T, side=1, lower=1, trans_a=1).T  # as Fortran has it: no copy
+    return (W.T @ white).astype(np.float64), W, white
 
 
 def move(state: State, error: F64) -> None:
@@ -316,7 +342,7 @@ def _keep_columns(state: State, keep: NDArray[np.bool_]) -> None:
     state.cov = square(state.cov, np.flatnonzero(keep))
 
 
-def square(matrix: F64, which: I64) -> F64:
+def square(matrix: NDArray[Float], which: I64) -> NDArray[Float]:
     """Rows and columns number `which` of a square matrix; faster than with `np.ix_`."""
     return matrix.take(which, axis=0).take(which, axis=1)
 

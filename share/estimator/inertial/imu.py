@@ -36,24 +36,23 @@ def integrate(
     """Motion over (from_ns, to_ns) by the trapezoidal rule. imu: samples about the interval, in order; the
     first and last are held where they do not reach its ends. Raises ValueError without any."""
     dt, gyro, accel = _intervals(imu, from_ns, to_ns)
-    gyro, accel = gyro - bg, accel - ba
-    turns = gyro * dt[:, None]
-    steps = se3.so3_exp(np.concatenate([turns, turns / 2]))
-    R = _rotations(T[:3, :3], steps[: len(dt)])
-    middle = R[:-1] @ steps[len(dt) :]
+    gyro, accel, each = gyro - bg, accel - ba, dt[:, None]
+    half = se3.so3_exp(gyro * (each / 2))
+    R = _products(T[:3, :3], half @ half)
+    middle = R[:-1] @ half
     g = np.array([0.0, 0.0, -gravity])
     a = (middle @ accel[:, :, None])[:, :, 0] + g
-    v_at = v + _sums(a * dt[:, None])
-    p_at = T[:3, 3] + _sums(v_at[:-1] * dt[:, None] + a * (dt**2 / 2)[:, None])
+    v_at = _sums(v, a * each)
+    p_at = _sums(T[:3, 3], v_at[:-1] * each + a * (each**2 / 2))
     v_mid, p_mid = (v_at[1:] + v_at[:-1]) / 2, (p_at[1:] + p_at[:-1]) / 2
-    left = dt.sum() - (np.cumsum(dt) - dt / 2)  # from the middle of each part to the end
-    gyro_effect, accel_effect = _effects(middle, v_mid, p_mid, left, se3.hat(g))
+    left = float(dt.sum()) - (np.cumsum(dt) - dt / 2)  # from the middle of each part to the end
+    effect = _effects(middle, v_mid, p_mid, left[:, None], g)
     return Motion(
         se3.compose(R[-1], p_at[-1]),
         v_at[-1],
         gyro[-1],
-        _transition(gyro_effect, accel_effect, dt, se3.hat(g)),
-        _noise(gyro_effect, accel_effect, dt, noise),
+        _transition(effect, dt, se3.hat(g)),
+        _noise(effect, dt, noise),
     )
 
 
@@ -77,53 +76,52 @@ def _intervals(imu: ImuBatch, from_ns: int, to_ns: int) -> tuple[F64, F64, F64]:
     return np.diff(at), means[:, :3], means[:, 3:]
 
 
-def _rotations(R: F64, steps: F64) -> F64:
-    """R and what it becomes by each of the steps (N, 3, 3): (N + 1, 3, 3)."""
-    out = np.empty((len(steps) + 1, 3, 3))
-    out[0] = R
-    for k, step in enumerate(steps):
-        np.matmul(out[k], step, out=out[k + 1])
+def _products(R: F64, steps: F64) -> F64:
+    """R and what it becomes by each of the steps (N, 3, 3): (N + 1, 3, 3). By doubling: after k rounds each
+    is the product of up to 2^k of them."""
+    out, reach = np.concatenate([R[None], steps]), 1
+    while reach < len(out):
+        out[reach:] = out[:-reach] @ out[reach:]
+        reach *= 2
     return out
 
 
-def _sums(steps: F64) -> F64:
-    """0 and the running sums of (N, 3): (N + 1, 3)."""
-    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+def _sums(first: F64, steps: F64) -> F64:
+    """(3,) and what it becomes by each of the steps (N, 3): (N + 1, 3)."""
+    return np.cumsum(np.concatenate([first[None], steps]), axis=0)
 
 
-def _effects(R: F64, v: F64, p: F64, left: F64, g: F64) -> tuple[F64, F64]:
-    """What an impulse of gyro and of accel error in each part does to (phi, rho, nu) at the end, (N, 9, 3).
+def _effects(R: F64, v: F64, p: F64, left: F64, g: F64) -> F64:
+    """What an impulse of gyro and of accel error in each part does to (phi, rho, nu) at the end, (N, 9, 6).
 
-    phi' = -R w; rho' = nu - [p] R w; nu' = [g] phi - [v] R w - R a; the rest of the way is phi = const,
-    nu = [g] phi t, rho = nu t + [g] phi t^2 / 2.
+    phi' = -R w; rho' = nu - [p] R w; nu' = [g] phi - [v] R w - R a; the rest of the way, left (N, 1) s, is
+    phi = const, nu = [g] phi t, rho = nu t + [g] phi t^2 / 2: as if turned about where a body in free fall
+    would be then.
     """
-    t = left[:, None, None]
-    turn, shift, kick = -R, -se3.hat(p) @ R, -se3.hat(v) @ R
-    pull = g @ turn
-    by_gyro = np.concatenate([turn, shift + kick * t + pull * t**2 / 2, kick + pull * t], axis=1)
-    by_accel = np.concatenate([np.zeros_like(R), -R * t, -R], axis=1)
-    return by_gyro, by_accel
+    falling = np.concatenate([p + v * left + g * (left**2 / 2), v + g * left])
+    levers = se3.hat(falling).reshape(2, -1, 3, 3) @ R
+    out = np.zeros((len(R), 9, 6))
+    out[:, :3, :3], out[:, 3:6, :3], out[:, 6:, :3] = R, levers[0], levers[1]
+    out[:, 3:6, 3:], out[:, 6:, 3:] = R * left[:, :, None], R
+    return np.negative(out, out=out)
 
 
-def _transition(gyro_effect: F64, accel_effect: F64, dt: F64, g: F64) -> F64:
+def _transition(effect: F64, dt: F64, g: F64) -> F64:
     T = float(dt.sum())
     out = np.eye(_SIDE)
-    out[3:6, 0:3], out[6:9, 0:3] = g * T**2 / 2, g * T
-    out[3:6, 6:9] = T * np.eye(3)
-    out[:9, 9:12] = np.einsum("n,nij->ij", dt, gyro_effect)
-    out[:9, 12:15] = np.einsum("n,nij->ij", dt, accel_effect)
+    out[3:6, 0:3], out[6:9, 0:3] = g * (T**2 / 2), g * T
+    out[3, 6] = out[4, 7] = out[5, 8] = T
+    out[:9, 9:] = (dt @ effect.reshape(-1, 54)).reshape(9, 6)
     return out
 
 
-def _noise(gyro_effect: F64, accel_effect: F64, dt: F64, imu: ImuNoise) -> F64:
+def _noise(effect: F64, dt: F64, imu: ImuNoise) -> F64:
     T = float(dt.sum())
-    weighted = (
-        np.concatenate([imu.gyro_density * gyro_effect, imu.accel_density * accel_effect], axis=2)
-        * np.sqrt(dt)[:, None, None]
-    )
+    density = np.repeat([imu.gyro_density, imu.accel_density], 3)
+    weighted = effect * (np.sqrt(dt)[:, None, None] * density)
     flat = weighted.transpose(1, 0, 2).reshape(9, -1)
     out = np.zeros((_SIDE, _SIDE))
     out[:9, :9] = flat @ flat.T
-    out[9:12, 9:12] = imu.gyro_walk**2 * T * np.eye(3)
-    out[12:15, 12:15] = imu.accel_walk**2 * T * np.eye(3)
+    walks = np.arange(9, _SIDE)
+    out[walks, walks] = T * np.repeat([imu.gyro_walk**2, imu.accel_walk**2], 3)
     return out

@@ -37,26 +37,27 @@ def shaken(imu: ImuNoise, samples: ImuBatch) -> ImuNoise:
     if len(samples) < 2:
         return imu
     step_s = (samples.stamps_ns[-1] - samples.stamps_ns[0]) * 1e-9 / (len(samples) - 1)
-    values = np.hstack([samples.gyro, samples.accel])
-    sums = np.concatenate([np.zeros((1, 6)), np.cumsum(values, axis=0)])
-    shown = np.full(6, np.inf)
-    for block in (max(1, round(block_s / step_s)) for block_s in _BLOCKS_S):
-        third = _third_differences((sums[block:] - sums[:-block]) / block, block)
-        if len(third) > block:
-            shown = np.minimum(shown, np.sqrt((third**2).mean(axis=0) / _TIMES * block * step_s))
-    if np.isinf(shown).any():
+    sums = np.zeros((len(samples) + 1, 6))
+    np.cumsum(np.concatenate([samples.gyro, samples.accel], axis=1), axis=0, out=sums[1:])
+    shown = []  # squared densities
+    for block in {max(1, round(block_s / step_s)) for block_s in _BLOCKS_S}:
+        fourth = _fourth_differences(sums, block)  # of the sums: third ones of the means, times block
+        if (count := len(fourth)) > block:
+            shown.append(np.einsum("na,na->a", fourth, fourth) * (step_s / (_TIMES * count * block)))
+    if not shown:
         return imu
+    least = np.sqrt(np.min(shown, axis=0))
     return replace(
         imu,
-        gyro_density=max(imu.gyro_density, float(shown[:3].max())),
-        accel_density=max(imu.accel_density, float(shown[3:].max())),
+        gyro_density=max(imu.gyro_density, float(least[:3].max())),
+        accel_density=max(imu.accel_density, float(least[3:].max())),
     )
 
 
-def _third_differences(x: F64, by: int) -> F64:
-    """Of (N, 6), between rows `by` apart: (N - 3 by, 6)."""
+def _fourth_differences(x: F64, by: int) -> F64:
+    """Of (N, 6), between rows `by` apart: (N - 4 by, 6)."""
     out = x
-    for _ in range(3):
+    for _ in range(4):
         out = out[by:] - out[:-by]
     return out
 

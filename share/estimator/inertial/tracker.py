@@ -304,7 +304,7 @@ class InertialTracker:
 
     def _judged(
         self, s: State, rows: ekf.Sight, rows_now: Callable[[], ekf.Sight]
-    ) -> tuple[ekf.Sight, NDArray[np.bool_], F64, F64]:
+    ) -> tuple[ekf.Sight, NDArray[np.bool_], ekf.Gain, ekf.Gain]:
         """Rows at the best linearisation, which of them the filter believes, and its `ekf.gains`."""
         if median(np.abs(rows.residual).ravel()) * self._rig.cam0.focal > _FAR_OFF_PX:
             rows = ekf.relinearised(s, rows_now, self._common)
