@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from share.strict import from_mapping, load_yaml
+from share.plain_data import from_mapping, load_yaml
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class SequencerConfig:
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """Tracking by camera alone (`share.estimator.visual`)."""
+    """Tracking by camera alone (`share.odometry.visual_tracker`)."""
 
     corners: int = 250  # points tracked at a time
     spacing_px: float = 14.0  # least distance between corners
@@ -57,7 +57,7 @@ class TrackerConfig:
 
 @dataclass(frozen=True)
 class InertialConfig:
-    """Tracking by cameras and IMU (`share.estimator.inertial`)."""
+    """Tracking by cameras and IMU (`share.odometry`)."""
 
     features: int = 80  # followed at a time
     spacing_px: float = 18.0  # least distance between new ones
@@ -256,7 +256,7 @@ class MergeConfig:
 
 
 STREAMED = "streamed"
-POLICIES = ("share", "covins-g", "linear", "equal", "random", STREAMED)  # see `share.control.policies`
+POLICIES = ("share", "covins-g", "linear", "equal", "random", STREAMED)  # see `share.scheduling.policies`
 
 
 @dataclass(frozen=True)

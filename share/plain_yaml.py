@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 _DEEPEST = 40  # lists and mappings in each other; a session with its recipe has 8
-_MOST = 200_000  # values, aliases counted in full; a session of ten agents has 5,000
+_MOST_VALUES = 200_000  # values, aliases counted in full; a session of ten agents has 5,000
 _LONGEST = 60  # characters of a number or a date
 _MERGE = "tag:yaml.org,2002:merge"  # of `<<`
 _SCALARS = ("int", "float", "timestamp", "bool")
@@ -54,8 +54,8 @@ class PlainLoader(yaml.SafeLoader):
 
     def _count(self, values: int, event: Any) -> None:
         self._values += values
-        if self._values > _MOST:
-            raise _error(f"has more than {_MOST:,} values, aliases counted in full", event.start_mark)
+        if self._values > _MOST_VALUES:
+            raise _error(f"has more than {_MOST_VALUES:,} values, aliases counted in full", event.start_mark)
 
     def _size(self, event: Any) -> int:
         if event.anchor in self.anchors and event.anchor not in self._sizes:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from share.geometry.target import Target
+from share.lab.calibrate.target import Target
+from share.lab.calibrate.target_sheet import darkness, ink
 from share.types import F64, U8
-from share.vision.target_picture import darkness, ink
 
 _TEXEL, _MARGIN = 0.001, 0.04  # m
 _FINE = np.array([[3, 0, 1], [0, 3, 1], [0, 0, 1]])  # to pixels a third as large: edges without steps

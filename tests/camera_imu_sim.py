@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from share.calibration.bundle import View
-from share.calibration.detect import Detection
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.geometry.target import AprilGrid, Target
+from share.lab.calibrate.camera_bundle import View
+from share.lab.calibrate.corners import Detection
+from share.lab.calibrate.target import AprilGrid, Target
 from share.types import F64, I64, ImuBatch
 
 NOISE = ImuNoise(2.4e-4, 1.5e-3, 1e-5, 1.5e-4, 200.0)  # a D435i's

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 from software_camera import SoftwareCamera
 
+from share.cameras.feed import Feed, MakeWatchdog
+from share.cameras.handover import Handover
+from share.cameras.realsense.camera import RealSense
+from share.cameras.realsense.devices import load_sdk
+from share.cameras.realsense.streams import Wanted
 from share.config import SequencerConfig
-from share.core.watchdog import Watchdog
 from share.errors import ShareError, UsageError
-from share.io.calibration import Calibration
-from share.io.feed import Feed, MakeWatchdog
-from share.io.handover import Handover
-from share.io.profile import profile
-from share.io.realsense.camera import RealSense
-from share.io.realsense.sdk import load_sdk
-from share.io.realsense.streams import Wanted
-from share.run.capture import Capture
+from share.recordings.calibration import Calibration
+from share.runtime.capture import Capture
+from share.sensors.profile import profile
+from share.sensors.watchdog import Watchdog
 
 WANTED = Wanted(profile("d435i"))
 PICTURE = np.tile(np.arange(640, dtype=np.uint16) % 251, (480, 1)).astype(np.uint8)

@@ -1,8 +1,8 @@
 """What all tests share."""
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import itertools  # noqa: E402
 import signal  # noqa: E402
@@ -73,8 +73,8 @@ def plain_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A user's cache folder ($XDG_CACHE_HOME) with the three seconds that `share demo --scene plain
     --seconds 3 --seed 18` plays: ar1, ar2 and robot in the plain room, 45 frames each. With this seed
     each device has had 20 IMU samples by its first picture, all that the tracker needs to begin."""
-    from share.emulate.demo import recipe
-    from share.emulate.session import cached_session
+    from share.lab.emulate.demo import recipe
+    from share.lab.emulate.session import cached_session
 
     cache = tmp_path_factory.mktemp("cache")
     cached_session(recipe("plain", 3.0, 18), cache / "share")

@@ -10,9 +10,9 @@ import json
 import sys
 from pathlib import Path
 
-from share.io.keys import edge_keys
-from share.io.transport import bind
-from share.run.stop import on_stop
+from share.net.keys import edge_keys
+from share.net.transport import bind
+from share.runtime.stop import on_stop
 
 
 def main() -> None:

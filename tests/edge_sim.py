@@ -11,16 +11,15 @@ import numpy as np
 from hellos import hello_of
 
 from share.config import Config, EdgeConfig
-from share.core import edge_events as ed
-from share.core import events as ev
-from share.core.agent import Agent
-from share.core.edge import Edge
-from share.core.finding import Finding
-from share.core.mapper import Mapper
-from share.core.steps import Solve, Step
 from share.geometry import se3
-from share.geometry.align import umeyama
-from share.graph.solver import Solver
+from share.geometry.se3 import umeyama
+from share.mapping.graph.solver import Solver
+from share.mapping.mapper import Mapper
+from share.mapping.steps import Finding, Solve, Step
+from share.protocol import agent_events as ev
+from share.protocol import edge_events as ed
+from share.protocol.agent import Agent
+from share.protocol.edge import Edge
 from share.types import F64, U8, AgentKind, Candidate, Keyframe, TrackState, View
 from share.wire.codec import decode
 from share.wire.messages import Hello, peer_id
@@ -122,7 +121,7 @@ class Person:
 
 
 class ModelRun:
-    """One life of the edge: both machines, as `share.run.edge` has them, without processes."""
+    """One life of the edge: both machines, as `share.runtime.edge` has them, without processes."""
 
     def __init__(self, config: Config, session: int) -> None:
         self.machine = Edge(config, session)

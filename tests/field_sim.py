@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from share.emulate.preparation import prepare
-from share.emulate.progress import silent
-from share.emulate.recipe import Recipe
-from share.emulate.types import Path as Motion
 from share.geometry import se3
-from share.io.mcap.recorder import Recorder
-from share.io.source import open_source
+from share.lab.emulate.preparation import prepare
+from share.lab.emulate.progress import silent
+from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.types import Path as Motion
+from share.recordings.mcap.recorder import Recorder
+from share.runtime.source import open_source
 from share.types import F64
 
 RATE_HZ = 120

@@ -8,12 +8,12 @@ import numpy as np
 from recordings import HEIGHT, STEP_NS, WIDTH, depth_mm, picture
 
 from share.config import SequencerConfig
-from share.core.measurement import Measurement
-from share.core.sequencer import SequencerCounters, sequence, streams_of
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.io.images import ArrayImage, load
-from share.io.recording import Source
+from share.recordings.images import ArrayImage, load
+from share.recordings.recording import Source
+from share.sensors.measurement import Measurement
+from share.sensors.sequencer import SequencerCounters, sequence, streams_of
 from share.types import Frame
 
 CAMERA = Camera(WIDTH, HEIGHT, 50.0, 51.0, 31.5, 23.5, (-0.1, 0.02, 0.001, -0.001))

@@ -11,7 +11,7 @@ import select
 import sys
 import time
 
-from share.io.transport import connect
+from share.net.transport import connect
 
 
 def main() -> None:

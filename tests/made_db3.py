@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from recordings import HEIGHT, WIDTH, depth_mm, picture
 
-from share.io.mcap import types as ros
+from share.recordings.mcap import types as ros
 
 EYE = "/device_0/sensor_0/Infrared_1"
 RIGHT = "/device_0/sensor_0/Infrared_2"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from share.evaluator.features import SHAPES, Features, kind_of
+from share.odometry.error_model.features import SHAPES, Features, kind_of
 
 
 def made_features(rng: np.random.Generator, **given: np.ndarray) -> Features:

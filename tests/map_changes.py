@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from hellos import hello_of
 
-from share.core.keeping import Change, KeepKeyframe, KeepLoop, KeepPoses, KeepRun, Kept, KeptKeyframe
 from share.geometry import se3
-from share.merge.join import Key, Loop
+from share.mapping.changes import Change, KeepKeyframe, KeepLoop, KeepPoses, KeepRun, Kept, KeptKeyframe
+from share.mapping.loops import Key, Loop
 from share.types import F64, Keyframe, View
 
 ANN, BOB = "ann-0001", "bob-0002"

@@ -8,7 +8,7 @@ import numpy as np
 
 from share.geometry import se3
 from share.geometry.camera import ImuNoise
-from share.mocap.mocap import Mocap
+from share.lab.mocap.mocap import Mocap
 from share.types import F64, I64, ImuBatch
 
 NOISE = ImuNoise(1.7e-4, 2e-3, 2e-5, 3e-3, 200.0)

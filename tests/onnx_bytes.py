@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 
-from share.evaluator.features import SHAPES
+from share.odometry.error_model.features import SHAPES
 
 FLOAT, UINT8 = 1, 2
 

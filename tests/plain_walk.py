@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from share.emulate.motion.plan import plan
-from share.emulate.plain.scene import SIZE, PlainRenderer, layout
-from share.emulate.sensor.device import Device
-from share.emulate.types import Moment, Path
 from share.geometry import se3
-from share.io.profile import profile
+from share.lab.emulate.motion.plan import plan
+from share.lab.emulate.plain.scene import SIZE, PlainRenderer, layout
+from share.lab.emulate.sensor.device import Device
+from share.lab.emulate.types import Moment, Path
+from share.sensors.profile import profile
 from share.types import F64, U8
 
 MOTIONS = {  # heads that turn at leisure: the tests want to see the room, not motion

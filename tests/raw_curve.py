@@ -13,7 +13,7 @@ import zmq
 from raw_zmtp import MORE, RawPeer, frame, greeting, metadata
 from zmq.utils import z85
 
-from share.io.keys import AgentKeys
+from share.net.keys import AgentKeys
 
 _KEY, _MAC = 32, 16
 

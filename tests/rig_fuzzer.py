@@ -20,11 +20,10 @@ import plain_walk
 from plain_walk import RIG
 
 from share.config import Config
-from share.geometry import se3, trackable
+from share.geometry import rig_check, se3
 from share.geometry.camera import Camera, Rig
-from share.run.guard import Guard
-from share.run.guarded_tracker import GuardedTracker
-from share.run.pipeline import tracker_of
+from share.runtime.guarded_tracker import Guard, GuardedTracker
+from share.runtime.pipeline import tracker_of
 from share.types import U8, Frame, ImuBatch
 
 SEED, RATE_HZ, STEP_S, _H = 18, 15.0, 0.005, 2e-3
@@ -209,7 +208,7 @@ def _fitted(image: U8, camera: Camera) -> U8:
 def play(rig: Rig, walk: Walk, guarded: bool = True) -> Counter[str]:
     """States of the frames, what failed (`failed`), or why the rig was refused (`refused`)."""
     states: Counter[str] = Counter()
-    if guarded and trackable.objection(rig) is not None:
+    if guarded and rig_check.objection(rig) is not None:
         return Counter(refused=1)
     guard = Guard(lambda text: states.update([f"failed: {text}"]))
     tracker = GuardedTracker(rig, Config(), guard) if guarded else tracker_of(rig, Config())
@@ -263,7 +262,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    from share import process
+    from share import startup
 
-    process.prepare()
+    startup.prepare()
     main()

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 from software_camera import DEPTH_UNIT_M, SoftwareCamera
 
+from share.cameras.feed import Feed, MakeWatchdog
+from share.cameras.handover import Handover
+from share.cameras.realsense.camera import RealSense
+from share.cameras.realsense.streams import Wanted
 from share.config import SequencerConfig
-from share.core.watchdog import Watchdog
 from share.errors import UsageError
-from share.io.feed import Feed, MakeWatchdog
-from share.io.handover import Handover
-from share.io.profile import profile
-from share.io.realsense.camera import RealSense
-from share.io.realsense.streams import Wanted
-from share.io.source import Source
+from share.runtime.source import Source
+from share.sensors.profile import profile
+from share.sensors.watchdog import Watchdog
 
 HZ, LENS = 15, (385.0, 385.0, 320.4, 239.6)  # of the demo's cameras
 STEREO = Wanted(profile("d435i", f"640x480@{HZ}"))

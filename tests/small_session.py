@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from share.emulate.recipe import Recipe
-from share.emulate.sensor.effects import parse
-from share.io.profile import shipped
+from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.sensor.effects import parse
+from share.sensors.profile import shipped
 from share.types import I64
 
 RATE_HZ, SIZE = 10, (160, 120)

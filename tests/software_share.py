@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 import pyrealsense2 as rs
 from software_camera import SoftwareCamera
 
+from share.cameras.realsense import camera as adapter
 from share.cli import main as command_line
-from share.io.realsense import camera as adapter
 
 
 def share(words: Sequence[str], camera: SoftwareCamera, play: Callable[[threading.Event], None]) -> None:

@@ -60,7 +60,7 @@ def test_every_setting_says_what_it_is() -> None:
 
 def test_table_has_every_key_and_its_default() -> None:
     from share.config import Config
-    from share.strict import to_mapping
+    from share.plain_data import to_mapping
 
     found = TOOL["sections"](TOOL["SOURCE"].read_text())
     told = {s.name: {row.name: row.default.strip("'") for row in s.settings} for s in found}

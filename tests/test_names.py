@@ -7,7 +7,7 @@ from unicodedata import normalize
 import pytest
 from hellos import hello_of
 
-from share.io.session import is_agent_name
+from share.recordings.session import is_agent_name
 
 
 @pytest.mark.parametrize(

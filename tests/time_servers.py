@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from share.core.time_server import TimeServer
-from share.wire.ntp import Packet, to_stamp
+from share.devices.time_server import TimeServer
+from share.net.ntp import Packet, to_stamp
 
 MS = 1_000_000
 CHRONYD = shutil.which("chronyd") or next(iter(map(str, Path("/usr/sbin").glob("chronyd"))), None)

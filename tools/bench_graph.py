@@ -19,9 +19,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 
@@ -31,9 +31,9 @@ from gtsam_graph import solve  # noqa: E402
 from rooms import Room, simulate  # noqa: E402
 
 from share.config import GraphConfig  # noqa: E402
-from share.graph.change import Change, Solution  # noqa: E402
-from share.graph.path import Roads  # noqa: E402
-from share.graph.solver import Solver  # noqa: E402
+from share.mapping.graph.covariance import Roads  # noqa: E402
+from share.mapping.graph.solver import Solver  # noqa: E402
+from share.mapping.graph.updates import Change, Solution  # noqa: E402
 from share.types import F64  # noqa: E402
 
 CONFIG = GraphConfig()

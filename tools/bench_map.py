@@ -17,9 +17,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 
@@ -30,9 +30,9 @@ from place_sim import sights  # noqa: E402
 
 from share.config import PlaceConfig  # noqa: E402
 from share.geometry import se3  # noqa: E402
-from share.place.index import PlaceIndex  # noqa: E402
-from share.place.matching import match  # noqa: E402
-from share.place.verify import Sight, Verified, verify  # noqa: E402
+from share.mapping.recognition.index import PlaceIndex  # noqa: E402
+from share.mapping.recognition.verification import Sight, Verified, verify  # noqa: E402
+from share.vision.matching import match  # noqa: E402
 
 PLACE = PlaceConfig()
 

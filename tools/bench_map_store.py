@@ -15,16 +15,16 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 
-from share.core.keeping import Change, KeepKeyframe, KeepPoses, KeepRun, Retire  # noqa: E402
 from share.geometry.camera import Camera, Rig  # noqa: E402
-from share.io.map_store import MapStore  # noqa: E402
-from share.merge.join import Key  # noqa: E402
+from share.mapping.changes import Change, KeepKeyframe, KeepPoses, KeepRun, Retire  # noqa: E402
+from share.mapping.loops import Key  # noqa: E402
+from share.store.map_store import MapStore  # noqa: E402
 from share.types import AgentKind, Keyframe, View  # noqa: E402
 from share.wire.messages import Hello  # noqa: E402
 

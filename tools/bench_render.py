@@ -2,7 +2,7 @@
 
     python tools/bench_render.py [--scene NAME] [--images N] [--seed S] [--room FOLDER]
 
-In a room of `share.emulate.world` (kept in FOLDER, if named, for baking takes a while), turning on the
+In a room of `share.lab.emulate.world` (kept in FOLDER, if named, for baking takes a while), turning on the
 spot in its middle. `cpu_ms` is the median of one image, everything included that `radiance` and `depth` do;
 `per_second` is by the clock, and two processes need two idle cores.
 """
@@ -15,19 +15,19 @@ import time
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 
-from share.emulate.render.gl import GlRenderer  # noqa: E402
-from share.emulate.types import Moment, Room  # noqa: E402
-from share.emulate.world.build import build  # noqa: E402
-from share.emulate.world.files import load_room, save_room  # noqa: E402
-from share.emulate.world.scenes import SCENES, layout  # noqa: E402
 from share.geometry.camera import Camera  # noqa: E402
-from share.spawning import SPAWN  # noqa: E402
+from share.lab.emulate.render.gl import GlRenderer  # noqa: E402
+from share.lab.emulate.types import Moment, Room  # noqa: E402
+from share.lab.emulate.world.build import build  # noqa: E402
+from share.lab.emulate.world.files import load_room, save_room  # noqa: E402
+from share.lab.emulate.world.scenes import SCENES, layout  # noqa: E402
+from share.processes import SPAWN  # noqa: E402
 
 D435I = Camera(640, 480, 383.2, 384.1, 318.7, 242.3)
 EUROC = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019359, 1.76e-05))

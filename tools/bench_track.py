@@ -26,28 +26,28 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 import poselib  # noqa: E402, F401 -- else the first frame would pay for it
 
 from share.config import Config, TrackerConfig  # noqa: E402
-from share.core.sequencer import SequencerCounters  # noqa: E402
-from share.emulate.demo import FALLBACK, SCENE  # noqa: E402
-from share.emulate.recipe import Recipe  # noqa: E402
-from share.emulate.render.context import missing  # noqa: E402
-from share.emulate.session import cached_session, make_session  # noqa: E402
-from share.estimator.inertial import ekf, features, find, observe  # noqa: E402
-from share.estimator.inertial.scene import Scene  # noqa: E402
-from share.estimator.inertial.tracker import InertialTracker  # noqa: E402
-from share.estimator.visual import VisualTracker  # noqa: E402
-from share.io.source import Source, open_source  # noqa: E402
-from share.run.pipeline import frames_of, tracker_for  # noqa: E402
+from share.lab.emulate.demo import FALLBACK, SCENE  # noqa: E402
+from share.lab.emulate.recipe import Recipe  # noqa: E402
+from share.lab.emulate.render.context import missing  # noqa: E402
+from share.lab.emulate.session import cached_session, make_session  # noqa: E402
+from share.odometry import features, filter, measurement  # noqa: E402
+from share.odometry.landmarks import Scene  # noqa: E402
+from share.odometry.tracker import InertialTracker  # noqa: E402
+from share.odometry.visual_tracker import VisualTracker  # noqa: E402
+from share.runtime.pipeline import frames_of, tracker_for  # noqa: E402
+from share.runtime.source import Source, open_source  # noqa: E402
+from share.sensors.sequencer import SequencerCounters  # noqa: E402
 from share.types import F64  # noqa: E402
 from share.vision import corners, patches  # noqa: E402
-from share.vision.view import ViewInSteps  # noqa: E402
+from share.vision.orb import ViewInSteps  # noqa: E402
 
 STEREO = {"euroc_752x480": ("euroc", 20), "d435i_848x480": ("d435i:848x480@30", 30)}  # profile, Hz
 NEEDS_LENS = "euroc_752x480"  # which the plain room does not have
@@ -55,15 +55,15 @@ ROBOT, ROBOT_PROFILE, ROBOT_HZ = "robot=robot:speed=0.3", "d435i:640x480@15", 15
 SHORTEST_S = 3  # of a session
 KITCHEN = Path(__file__).resolve().parents[2] / "shared" / "data" / "real" / "redkitchen_0000_0499"
 STAGES: tuple[tuple[Any, str, str], ...] = (
-    (ekf, "propagate", "imu"),
-    (observe, "aim", "expect"),
+    (filter, "propagate", "imu"),
+    (measurement, "aim_of", "expect"),
     (patches, "align", "align"),
-    (find, "rescue", "rescue"),
+    (measurement, "rescue", "rescue"),
     (Scene, "mark_movers", "movers"),
     (Scene, "heard", "rows"),
-    (ekf, "relinearised", "anew where far off"),
-    (ekf, "gains", "gains"),
-    (ekf, "update", "update"),
+    (filter, "relinearised", "anew where far off"),
+    (filter, "gains", "gains"),
+    (filter, "update", "update"),
     (Scene, "seen", "slant and runaways"),
     (Scene, "wake", "keyframe: wake"),
     (Scene, "_forget", "keyframe: forget"),

@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from share.io.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate
-from share.io.transport import AgentLink, EdgeLink, bind, connect
-from share.io.transport.memory import MemoryNetwork
+from share.net.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate
+from share.net.memory import MemoryNetwork
+from share.net.transport import AgentLink, EdgeLink, bind, connect
 from share.types import Keyframe, TrackState, View
 from share.wire.codec import Bytes, decode, encode, size
 from share.wire.messages import Message, Ping, PoseUpdate

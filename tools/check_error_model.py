@@ -14,9 +14,9 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 from scipy.stats import spearmanr  # noqa: E402
@@ -24,10 +24,10 @@ from tool_main import exit_code, line  # noqa: E402
 
 from share.config import Config  # noqa: E402
 from share.errors import UsageError  # noqa: E402
-from share.evaluator.model import Network, estimate  # noqa: E402
-from share.io.network import open_network, read_model  # noqa: E402
-from share.io.source import open_source  # noqa: E402
-from share.run.labels import keyframes  # noqa: E402
+from share.lab.train.labels import keyframes  # noqa: E402
+from share.odometry.error_model.model import Network, estimate  # noqa: E402
+from share.odometry.error_model.network import open_network, read_model  # noqa: E402
+from share.runtime.source import open_source  # noqa: E402
 from share.types import F64  # noqa: E402
 
 HEAD = (

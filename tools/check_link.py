@@ -20,10 +20,10 @@ import time
 import numpy as np
 from tool_main import exit_code, line
 
-from share.core.channel import Network, Way
 from share.errors import UsageError
-from share.io.transport import AgentLink, EdgeLink, bind, connect
-from share.io.transport.shaped import ShapedLink
+from share.net.channel import Network, Way
+from share.net.emulated import ShapedLink
+from share.net.transport import AgentLink, EdgeLink, bind, connect
 
 POSE, KEYFRAME = 200, 30_000  # bytes
 POSE_S, KEYFRAME_S = 1 / 30, 1 / 3

@@ -17,18 +17,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from share.core.measurement import CAM0
-from share.emulate.render.gl import GlRenderer
-from share.emulate.session import PLAN
-from share.emulate.types import Moment
-from share.emulate.world.build import build
-from share.emulate.world.layout import Layout
-from share.emulate.world.occupancy import Occupancy
-from share.emulate.world.scenes import SCENES, layout
-from share.emulate.world.views import looking
 from share.geometry.camera import Camera
-from share.io.session import read_session
-from share.io.source import open_source
+from share.lab.emulate.render.gl import GlRenderer
+from share.lab.emulate.session import PLAN
+from share.lab.emulate.types import Moment
+from share.lab.emulate.world.build import build
+from share.lab.emulate.world.layout import Layout
+from share.lab.emulate.world.occupancy import Occupancy
+from share.lab.emulate.world.scenes import SCENES, layout
+from share.lab.emulate.world.views import looking
+from share.recordings.session import read_session
+from share.runtime.source import open_source
+from share.sensors.measurement import CAM0
 from share.types import F32, F64, U8
 
 ROWS, COLUMNS = 3, 4

@@ -18,7 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from share.emulate.world.stats import HEIGHT, WIDTH, ImageStatistics, comparable, statistics
+from share.lab.emulate.world.stats import HEIGHT, WIDTH, ImageStatistics, comparable, statistics
 from share.types import F32, U8
 
 _FOCAL, _MEAN, _BLUR, _NOISE = 458.0, 110.0, 0.5, 1.5
@@ -35,13 +35,13 @@ def of_folder(folder: Path, most: int) -> list[U8]:
 
 def of_room(name: str, seed: int, count: int) -> list[U8]:
     """Views of one room."""
-    from share.emulate.render.gl import GlRenderer
-    from share.emulate.types import Moment
-    from share.emulate.world.build import build
-    from share.emulate.world.occupancy import Occupancy
-    from share.emulate.world.scenes import layout
-    from share.emulate.world.views import standing_views
     from share.geometry.camera import Camera
+    from share.lab.emulate.render.gl import GlRenderer
+    from share.lab.emulate.types import Moment
+    from share.lab.emulate.world.build import build
+    from share.lab.emulate.world.occupancy import Occupancy
+    from share.lab.emulate.world.scenes import layout
+    from share.lab.emulate.world.views import standing_views
 
     room, rng = layout(name, seed), np.random.default_rng((seed, 5))
     camera = Camera(WIDTH, HEIGHT, _FOCAL, _FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5)

@@ -17,10 +17,10 @@ from deploy_settings import merged
 from tool_main import exit_code
 
 from share.cli.progress import progress
-from share.core.checkup import boot
+from share.devices import checks
 from share.errors import UsageError
-from share.io.keys import public_key
-from share.io.transport import parse_address
+from share.net.keys import public_key
+from share.net.transport import parse_address
 
 DIST = Path(__file__).resolve().parents[1] / "dist" / "share"
 PROFILES = {"ar": "d435i-n100-headset", "robot": "d435i-turtlebot4", "": "laptop-edge"}  # by KIND
@@ -211,7 +211,7 @@ def plan(
             for name, text in files.items()
         ),
         f"{where}/etc/systemd/system/share-*.service, /etc/udev/rules.d/99-share-realsense.rules",
-        f"{where}{boot.FILE}: CPU governor and USB memory, as the profile wants them",
+        f"{where}{checks.FILE}: CPU governor and USB memory, as the profile wants them",
         f"{where}/opt/share/current: {there.current or 'none'} -> {release.name}",
         *(begin if service.unit else []),
     ]

@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 from keyframe_types import AgentKeyframes, KeyframeSet, Spacing
 
-from share.emulate.recipe import Recipe
 from share.errors import DataError, WireError
-from share.io.files import atomic_write
+from share.files.writing import atomic_write
+from share.lab.emulate.recipe import Recipe
 from share.types import F64, Keyframe
 from share.wire.codec import decode, encode
 from share.wire.messages import Hello, Message

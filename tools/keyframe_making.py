@@ -11,14 +11,14 @@ from keyframe_odometry import Drift, odometry
 from keyframe_types import AgentKeyframes, KeyframeSet, Spacing
 from keyframe_views import views
 
-from share.core.chain import Chain
-from share.emulate.preparation import Prepared, keep_room, prepare
-from share.emulate.progress import Progress, silent
-from share.emulate.recipe import Recipe
-from share.emulate.stage import Actor
-from share.emulate.takes import truth_of
 from share.geometry import se3
-from share.io.trajectory import Trajectory
+from share.lab.emulate.preparation import Prepared, keep_room, prepare
+from share.lab.emulate.progress import Progress, silent
+from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.stage import Actor
+from share.lab.emulate.takes import truth_of
+from share.protocol.agent_ledger import Chain
+from share.recordings.trajectory import Trajectory
 from share.types import F64, I64, Candidate, Keyframe, View
 from share.wire.messages import Hello
 

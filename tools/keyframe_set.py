@@ -18,10 +18,10 @@ from pathlib import Path
 from keyframe_file import load, save
 from keyframe_types import AgentKeyframes, KeyframeSet, Spacing
 
-from share.emulate.progress import Progress, silent
-from share.emulate.recipe import Recipe
-from share.emulate.session import default_cache
-from share.io.files import writable_dir
+from share.files.writing import writable_dir
+from share.lab.emulate.progress import Progress, silent
+from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.session import default_cache
 
 __all__ = ["AgentKeyframes", "KeyframeSet", "Spacing", "keyframe_set", "place"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from share.emulate.recipe import Recipe
 from share.errors import UsageError
+from share.lab.emulate.recipe import Recipe
 from share.types import F64, Keyframe
 from share.wire.messages import Hello
 
@@ -40,8 +40,8 @@ class AgentKeyframes:
 
 @dataclass(frozen=True, eq=False)
 class KeyframeSet:
-    """agents: by name. size: of the room (x, y, z) m, as `share.emulate.world.scenes.corridor.twins` wants
-    it."""
+    """agents: by name. size: of the room (x, y, z) m, as `share.lab.emulate.world.scenes.corridor.twins`
+    wants it."""
 
     recipe: Recipe
     every: Spacing

@@ -8,17 +8,17 @@ from itertools import groupby
 
 import numpy as np
 
-from share.core.measurement import CAM0, CAM1, DEPTH
-from share.emulate import shooting
-from share.emulate.chunks import Picture, encoded
-from share.emulate.progress import Progress
-from share.emulate.sensor.device import Pictures
-from share.emulate.sensor.exposure import Shots
-from share.emulate.stage import Actor, Stage
 from share.geometry.camera import Rig
-from share.io.pool import Pool
+from share.lab.emulate import shooting
+from share.lab.emulate.chunks import Picture, encoded
+from share.lab.emulate.progress import Progress
+from share.lab.emulate.sensor.device import Pictures
+from share.lab.emulate.sensor.exposure import Shots
+from share.lab.emulate.stage import Actor, Stage
+from share.runtime.pool import Pool
+from share.sensors.measurement import CAM0, CAM1, DEPTH
 from share.types import I64, Frame, View
-from share.vision.view import make_view
+from share.vision.orb import make_view
 
 _STRIP = 12  # frames of a job
 

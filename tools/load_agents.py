@@ -1,4 +1,4 @@
-"""N agents in one cheap process: what `share.core.agent` would say, when it would say it, in ready bytes.
+"""N agents in one cheap process: what `share.protocol.agent` would say, when it would say it, in ready bytes.
 
     python tools/load_agents.py tcp://H:P N SECONDS COUNTED_FROM
 
@@ -17,9 +17,9 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import msgspec  # noqa: E402
 import numpy as np  # noqa: E402
@@ -28,7 +28,7 @@ from keyframe_set import KeyframeSet  # noqa: E402
 from load_room import room  # noqa: E402
 from load_tracks import RATE_HZ, Walker  # noqa: E402
 
-from share.metrics.latency import summary  # noqa: E402
+from share.metrics.frame_log import summary  # noqa: E402
 from share.types import TrackState  # noqa: E402
 from share.wire.codec import encode  # noqa: E402
 from share.wire.messages import Bye, Evaluation, Ping, PoseUpdate, peer_id  # noqa: E402

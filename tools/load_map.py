@@ -8,9 +8,9 @@ from collections.abc import Callable
 from typing import Any
 
 from share.config import Config
-from share.core.finding import Finding
-from share.core.mapper import Mapper
-from share.graph.solver import Solver
+from share.mapping.graph.solver import Solver
+from share.mapping.mapper import Mapper
+from share.mapping.steps import Finding
 from share.types import Keyframe
 from share.wire.messages import Hello
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from keyframe_set import KeyframeSet, keyframe_set
 
-from share.emulate.recipe import Recipe
+from share.lab.emulate.recipe import Recipe
 
 RECIPE = Recipe("warehouse", ("ar1=walk:", "ar2=walk:", "robot=robot:"), 60.0, seed=301)
 

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 import onnx  # noqa: E402
@@ -34,8 +34,8 @@ from tool_main import exit_code  # noqa: E402
 from torch.nn import functional  # noqa: E402
 
 from share.errors import DataError, UsageError  # noqa: E402
-from share.evaluator.features import PICTURE_PX  # noqa: E402
-from share.train.label_file import read_labels  # noqa: E402
+from share.lab.train.labels import read_labels  # noqa: E402
+from share.odometry.error_model.features import PICTURE_PX  # noqa: E402
 from share.types import F32, U8  # noqa: E402
 
 _STAGES = ((6, 24, 2, 2), (6, 32, 3, 2), (6, 64, 4, 2), (6, 96, 3, 1), (6, 160, 3, 2), (6, 320, 1, 1))

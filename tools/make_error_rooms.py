@@ -14,17 +14,17 @@ import argparse
 import sys
 from pathlib import Path
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 
 from share.cli.progress import Stages  # noqa: E402
-from share.emulate.recipe import Recipe  # noqa: E402
-from share.emulate.sensor.effects import Effects  # noqa: E402
-from share.emulate.session import make_session  # noqa: E402
+from share.lab.emulate.recipe import Recipe  # noqa: E402
+from share.lab.emulate.sensor.effects import Effects  # noqa: E402
+from share.lab.emulate.session import make_session  # noqa: E402
 
 _SEED = 20261123
 _SCENES = ("warehouse", "firestation", "warehouse", "firestation", "whitewall")

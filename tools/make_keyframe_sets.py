@@ -16,17 +16,17 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 from keyframe_set import KeyframeSet, Spacing, keyframe_set, place  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 
 from share.cli.progress import Stages  # noqa: E402
-from share.emulate.preparation import furnish  # noqa: E402
-from share.emulate.recipe import Recipe  # noqa: E402
 from share.errors import UsageError  # noqa: E402
+from share.lab.emulate.preparation import furnish  # noqa: E402
+from share.lab.emulate.recipe import Recipe  # noqa: E402
 
 NAME = "make_keyframe_sets"
 

@@ -14,15 +14,15 @@ import argparse
 import sys
 from pathlib import Path
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 from tool_main import exit_code  # noqa: E402
 
 from share.cli.progress import Stages  # noqa: E402
-from share.emulate.recipe import Recipe  # noqa: E402
-from share.emulate.session import make_session  # noqa: E402
+from share.lab.emulate.recipe import Recipe  # noqa: E402
+from share.lab.emulate.session import make_session  # noqa: E402
 
 _DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "motion"
 _D435I = "d435i:640x480@15"

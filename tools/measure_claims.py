@@ -7,8 +7,8 @@ Takes what `make_keyframe_sets.py` takes; sets that it has not made are left out
 `LIES`. ATE is that of the other agents: `final` of their keyframes as the edge has them at the end, `causal`
 of each keyframe as its agent was placed when it was made; one alignment (SE3) for all of a map. In brackets:
 against the same session where the last agent is honest, and against the session without it. A run is a room
-of `share.core.world` by policy covins-g, so everything is sent and every loop that is verified is judged.
-"""
+of `share.lab.evaluate.world` by policy covins-g, so everything is sent and every loop that is verified is
+judged. """
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 from keyframe_set import AgentKeyframes, KeyframeSet, Spacing, keyframe_set, place  # noqa: E402
@@ -33,12 +33,12 @@ from remembered import RememberingMapper  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share.config import Config  # noqa: E402
-from share.core.channel import NETWORKS  # noqa: E402
-from share.core.mapper import Mapper  # noqa: E402
-from share.core.world import Costs, Seen, World  # noqa: E402
 from share.errors import ShareError, UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
-from share.geometry.align import umeyama  # noqa: E402
+from share.geometry.se3 import umeyama  # noqa: E402
+from share.lab.evaluate.world import Costs, Seen, World  # noqa: E402
+from share.mapping.mapper import Mapper  # noqa: E402
+from share.net.channel import NETWORKS  # noqa: E402
 from share.types import F64, Candidate, View  # noqa: E402
 from share.wire.messages import Hello, peer_id  # noqa: E402
 

@@ -3,12 +3,11 @@
     python tools/measure_embedding.py SESSION [SESSION ...] [--model FILE]
 
 SESSION: a folder by `share emulate`. Keyframes are each 30 cm or 20 degrees of an agent's true path; each
-looks for the place among those of all other agents. True are those that `share.place.verify` finds with a
-pose that is right by 15 cm and 2 degrees. Prints, of keyframes that have a true one at all, how many have it
-among the first 1, 3, 8 and 20 found: by words, by likeness of the embeddings (cosine), of pictures of 16 x 12
-pixels (for comparison), and by words and likeness together (reciprocal ranks, Cormack et al. 2009), at
-several weights.
-"""
+looks for the place among those of all other agents. True are those that
+`share.mapping.recognition.verification` finds with a pose that is right by 15 cm and 2 degrees. Prints, of
+keyframes that have a true one at all, how many have it among the first 1, 3, 8 and 20 found: by words, by
+likeness of the embeddings (cosine), of pictures of 16 x 12 pixels (for comparison), and by words and likeness
+together (reciprocal ranks, Cormack et al. 2009), at several weights."""
 
 from __future__ import annotations
 
@@ -19,9 +18,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
@@ -30,20 +29,20 @@ from keyframe_types import Spacing  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share.config import Config, PlaceConfig  # noqa: E402
-from share.core.sequencer import SequencerCounters  # noqa: E402
 from share.errors import UsageError  # noqa: E402
-from share.evaluator.features import SHAPES, picture  # noqa: E402
 from share.geometry import se3  # noqa: E402
-from share.io.network import SHIPPED, open_network, read_model  # noqa: E402
-from share.io.session import read_session  # noqa: E402
-from share.io.source import open_source  # noqa: E402
-from share.io.trajectory import Trajectory  # noqa: E402
-from share.metrics.association import interpolate  # noqa: E402
-from share.place.index import PlaceIndex  # noqa: E402
-from share.place.verify import Sight, Verified, verify  # noqa: E402
-from share.run.pipeline import frames_of  # noqa: E402
+from share.geometry.interpolation import interpolate  # noqa: E402
+from share.mapping.recognition.index import PlaceIndex  # noqa: E402
+from share.mapping.recognition.verification import Sight, Verified, verify  # noqa: E402
+from share.odometry.error_model.features import SHAPES, picture  # noqa: E402
+from share.odometry.error_model.network import SHIPPED, open_network, read_model  # noqa: E402
+from share.recordings.session import read_session  # noqa: E402
+from share.recordings.trajectory import Trajectory  # noqa: E402
+from share.runtime.pipeline import frames_of  # noqa: E402
+from share.runtime.source import open_source  # noqa: E402
+from share.sensors.sequencer import SequencerCounters  # noqa: E402
 from share.types import F64, U8  # noqa: E402
-from share.vision.view import make_view  # noqa: E402
+from share.vision.orb import make_view  # noqa: E402
 
 EVERY = Spacing(0.3, 0.35)
 NEAR_M, NEAR_DEG = 2.5, 50.0  # further apart, two views are not even tried

@@ -19,29 +19,29 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 
 from share.config import Config  # noqa: E402
-from share.core.measurement import CAM0, IMU  # noqa: E402
-from share.emulate.motion.plan import Plan, plan  # noqa: E402
-from share.emulate.motion.recorded import RecordedPath  # noqa: E402
-from share.emulate.world.layout import Layout  # noqa: E402
-from share.emulate.world.rays import Scene  # noqa: E402
-from share.emulate.world.scenes import layout  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.absolute_pose import Terms, absolute_pose  # noqa: E402
 from share.geometry.camera import Camera, rays  # noqa: E402
-from share.io.session import read_session  # noqa: E402
-from share.io.source import Source, open_source  # noqa: E402
-from share.mocap.preintegrate import preintegrate, sampled  # noqa: E402
-from share.run.track import accuracy, track  # noqa: E402
+from share.lab.emulate.motion.plan import Plan, plan  # noqa: E402
+from share.lab.emulate.motion.recorded import RecordedPath  # noqa: E402
+from share.lab.emulate.world.layout import Layout  # noqa: E402
+from share.lab.emulate.world.rays import Scene  # noqa: E402
+from share.lab.emulate.world.scenes import layout  # noqa: E402
+from share.lab.mocap.factors import preintegrate, sampled  # noqa: E402
+from share.recordings.session import read_session  # noqa: E402
+from share.runtime.source import Source, open_source  # noqa: E402
+from share.runtime.track import accuracy, track  # noqa: E402
+from share.sensors.measurement import CAM0, IMU  # noqa: E402
 from share.types import F64, I64, U8, ImuBatch  # noqa: E402
 from share.vision.corners import detect  # noqa: E402
-from share.vision.klt import follow  # noqa: E402
+from share.vision.optical_flow import follow  # noqa: E402
 
 Row = dict[str, Any]
 CORNERS, SPACING_PX, INLIER_PX, LEAST = 200, 16, 1.0, 20

@@ -2,7 +2,7 @@
 
     python tools/measure_faults.py [--seconds S] [--faults A,B] [--out FILE] SESSION/NAME ...
 
-Faults are those of `share/emulate/faults.py`, each on its own, on the first S seconds. Of each:
+Faults are those of `share/lab/emulate/faults.py`, each on its own, on the first S seconds. Of each:
 `ate_cm`: causal poses, SE3 alignment, of the longest stretch (`scored`: its share of all frames that have a
 pose); `ratio`: to the clean run. `states`: % of the frames. `lost_s`, `stretches`: as in report.json.
 `wrong_ok`: % of all frames that are told OK though the position is off by more than 5 cm and more than three
@@ -24,28 +24,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 
 from share.config import Config  # noqa: E402
-from share.core.measurement import Measurement  # noqa: E402
-from share.core.sequencer import SequencerCounters  # noqa: E402
-from share.emulate.faults import FAULTS, Arriving, Fault, apply  # noqa: E402
 from share.errors import ShareError, UsageError  # noqa: E402
-from share.estimator.inertial.tracker import InertialTracker  # noqa: E402
-from share.estimator.result import TrackResult  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.camera import Rig  # noqa: E402
-from share.io.source import Source, open_source  # noqa: E402
-from share.io.trajectory import Trajectory  # noqa: E402
-from share.metrics.association import interpolate  # noqa: E402
+from share.geometry.interpolation import interpolate  # noqa: E402
+from share.lab.emulate.faults import FAULTS, Arriving, Fault, apply  # noqa: E402
+from share.lab.evaluate.statistics import deviations  # noqa: E402
 from share.metrics.ate import ate  # noqa: E402
-from share.metrics.consistency import deviations  # noqa: E402
-from share.metrics.runlog import RunLog  # noqa: E402
-from share.run.pipeline import frames_of  # noqa: E402
+from share.metrics.frame_log import RunLog  # noqa: E402
+from share.odometry.result import TrackResult  # noqa: E402
+from share.odometry.tracker import InertialTracker  # noqa: E402
+from share.recordings.trajectory import Trajectory  # noqa: E402
+from share.runtime.pipeline import frames_of  # noqa: E402
+from share.runtime.source import Source, open_source  # noqa: E402
+from share.sensors.measurement import Measurement  # noqa: E402
+from share.sensors.sequencer import SequencerCounters  # noqa: E402
 from share.types import Frame, TrackState  # noqa: E402
 
 Row = dict[str, Any]

@@ -23,9 +23,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 from keyframe_set import KeyframeSet, Spacing, keyframe_set, place  # noqa: E402
@@ -34,14 +34,14 @@ from make_keyframe_sets import recipe_of  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 
 from share.config import Config  # noqa: E402
-from share.core.mapper import Mapper  # noqa: E402
-from share.core.steps import Solve  # noqa: E402
 from share.errors import UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
-from share.graph.solver import Solver  # noqa: E402
-from share.merge.join import Key  # noqa: E402
+from share.mapping.graph.solver import Solver  # noqa: E402
+from share.mapping.loops import Key  # noqa: E402
+from share.mapping.mapper import Mapper  # noqa: E402
+from share.mapping.steps import Solve  # noqa: E402
 from share.metrics.ate import joint_ate  # noqa: E402
-from share.strict import from_mapping, to_mapping  # noqa: E402
+from share.plain_data import from_mapping, to_mapping  # noqa: E402
 from share.types import F64  # noqa: E402
 
 SEEN_M, SEEN_RAD = 1.0, float(np.radians(30))

@@ -22,15 +22,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from share import children, process
+from share import processes, startup
 
-process.prepare()
+startup.prepare()
 
 from load_process import cpu_s, rss_mb, worker_of  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share.errors import ShareError  # noqa: E402
-from share.io.files import atomic_write, writable_dir  # noqa: E402
+from share.files.writing import atomic_write, writable_dir  # noqa: E402
 
 COUNTED_FROM_S = 10.0
 HERE = Path(__file__).parent
@@ -89,7 +89,7 @@ def carry(agents: int, seconds: float, config: Path | None) -> Row:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            env=children.environment(),
+            env=processes.environment(),
         ) as generator:
             used = _watch(generator, front, status)
             told, _ = generator.communicate("\n")
@@ -109,7 +109,7 @@ def edge(folder: Path, config: Path | None) -> Iterator[tuple[subprocess.Popen[s
     command += ["--map", folder / "map.sqlite", "--out", folder / "out"]
     command += [] if config is None else ["--config", config]
     front = subprocess.Popen(
-        [str(word) for word in command], stderr=subprocess.PIPE, text=True, env=children.environment()
+        [str(word) for word in command], stderr=subprocess.PIPE, text=True, env=processes.environment()
     )
     try:
         assert front.stderr is not None

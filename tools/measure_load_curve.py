@@ -21,9 +21,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 from load_map import TimedMap  # noqa: E402
@@ -33,9 +33,9 @@ from load_tracks import RATE_HZ, Walker  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 
 from share.config import Config  # noqa: E402
-from share.core.keeping import KeepKeyframe, KeepRun  # noqa: E402
-from share.io.files import atomic_write, writable_dir  # noqa: E402
-from share.io.map_store import MapStore  # noqa: E402
+from share.files.writing import atomic_write, writable_dir  # noqa: E402
+from share.mapping.changes import KeepKeyframe, KeepRun  # noqa: E402
+from share.store.map_store import MapStore  # noqa: E402
 from share.types import Keyframe  # noqa: E402
 
 ROOM_FOR = 10**7  # keyframes: no bound

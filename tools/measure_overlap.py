@@ -1,4 +1,4 @@
-"""How exact `share.control.overlap` is, and what it costs, by the distance of its points.
+"""How exact `share.scheduling.overlap` is, and what it costs, by the distance of its points.
 
     python tools/measure_overlap.py
 
@@ -12,16 +12,16 @@ from __future__ import annotations
 import math
 import time
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 
 from share.config import ControlConfig  # noqa: E402
-from share.control.overlap import Frustum, Seen, ious, volumes  # noqa: E402
 from share.geometry.camera import Camera  # noqa: E402
 from share.geometry.se3 import compose, exp, so3_exp  # noqa: E402
+from share.scheduling.overlap import Frustum, Seen, ious, volumes  # noqa: E402
 from share.types import F64  # noqa: E402
 
 SIDE_M = 8.0

@@ -20,27 +20,27 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 from measure_emulation import first_hits, scene_of  # noqa: E402
 
-from share.emulate.motion.avatars import Avatar, shapes  # noqa: E402
-from share.emulate.motion.crowd import length_of, present_of  # noqa: E402
-from share.emulate.motion.floor import Floor  # noqa: E402
-from share.emulate.motion.paper import LENGTHS_M, NAMES, SECONDS  # noqa: E402
-from share.emulate.motion.plan import Agent, plan  # noqa: E402
-from share.emulate.motion.together import nearest  # noqa: E402
-from share.emulate.world.layout import Layout  # noqa: E402
-from share.emulate.world.occupancy import Occupancy  # noqa: E402
-from share.emulate.world.rays import Scene  # noqa: E402
-from share.emulate.world.scenes import layout  # noqa: E402
 from share.errors import ShareError  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.camera import Camera, rays  # noqa: E402
-from share.io.profile import profile  # noqa: E402
+from share.lab.emulate.motion.avatars import Avatar, shapes  # noqa: E402
+from share.lab.emulate.motion.crowd import length_of, present_of  # noqa: E402
+from share.lab.emulate.motion.floor import Floor  # noqa: E402
+from share.lab.emulate.motion.paper import LENGTHS_M, NAMES, SECONDS  # noqa: E402
+from share.lab.emulate.motion.plan import Agent, plan  # noqa: E402
+from share.lab.emulate.motion.together import nearest  # noqa: E402
+from share.lab.emulate.world.layout import Layout  # noqa: E402
+from share.lab.emulate.world.occupancy import Occupancy  # noqa: E402
+from share.lab.emulate.world.rays import Scene  # noqa: E402
+from share.lab.emulate.world.scenes import layout  # noqa: E402
+from share.sensors.profile import profile  # noqa: E402
 from share.types import F64, I64  # noqa: E402
 
 Row = dict[str, Any]

@@ -14,9 +14,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import vio_options  # noqa: E402
 from tool_main import exit_code  # noqa: E402
@@ -24,11 +24,11 @@ from vio_kept import code_version  # noqa: E402
 
 from share.cli.compare import pythons  # noqa: E402
 from share.config import Config  # noqa: E402
-from share.emulate.session import cached_session  # noqa: E402
-from share.io.files import atomic_write, writable_dir  # noqa: E402
-from share.io.source import open_source  # noqa: E402
-from share.run.versus import contenders, rows  # noqa: E402
-from share.run.versus_report import markdown  # noqa: E402
+from share.files.writing import atomic_write, writable_dir  # noqa: E402
+from share.lab.emulate.session import cached_session  # noqa: E402
+from share.lab.evaluate.peer_comparison import contenders, rows  # noqa: E402
+from share.lab.evaluate.peer_report import markdown  # noqa: E402
+from share.runtime.source import open_source  # noqa: E402
 
 
 def main() -> int:

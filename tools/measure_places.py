@@ -16,9 +16,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 from keyframe_set import Spacing  # noqa: E402

@@ -24,28 +24,28 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 from tool_main import exit_code  # noqa: E402
 
 from share.config import Config  # noqa: E402
-from share.core.sequencer import SequencerCounters  # noqa: E402
-from share.emulate.motion.sources import EUROC, open_recording  # noqa: E402
-from share.emulate.recipe import Recipe  # noqa: E402
-from share.emulate.session import cached_session  # noqa: E402
 from share.errors import DataError, UsageError  # noqa: E402
 from share.geometry import se3  # noqa: E402
-from share.geometry.align import umeyama  # noqa: E402
-from share.io import tables  # noqa: E402
-from share.io.source import Source, open_source  # noqa: E402
-from share.io.trajectory import Trajectory, poses  # noqa: E402
-from share.metrics.association import associate, interpolate  # noqa: E402
+from share.geometry.interpolation import associate, interpolate  # noqa: E402
+from share.geometry.se3 import umeyama  # noqa: E402
+from share.lab.emulate.motion.sources import EUROC, open_recording  # noqa: E402
+from share.lab.emulate.recipe import Recipe  # noqa: E402
+from share.lab.emulate.session import cached_session  # noqa: E402
 from share.metrics.ate import ate  # noqa: E402
-from share.run.pipeline import frames_of, tracker_for  # noqa: E402
-from share.run.track import TrackRun, accuracy, track  # noqa: E402
+from share.recordings import tables  # noqa: E402
+from share.recordings.trajectory import Trajectory, poses  # noqa: E402
+from share.runtime.pipeline import frames_of, tracker_for  # noqa: E402
+from share.runtime.source import Source, open_source  # noqa: E402
+from share.runtime.track import TrackRun, accuracy, track  # noqa: E402
+from share.sensors.sequencer import SequencerCounters  # noqa: E402
 from share.types import F64, TrackState  # noqa: E402
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

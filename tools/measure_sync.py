@@ -22,16 +22,15 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 
-from share.core.time_server import TimeServer  # noqa: E402
-from share.io.udp import Host, StampedSocket, clock_precision  # noqa: E402
-from share.run.time_check import check  # noqa: E402
-from share.run.time_server import TimeServerRun  # noqa: E402
+from share.devices.time_client import check  # noqa: E402
+from share.devices.time_server import TimeServer, TimeServerRun  # noqa: E402
+from share.net.udp import Host, StampedSocket, clock_precision  # noqa: E402
 
 LEAST_S, THERE_S, BACK_S = 0.0005, 0.002, 0.001  # of the relay: at least, and more on average
 US = 1e3

@@ -20,21 +20,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share.errors import UsageError  # noqa: E402
-from share.io.json_file import read_json_lines  # noqa: E402
-from share.metrics.association import associate  # noqa: E402
-from share.metrics.ate import position_errors  # noqa: E402
-from share.metrics.spread import spread  # noqa: E402
-from share.run.score import score  # noqa: E402
-from share.run.traces import began_s, traces  # noqa: E402
-from share.run.trial import RUN, SETTINGS, Trial, read_trial  # noqa: E402
+from share.files.json_file import read_json_lines  # noqa: E402
+from share.geometry.interpolation import associate  # noqa: E402
+from share.lab.evaluate.play import score  # noqa: E402
+from share.lab.evaluate.scoring import began_s, traces  # noqa: E402
+from share.lab.evaluate.trial import RUN, SETTINGS, Trial, read_trial  # noqa: E402
+from share.metrics.ate import position_errors, spread  # noqa: E402
 from share.types import F64  # noqa: E402
 
 HEAD = ("agents", "runs", "N", "told, cm", "true, cm", "true / told", "within twice, %", "rank", "of runs")

@@ -30,9 +30,9 @@ from functools import wraps
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
@@ -40,22 +40,22 @@ from numpy.typing import NDArray  # noqa: E402
 
 from share.columns import Columns  # noqa: E402
 from share.config import Config  # noqa: E402
-from share.core.sequencer import SequencerCounters  # noqa: E402
-from share.emulate.preparation import keep_room, prepare  # noqa: E402
-from share.emulate.progress import silent  # noqa: E402
-from share.emulate.recipe import Recipe  # noqa: E402
-from share.emulate.room_file import open_renderer  # noqa: E402
-from share.emulate.sensor.effects import NONE, Effects  # noqa: E402
-from share.emulate.session import cached_session  # noqa: E402
-from share.emulate.types import Moment  # noqa: E402
 from share.errors import ShareError, UsageError  # noqa: E402
-from share.estimator.inertial.state import State  # noqa: E402
-from share.estimator.inertial.tracker import InertialTracker  # noqa: E402
 from share.geometry import se3  # noqa: E402
 from share.geometry.camera import Camera, rays  # noqa: E402
-from share.io.session import read_session  # noqa: E402
-from share.io.source import open_source  # noqa: E402
-from share.run.pipeline import frames_of  # noqa: E402
+from share.lab.emulate.preparation import keep_room, prepare  # noqa: E402
+from share.lab.emulate.progress import silent  # noqa: E402
+from share.lab.emulate.recipe import Recipe  # noqa: E402
+from share.lab.emulate.room_file import open_renderer  # noqa: E402
+from share.lab.emulate.sensor.effects import NONE, Effects  # noqa: E402
+from share.lab.emulate.session import cached_session  # noqa: E402
+from share.lab.emulate.types import Moment  # noqa: E402
+from share.odometry.state import State  # noqa: E402
+from share.odometry.tracker import InertialTracker  # noqa: E402
+from share.recordings.session import read_session  # noqa: E402
+from share.runtime.pipeline import frames_of  # noqa: E402
+from share.runtime.source import open_source  # noqa: E402
+from share.sensors.sequencer import SequencerCounters  # noqa: E402
 from share.types import F32, F64, I64  # noqa: E402
 from share.vision import patches  # noqa: E402
 

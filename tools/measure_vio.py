@@ -14,9 +14,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 import vio_options  # noqa: E402
@@ -28,9 +28,9 @@ from vio_sequences import SECONDS, Sequence  # noqa: E402
 from vio_table import Row, table  # noqa: E402
 
 from share.config import Config  # noqa: E402
-from share.emulate.session import cached_session  # noqa: E402
-from share.io.files import atomic_write  # noqa: E402
-from share.io.source import open_source  # noqa: E402
+from share.files.writing import atomic_write  # noqa: E402
+from share.lab.emulate.session import cached_session  # noqa: E402
+from share.runtime.source import open_source  # noqa: E402
 
 
 def main() -> int:

@@ -9,8 +9,8 @@ import numpy as np
 from places_data import Views
 
 from share.config import PlaceConfig
-from share.place.index import PlaceIndex
-from share.place.verify import Verified, verify
+from share.mapping.recognition.index import PlaceIndex
+from share.mapping.recognition.verification import Verified, verify
 from share.types import F64
 
 FALSE_M, FALSE_DEG = 0.25, 5.0

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from keyframe_set import KeyframeSet, Spacing, keyframe_set
 
-from share.emulate.recipe import Recipe
-from share.emulate.world.scenes.corridor import twins
 from share.geometry import se3
-from share.place.verify import Sight
+from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.world.scenes.corridor import twins
+from share.mapping.recognition.verification import Sight
 from share.types import F64
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "place"))

@@ -27,28 +27,31 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share import __version__  # noqa: E402
 from share.config import Config  # noqa: E402
-from share.emulate.recipe import Recipe  # noqa: E402
-from share.emulate.session import cached_session  # noqa: E402
 from share.errors import DataError, ShareError, UsageError  # noqa: E402
-from share.io.files import atomic_write  # noqa: E402
-from share.io.machine import describe_machine  # noqa: E402
-from share.io.session import read_session  # noqa: E402
-from share.metrics.comparison import MEASURES, policies  # noqa: E402
-from share.metrics.figures import RunFigures  # noqa: E402
-from share.run.ablation import plan  # noqa: E402
-from share.run.as_text import number  # noqa: E402
-from share.run.campaign import go_through, side_by_side  # noqa: E402
-from share.run.figures import figures  # noqa: E402
-from share.run.play import Terms  # noqa: E402
+from share.files.writing import atomic_write  # noqa: E402
+from share.lab.emulate.recipe import Recipe  # noqa: E402
+from share.lab.emulate.session import cached_session  # noqa: E402
+from share.lab.evaluate.campaign import (  # noqa: E402
+    go_through,
+    plan,
+    side_by_side,
+)
+from share.lab.evaluate.figures import RunFigures  # noqa: E402
+from share.lab.evaluate.play import Terms  # noqa: E402
+from share.lab.evaluate.report import number  # noqa: E402
+from share.lab.evaluate.scoring import figures  # noqa: E402
+from share.lab.evaluate.statistics import MEASURES, policies  # noqa: E402
+from share.recordings.session import read_session  # noqa: E402
+from share.runtime.machine import describe_machine  # noqa: E402
 
 HISTORY = Path(__file__).resolve().parents[1] / "docs" / "results" / "regression.jsonl"
 _WHO = ("ar1=walk:", "ar2=walk:speed=1.2", "robot=robot:")

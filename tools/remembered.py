@@ -7,10 +7,9 @@ from collections.abc import Collection
 from typing import Any
 
 from share.config import Config, PlaceConfig
-from share.core.finding import Finding
-from share.core.mapper import Mapper
-from share.core.steps import Look, Step, Verify
-from share.place.verify import Refusal, Sight, Verified
+from share.mapping.mapper import Mapper
+from share.mapping.recognition.verification import Refusal, Sight, Verified
+from share.mapping.steps import Finding, Look, Step, Verify
 from share.wire.messages import Hello
 
 _seen: dict[tuple[bytes, bytes, PlaceConfig], Verified | Refusal] = {}

@@ -22,9 +22,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 from keyframe_set import AgentKeyframes, KeyframeSet  # noqa: E402
@@ -33,15 +33,14 @@ from measure_joins import configured  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
 from share.config import POLICIES, STREAMED, Config  # noqa: E402
-from share.core.events import Localised  # noqa: E402
-from share.core.modelled import ModelledMapper, Odds, Truth  # noqa: E402
-from share.core.world import Costs, Seen, World  # noqa: E402
-from share.geometry.align import umeyama  # noqa: E402
-from share.geometry.se3 import transform  # noqa: E402
-from share.io.transport.links import Links  # noqa: E402
-from share.metrics.association import Trajectory  # noqa: E402
-from share.metrics.latency import summary as summarised  # noqa: E402
+from share.geometry.interpolation import Trajectory  # noqa: E402
+from share.geometry.se3 import transform, umeyama  # noqa: E402
+from share.lab.evaluate.modelled_mapper import ModelledMapper, Odds, Truth  # noqa: E402
+from share.lab.evaluate.world import Costs, Seen, World  # noqa: E402
+from share.metrics.frame_log import summary as summarised  # noqa: E402
 from share.metrics.local_error import LocalError  # noqa: E402
+from share.net.emulated import Links  # noqa: E402
+from share.protocol.agent_events import Localised  # noqa: E402
 from share.types import F64, Candidate  # noqa: E402
 
 SIMULATED = [policy for policy in POLICIES if policy != STREAMED]  # its agents send raw frames

@@ -19,9 +19,9 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 from keyframe_making import make_unseen  # noqa: E402
@@ -30,9 +30,9 @@ from measure_joins import configured  # noqa: E402
 from simulate import SIMULATED, Row, mean, play  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
-from share.emulate.recipe import Recipe  # noqa: E402
 from share.errors import UsageError  # noqa: E402
-from share.spawning import SPAWN  # noqa: E402
+from share.lab.emulate.recipe import Recipe  # noqa: E402
+from share.processes import SPAWN  # noqa: E402
 
 KINDS = ("ar", "ar", "robot")
 APART_M = 1000.0  # of rooms

@@ -25,9 +25,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 import numpy as np  # noqa: E402
 from keyframe_making import make_unseen  # noqa: E402
@@ -36,9 +36,9 @@ from measure_joins import configured  # noqa: E402
 from simulate import SIMULATED, Row, play  # noqa: E402
 from tool_main import exit_code, line  # noqa: E402
 
-from share.emulate.recipe import Recipe  # noqa: E402
 from share.errors import UsageError  # noqa: E402
-from share.spawning import SPAWN  # noqa: E402
+from share.lab.emulate.recipe import Recipe  # noqa: E402
+from share.processes import SPAWN  # noqa: E402
 
 FIGURES = ("AR latency", "robot latency", "AR error", "robot error", "merges")
 USUAL = {"ar": "walk:", "robot": "robot:"}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import share
-from share.io.files import atomic_write
+from share.files.writing import atomic_write
 
 _NOT_IN_A_RUN = ("cli", "emulate", "merge", "mocap", "wire")  # of share/
 

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 
 from share.config import Config
-from share.core.sequencer import SequencerCounters
 from share.errors import DataError
-from share.estimator.result import TrackResult
-from share.io.source import Source
-from share.io.trajectory import Trajectory
-from share.metrics.association import associate
+from share.geometry.interpolation import associate
+from share.lab.evaluate.statistics import Deviations, deviations, inside, nees
 from share.metrics.ate import ate
-from share.metrics.consistency import Deviations, deviations, inside, nees
+from share.metrics.frame_log import RunLog
 from share.metrics.rpe import rpe_time
-from share.metrics.runlog import RunLog
-from share.run.pipeline import frames_of, tracker_for
+from share.odometry.result import TrackResult
+from share.recordings.trajectory import Trajectory
+from share.runtime.pipeline import frames_of, tracker_for
+from share.runtime.source import Source
+from share.sensors.sequencer import SequencerCounters
 from share.types import F64, I64, TrackState
 
 ACCURACY = (

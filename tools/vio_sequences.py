@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from share.emulate.recipe import Recipe
+from share.lab.emulate.recipe import Recipe
 
 SECONDS = 60.0
 _D435I = "d435i:640x480@30"

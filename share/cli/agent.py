@@ -16,13 +16,13 @@ from share.cli.progress import LiveLine
 from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
+    from share.cameras.feed import Feed
     from share.config import Config
-    from share.io.feed import Feed
-    from share.io.keys import AgentKeys
-    from share.io.source import Source
-    from share.io.transport import AgentLink
-    from share.run.agent import AgentRun, Status
-    from share.run.errors import Errors
+    from share.net.keys import AgentKeys
+    from share.net.transport import AgentLink
+    from share.runtime.agent import AgentRun, Status
+    from share.runtime.error_model import Errors
+    from share.runtime.source import Source
     from share.types import AgentKind
 
 
@@ -89,10 +89,10 @@ def agent(
     Example:  share agent rec/kitchen --name ann --kind ar --edge tcp://127.0.0.1:5555 --out out/ann
     """
     settings = options.load_config(config_file)
-    from share.io.pose_feed import PoseFeed
-    from share.run.agent import AgentRun
-    from share.run.stop import on_stop
-    from share.run.stream import StreamRun
+    from share.runtime.agent import AgentRun
+    from share.runtime.pose_feed import PoseFeed
+    from share.runtime.stop import on_stop
+    from share.runtime.stream import StreamRun
     from share.wire.messages import Hello
 
     if streamed and true_error:
@@ -130,7 +130,7 @@ _NOBODY = "is `share edge` running there?"
 
 def _keys(folder: str | None, server_key: str | None) -> AgentKeys | None:
     """None without --server-key. Raises UsageError."""
-    from share.io.keys import agent_keys
+    from share.net.keys import agent_keys
 
     if server_key is None:
         if folder is not None:
@@ -141,7 +141,7 @@ def _keys(folder: str | None, server_key: str | None) -> AgentKeys | None:
 
 def _kind(given: str | None, profile_name: str | None) -> AgentKind:
     """As given, or what the computer of that profile is for. Raises UsageError, ConfigError."""
-    from share.io.profile import host_profile
+    from share.sensors.profile import host_profile
     from share.types import AgentKind
 
     role = given or ("" if profile_name is None else host_profile(profile_name).role)
@@ -154,7 +154,7 @@ def _kind(given: str | None, profile_name: str | None) -> AgentKind:
 
 def _dial(address: str, run_id: int, keys: AgentKeys | None) -> Callable[[], AgentLink]:
     """What connects to the edge. Raises UsageError for an address that is none, or wants keys."""
-    from share.io.transport import check_keys, connect, parse_address
+    from share.net.transport import check_keys, connect, parse_address
 
     check_keys(parse_address(address), keys)
     return partial(connect, address, run_id, keys)
@@ -166,8 +166,8 @@ def _errors(source: Source, settings: Config, true_error: bool, say: Callable[[s
         return _by_truth(source)
     if not settings.agent.error_model:
         return None
-    from share.io.network import error_model
-    from share.run.errors import ByModel
+    from share.odometry.error_model.network import error_model
+    from share.runtime.error_model import ByModel
 
     return ByModel(error_model(settings.agent.error_model), say)
 
@@ -175,7 +175,7 @@ def _errors(source: Source, settings: Config, true_error: bool, say: Callable[[s
 def _by_truth(source: Source) -> Errors:
     """Raises UsageError where nobody knows it."""
     from share.metrics.local_error import LocalError
-    from share.run.errors import ByTruth
+    from share.runtime.error_model import ByTruth
 
     truth = source.truth()
     if truth is None:
@@ -187,7 +187,7 @@ def _by_truth(source: Source) -> Errors:
 
 def _shaped(dial: Callable[[], AgentLink], name: str, seed: int) -> Callable[[], AgentLink]:
     """`dial`, with an emulated network around the link. Raises UsageError, ConfigError."""
-    from share.io.transport.shaped import ShapedLink, network
+    from share.net.emulated import ShapedLink, network
 
     found = network(name)
     return lambda: ShapedLink(dial(), found, seed)

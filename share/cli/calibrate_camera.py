@@ -15,9 +15,9 @@ from share.cli.table import aligned
 from share.errors import DataError, ShareError
 
 if TYPE_CHECKING:
-    from share.geometry.target import Target
-    from share.io.board_views import Pictures
-    from share.io.camera_report import Outcome
+    from share.lab.calibrate.board_views import Pictures
+    from share.lab.calibrate.camera_report import Outcome
+    from share.lab.calibrate.target import Target
 
 
 @click.command(short_help="Intrinsics of one or two cameras from views of a board.")
@@ -63,15 +63,13 @@ def camera(
     Example:  share calibrate camera board.mcap --target aprilgrid --out calib/mine
               share calibrate camera pictures --target board.yaml --camera cam0 --out calib/mine
     """
-    from share.io import camera_report
-    from share.io.board_views import open_pictures
-    from share.io.calibration import CAMCHAIN
-    from share.io.camera_report import PICTURE, REPORT
-    from share.io.earlier import places, written
-    from share.io.files import atomic_write, writable_dir
-    from share.io.json_file import known
-    from share.io.kalibr import to_kalibr
-    from share.io.target import named_target
+    from share.files.json_file import known
+    from share.files.writing import atomic_write, writable_dir
+    from share.lab.calibrate import camera_report
+    from share.lab.calibrate.board_views import open_pictures
+    from share.lab.calibrate.camera_report import PICTURE, REPORT, places, written
+    from share.lab.calibrate.target import named_target
+    from share.recordings.calibration import CAMCHAIN, to_kalibr
 
     target = named_target(target_name)
     pictures = open_pictures(source, ("cam0", "cam1") if camera == "both" else ("cam0",), calib)
@@ -96,13 +94,11 @@ def camera(
 def _calibrated(
     source: str, pictures: Pictures, target: Target, every: int, most: int, model: str, workers: int
 ) -> Outcome:
-    from share.calibration.bundle import calibrate
-    from share.calibration.coverage import choose, coverage
-    from share.calibration.epipolar import typical_miss
-    from share.calibration.start import enough
-    from share.calibration.verdict import judge
-    from share.io.board_views import find_views
-    from share.io.camera_report import Outcome
+    from share.lab.calibrate.board_views import find_views
+    from share.lab.calibrate.camera_bundle import calibrate
+    from share.lab.calibrate.camera_report import Outcome
+    from share.lab.calibrate.camera_start import enough
+    from share.lab.calibrate.camera_verdict import choose, coverage, judge, typical_miss
 
     with Stages() as stages:
         views, sizes = find_views(
@@ -139,7 +135,7 @@ def _calibrated(
 
 
 def _summary(outcome: Outcome, files: tuple[Path, ...]) -> str:
-    from share.io.camera_report import table
+    from share.lab.calibrate.camera_report import table
 
     verdict = outcome.verdict
     lines = [

@@ -15,10 +15,10 @@ from share.cli.table import aligned
 from share.errors import DataError, ShareError
 
 if TYPE_CHECKING:
-    from share.calibration.camera_imu.verdict import Comparison
     from share.geometry.camera import ImuNoise
-    from share.io.camera_imu_report import Outcome
-    from share.io.rig_pictures import RigPictures
+    from share.lab.calibrate.board_views import RigPictures
+    from share.lab.calibrate.camera_imu.verdict import Comparison
+    from share.lab.calibrate.camera_imu_report import Outcome
     from share.types import F64
 
 _WORTH = 2.0  # times the stated noise: worth a word
@@ -67,15 +67,15 @@ def camera_imu(
     Example:  share calibrate camera-imu dance.mcap --target board.yaml --camera calib/mine \\
                 --imu calib/mine --out calib/mine
     """
-    from share.io import camera_imu_report as report
-    from share.io.calibration import CAMCHAIN, IMU_CHAIN
-    from share.io.camera_imu_chart import residual_png
-    from share.io.earlier import places, says_noise, written
-    from share.io.files import atomic_write, writable_dir
-    from share.io.json_file import known
-    from share.io.rig_pictures import open_rig_pictures
-    from share.io.section import text_of
-    from share.io.stated_noise import chain_file, stated_noise
+    from share.files.json_file import known
+    from share.files.writing import atomic_write, writable_dir
+    from share.files.yaml_file import text_of
+    from share.lab.calibrate import camera_imu_report as report
+    from share.lab.calibrate.board_views import open_rig_pictures
+    from share.lab.calibrate.camera_imu_report import residual_png
+    from share.lab.calibrate.camera_report import places, says_noise, written
+    from share.lab.calibrate.imu_table import chain_file, stated_noise
+    from share.recordings.calibration import CAMCHAIN, IMU_CHAIN
 
     pictures = open_rig_pictures(source, camera)
     noise = stated_noise(source, imu, "--imu")
@@ -113,12 +113,12 @@ def _calibrated(
     within: float,
     workers: int,
 ) -> Outcome:
-    from share.calibration.camera_imu.fit import fit
-    from share.calibration.camera_imu.verdict import compare, judge
-    from share.io.camera_imu_report import Outcome
-    from share.io.imu_table import read_imu
-    from share.io.rig_pictures import find_stamped
-    from share.io.target import named_target
+    from share.lab.calibrate.board_views import find_stamped
+    from share.lab.calibrate.camera_imu.fit import fit
+    from share.lab.calibrate.camera_imu.verdict import compare, judge
+    from share.lab.calibrate.camera_imu_report import Outcome
+    from share.lab.calibrate.imu_table import read_imu
+    from share.lab.calibrate.target import named_target
 
     target = named_target(target_name)
     with Stages() as stages:
@@ -174,7 +174,7 @@ def _summary(outcome: Outcome, files: tuple[Path, ...]) -> str:
 
 def _of_cameras(outcome: Outcome) -> str:
     """What of the sigmas comes from the cameras' own."""
-    from share.calibration.camera_imu.verdict import largest
+    from share.lab.calibrate.camera_imu.verdict import largest
 
     fit, doubt = outcome.fit, outcome.doubt
     if fit.by_rig is None:

@@ -13,8 +13,8 @@ from share.cli.progress import Stages
 from share.cli.table import aligned
 
 if TYPE_CHECKING:
-    from share.calibration.imu import ImuNature
-    from share.io.imu_report import Row
+    from share.lab.calibrate.imu import ImuNature
+    from share.lab.calibrate.imu_report import Row
 
 _FAR = 2.0  # times the profile's figure, or part of it: worth a word
 _LETTERS = {"density": "N", "instability": "B", "walk": "K"}
@@ -39,13 +39,13 @@ def imu(source: str, profile_name: str | None, inflate: float, out: Path, as_jso
     \b
     Example:  share calibrate imu rest.mcap --profile d435i --out calib/mine
     """
-    from share.calibration.imu import characterise
-    from share.io import imu_report
-    from share.io.allan_chart import allan_png
-    from share.io.files import atomic_write, writable_dir
-    from share.io.imu_table import read_imu
-    from share.io.json_file import known
-    from share.io.profile import profile
+    from share.files.json_file import known
+    from share.files.writing import atomic_write, writable_dir
+    from share.lab.calibrate import imu_report
+    from share.lab.calibrate.imu import characterise
+    from share.lab.calibrate.imu_report import allan_png
+    from share.lab.calibrate.imu_table import read_imu
+    from share.sensors.profile import profile
 
     stated = profile(profile_name) if profile_name else None
     writable_dir(out, "kalibr_imu_chain.yaml", "imu-report.json", "imu-report.png")
@@ -68,7 +68,7 @@ def imu(source: str, profile_name: str | None, inflate: float, out: Path, as_jso
 
 
 def _summary(nature: ImuNature, rows: list[Row], dropped: int) -> str:
-    from share.io.imu_report import STANDARD_GRAVITY, gravity
+    from share.lab.calibrate.imu_report import STANDARD_GRAVITY, gravity
 
     heads = ["", "", "x", "y", "z", "all", *(["profile", "ratio"] if any(r.stated for r in rows) else [])]
     norm, bias = gravity(nature), ", ".join(f"{b:+.5f}" for b in nature.gyro.mean)

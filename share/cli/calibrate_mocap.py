@@ -14,9 +14,9 @@ from share.cli.progress import Stages
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.calibration.mounting import Check
-    from share.mocap.fit import Fit
-    from share.mocap.mocap import Mocap
+    from share.lab.calibrate.handeye import Check
+    from share.lab.mocap.fit import Fit
+    from share.lab.mocap.mocap import Mocap
     from share.types import F64
 
 
@@ -78,15 +78,14 @@ def mocap(
     \b
     Example:  share calibrate mocap walk.mcap --truth walk.vicon.tum --out calib/mine
     """
-    from share.io.files import atomic_write, writable_dir
-    from share.io.imu_table import read_imu
-    from share.io.json_file import known
-    from share.io.mocap_file import pick_body, read_bodies
-    from share.io.mocap_report import mocap_json, mocap_text
-    from share.io.stated_noise import stated_noise
-    from share.mocap.fit import fit
-    from share.mocap.options import FitOptions
-    from share.mocap.verdict import check_fit, doubts
+    from share.files.json_file import known
+    from share.files.writing import atomic_write, writable_dir
+    from share.lab.calibrate.imu_table import read_imu, stated_noise
+    from share.lab.mocap.files import pick_body, read_bodies
+    from share.lab.mocap.fit import fit
+    from share.lab.mocap.report import mocap_json, mocap_text
+    from share.lab.mocap.state import FitOptions
+    from share.lab.mocap.verdict import check_fit, doubts
 
     chosen = FitOptions(sigma_position=sigma_mm * 1e-3, within_s=within)
     if one_clock:
@@ -112,8 +111,8 @@ def mocap(
 
 
 def _check(found: Fit, track: Path, seen: Mocap) -> Check:
-    from share.calibration.mounting import check
-    from share.io.trajectory import read_tum
+    from share.lab.calibrate.handeye import check
+    from share.recordings.trajectory import read_tum
 
     if not track.is_file():
         raise UsageError(f"--track {track}: no such file")
@@ -127,7 +126,7 @@ def _summary(found: Fit, checked: Check | None) -> str:
     import numpy as np
 
     from share.geometry import se3
-    from share.mocap.verdict import sigmas
+    from share.lab.mocap.verdict import sigmas
 
     T, left, sigma = found.T_body_mocap, found.residuals, sigmas(found)
     turn = np.degrees(se3.so3_log(T[:3, :3]))

@@ -24,12 +24,11 @@ def realsense(serial: str | None, profile_name: str | None, mode: str | None, de
     \b
     Example:  share calibrate realsense --out calib/mine
     """
-    from share.io.calibration import CAMCHAIN, IMU_CHAIN
-    from share.io.files import atomic_write, writable_dir
-    from share.io.kalibr import kalibr_texts
-    from share.io.profile import profile
-    from share.io.realsense.camera import RealSense
-    from share.io.realsense.streams import Wanted
+    from share.cameras.realsense.camera import RealSense
+    from share.cameras.realsense.streams import Wanted
+    from share.files.writing import atomic_write, writable_dir
+    from share.recordings.calibration import CAMCHAIN, IMU_CHAIN, kalibr_texts
+    from share.sensors.profile import profile
 
     for path in (out / CAMCHAIN, out / IMU_CHAIN):
         if path.exists():

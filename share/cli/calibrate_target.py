@@ -40,11 +40,10 @@ def target(
     """
     import yaml
 
-    from share.calibration.sheet import USUAL, sheet
-    from share.io.earlier import says_target
-    from share.io.files import atomic_write, check_replaceable, check_writable
-    from share.io.target import to_plain
-    from share.io.target_sheet import pdf, words
+    from share.files.writing import atomic_write, check_replaceable, check_writable
+    from share.lab.calibrate.camera_report import says_target
+    from share.lab.calibrate.target import to_plain
+    from share.lab.calibrate.target_sheet import USUAL, pdf, sheet, words
 
     if out.suffix.lower() != ".pdf":
         raise UsageError(f"--out {out}: expected a name that ends in .pdf")

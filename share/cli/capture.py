@@ -13,7 +13,7 @@ from share.cli.progress import LiveLine
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.run.capture import Status
+    from share.runtime.capture import Status
 
 
 @click.command()
@@ -56,14 +56,14 @@ def capture(
     \b
     Example:  share capture --out walk.mcap --seconds 60
     """
+    from share.cameras.handover import Handover
+    from share.cameras.realsense.live import feed_of
+    from share.cameras.realsense.streams import Wanted
     from share.config import SequencerConfig
-    from share.io.handover import Handover
-    from share.io.profile import profile
-    from share.io.realsense.live import feed_of
-    from share.io.realsense.streams import Wanted
-    from share.io.source import calibration_of
-    from share.run.capture import Capture
-    from share.run.stop import on_stop
+    from share.runtime.capture import Capture
+    from share.runtime.source import calibration_of
+    from share.runtime.stop import on_stop
+    from share.sensors.profile import profile
 
     if depth and imu_only:
         raise UsageError("--depth, --imu-only: give one of them")

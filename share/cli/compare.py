@@ -12,11 +12,11 @@ import click
 from share.cli import options
 from share.cli.progress import LiveLine
 from share.errors import DataError, ShareError, UsageError
-from share.peers import PEERS
+from share.lab.peers import PEERS
 
 if TYPE_CHECKING:
-    from share.io.source import Source
-    from share.run.versus import Contender, Row
+    from share.lab.evaluate.peer_comparison import Contender, Row
+    from share.runtime.source import Source
 
 
 @click.command(short_help="Our tracker and those of others, on the same recordings.")
@@ -56,8 +56,8 @@ def compare(
               share evaluate compare room1 --peer basalt=peers/bin/python --out compared
     """
     settings = options.load_config(config_file)
-    from share.io.files import writable_dir
-    from share.run.versus import contenders
+    from share.files.writing import writable_dir
+    from share.lab.evaluate.peer_comparison import contenders
 
     recordings = _opened(sources)
     all_of, lacking = contenders(settings, pythons(peers), vocabulary)
@@ -80,8 +80,8 @@ def compare(
 
 def _opened(sources: tuple[str, ...]) -> dict[str, Source]:
     """By name. Raises UsageError where there is no truth."""
-    from share.io.source import open_source
-    from share.run.versus import check
+    from share.lab.evaluate.peer_comparison import check
+    from share.runtime.source import open_source
 
     found = {name: open_source(path) for name, path in _recordings(sources)}
     for name, source in found.items():
@@ -93,7 +93,7 @@ def _run(
     jobs: Sequence[tuple[str, Contender]], recordings: Mapping[str, Source], out: Path
 ) -> tuple[list[Row], int]:
     """What is known, and how many failed, which is said."""
-    from share.run.versus import rows
+    from share.lab.evaluate.peer_comparison import rows
 
     live, found, failed = LiveLine(), list["Row"](), 0
     for number, (name, contender) in enumerate(jobs):
@@ -109,9 +109,9 @@ def _run(
 
 
 def _write(out: Path, found: Sequence[Row], lacking: Sequence[str]) -> None:
-    from share.io.files import atomic_write
-    from share.io.page import page
-    from share.run.versus_report import csv_of, draw, markdown
+    from share.files.writing import atomic_write
+    from share.lab.evaluate.page import page
+    from share.lab.evaluate.peer_report import csv_of, draw, markdown
 
     text = markdown(found, lacking)
     atomic_write(out / "table.md", text)
@@ -127,7 +127,7 @@ def _show(live: LiveLine, what: str, of: int, done: int) -> None:
 
 def _recordings(sources: tuple[str, ...]) -> Iterator[tuple[str, str]]:
     """Name and what to open. Raises UsageError where two have one name."""
-    from share.io.session import is_session, read_session
+    from share.recordings.session import is_session, read_session
 
     found = []
     for text in sources:

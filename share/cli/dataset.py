@@ -39,9 +39,9 @@ def info(source: str, calib: str | None, frames: slice | None, as_json: bool) ->
               share dataset info session/ann --json
               share dataset info room.sqlite
     """
-    from share.io.describe import describe
-    from share.io.map_store import is_map
-    from share.io.source import open_source
+    from share.recordings.describe import describe
+    from share.runtime.source import open_source
+    from share.store.map_store import is_map
 
     if is_map(Path(source)):
         if calib or frames:
@@ -76,9 +76,9 @@ def convert(
     \b
     Example:  share dataset convert rec/kitchen --out kitchen.mcap --frames 0:250
     """
-    from share.io.convert import to_euroc, to_mcap
-    from share.io.files import check_replaceable
-    from share.io.source import open_source
+    from share.files.writing import check_replaceable
+    from share.recordings.convert import to_euroc, to_mcap
+    from share.runtime.source import open_source
 
     target = Path(out)
     if kind == "euroc" and jpeg is not None:
@@ -108,7 +108,7 @@ def recover(broken: str, out: str, as_json: bool) -> None:
     \b
     Example:  share dataset recover walk.mcap.part --out walk.mcap
     """
-    from share.io.mcap.recover import recover as run
+    from share.recordings.mcap.recover import recover as run
 
     path, target = Path(broken), Path(out)
     if not path.is_file():

@@ -15,9 +15,9 @@ from share.cli.table import aligned
 from share.errors import DataError, UsageError
 
 if TYPE_CHECKING:
-    from share.io.field_session import Device
-    from share.mocap.mocap import Mocap
-    from share.mocap.options import FitOptions
+    from share.lab.mocap.mocap import Mocap
+    from share.lab.mocap.session import Device
+    from share.lab.mocap.state import FitOptions
 
 _CLOCK = ("device", "offset s", "± ms", "drift ppm", "alike", "next")
 _MOUNTING = ("body deg", "±", "body mm", "±", "up", "tilt deg")
@@ -101,9 +101,9 @@ def align(
                   --body ann=Headset1 --kind bob=robot --mounting bob=calib/bob --out room1
               share evaluate run room1 --virtual --out runs/room1
     """
-    from share.io.field_session import write_session
-    from share.io.files import new_folder
-    from share.mocap.options import FitOptions
+    from share.files.writing import new_folder
+    from share.lab.mocap.session import write_session
+    from share.lab.mocap.state import FitOptions
 
     names = _devices(recordings)
     told = {
@@ -164,7 +164,7 @@ def _bodies(
     names: dict[str, str], files: dict[str, str], bodies: dict[str, str], rotations: str
 ) -> dict[str, tuple[str, Mocap]]:
     """By device: file and body for a person, and what the motion capture saw of it."""
-    from share.io.mocap_file import pick_body, read_bodies
+    from share.lab.mocap.files import pick_body, read_bodies
 
     read = {file: read_bodies(Path(file), rotations) for file in dict.fromkeys(files.values())}
     out: dict[str, tuple[str, Mocap]] = {}
@@ -193,10 +193,10 @@ def _device(
     chosen: FitOptions,
     stages: Stages,
 ) -> Device:
-    from share.io.field_session import Device
-    from share.io.imu_table import read_imu
-    from share.io.source import open_source
-    from share.mocap.align import align as run
+    from share.lab.calibrate.imu_table import read_imu
+    from share.lab.mocap.align import align as run
+    from share.lab.mocap.session import Device
+    from share.runtime.source import open_source
 
     def of(option: str) -> str | None:
         return told[option].get(name, told[option].get(""))
@@ -228,7 +228,7 @@ def _kind(text: str) -> Any:
 
 
 def _mounted(chosen: FitOptions, mounting: str | None) -> FitOptions:
-    from share.io.mocap_report import read_mounting
+    from share.lab.mocap.report import read_mounting
 
     if mounting is None:
         return chosen

@@ -27,8 +27,8 @@ def export(map_file: str, out: str, as_json: bool) -> None:
     """
     import json
 
-    from share.io.map_export import export as run
-    from share.io.map_store import MapStore
+    from share.store.export import export as run
+    from share.store.map_store import MapStore
 
     if not Path(map_file).is_file():
         raise UsageError(f"{map_file}: no such file")
@@ -49,8 +49,8 @@ def export(map_file: str, out: str, as_json: bool) -> None:
 
 def info(path: Path) -> dict[str, Any]:
     """Of a map file. Raises ShareError."""
-    from share.io.map_describe import describe_map
-    from share.io.map_store import MapStore
+    from share.store.export import describe_map
+    from share.store.map_store import MapStore
 
     return describe_map(MapStore.read(path))
 

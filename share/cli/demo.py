@@ -15,8 +15,8 @@ from share.config import POLICIES, STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
+    from share.lab.evaluate.play import SessionScore
     from share.metrics.ate import Ate
-    from share.run.score import SessionScore
 
 
 class _Seconds(click.FloatRange):
@@ -65,14 +65,13 @@ def demo(
     options.load_config(config_file)  # what is wrong with this and the link is said before anything is made
     if policy == STREAMED and true_error:
         raise UsageError("--true-error: is of agents that track themselves; leave it out by policy streamed")
-    from share.emulate.demo import AGENTS, meeting_seed, recipe
-    from share.emulate.session import cached_session
-    from share.io.files import writable_dir
-    from share.io.machine import cores
-    from share.io.session import read_session
-    from share.io.transport.links import Links
-    from share.run.play import Terms, play
-    from share.run.score import score
+    from share.files.writing import writable_dir
+    from share.lab.emulate.demo import AGENTS, meeting_seed, recipe
+    from share.lab.emulate.session import cached_session
+    from share.lab.evaluate.play import Terms, play, score
+    from share.net.emulated import Links
+    from share.recordings.session import read_session
+    from share.runtime.machine import cores
 
     Links.parse(link).check(AGENTS)
     writable_dir(folder)
@@ -92,7 +91,7 @@ def demo(
     picture = folder / "trajectories.png"
     picture.unlink(missing_ok=True)  # of an earlier demo
     if result.joint is not None:
-        from share.io.picture import draw_trajectories
+        from share.lab.evaluate.charts import draw_trajectories
 
         title = f"joint ATE {100 * result.joint.joint.rmse:.2f} cm, causal, one alignment for all"
         paths = {name: (agent.map, agent.truth) for name, agent in result.agents.items()}
@@ -102,8 +101,8 @@ def demo(
 
 def _drawable(scene: str | None) -> str:
     """The scene asked for; else the usual one, or the plain one where there is no OpenGL."""
-    from share.emulate.demo import FALLBACK, SCENE
-    from share.emulate.render.context import missing
+    from share.lab.emulate.demo import FALLBACK, SCENE
+    from share.lab.emulate.render.context import missing
 
     if scene is not None:
         return scene

@@ -13,7 +13,7 @@ from share.cli import options
 from share.errors import ShareError
 
 if TYPE_CHECKING:
-    from share.core.checkup import Finding
+    from share.devices.checks import Finding
 
 
 @click.command()
@@ -46,9 +46,9 @@ def doctor(
     \b
     Example:  share doctor --profile d435i-n100-headset --calib calib/d435i
     """
-    from share.core.checkup import failures
-    from share.io.profile import host_profile
-    from share.run.doctor import ask, of_calibration, of_camera, of_edge, of_host, of_port
+    from share.devices.checks import failures
+    from share.runtime.doctor import ask, of_calibration, of_camera, of_edge, of_host, of_port
+    from share.sensors.profile import host_profile
 
     wanted = host_profile(profile)
     sdk = ask(wanted)

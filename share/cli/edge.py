@@ -13,8 +13,8 @@ from share.config import POLICIES, STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.io.keys import EdgeKeys
-    from share.io.map_store import MapStore
+    from share.net.keys import EdgeKeys
+    from share.store.map_store import MapStore
 
 
 @click.command()
@@ -56,11 +56,11 @@ def edge(
     from contextlib import ExitStack, closing
     from dataclasses import replace
 
-    from share.io.transport import bind as bind_link
-    from share.io.transport import parse_address
-    from share.run.edge import EdgeRun
-    from share.run.status import StatusServer
-    from share.run.stop import on_stop
+    from share.net.transport import bind as bind_link
+    from share.net.transport import parse_address
+    from share.runtime.edge import EdgeRun
+    from share.runtime.status import StatusServer
+    from share.runtime.stop import on_stop
     from share.wire.codec import MAX_FRAME_BYTES, MAX_IMAGE_BYTES
 
     with_keys = _keys(keys, parse_address(bind, bind=True).local)
@@ -95,7 +95,7 @@ def edge(
 
 def _keys(folder: str | None, local: bool) -> EdgeKeys | None:
     """Those of --keys; for a network, else of the default folder, if there are any. Raises UsageError."""
-    from share.io.keys import default_folder, edge_keys, has_pair
+    from share.net.keys import default_folder, edge_keys, has_pair
 
     if folder is None and (local or not has_pair(default_folder())):
         return None
@@ -104,7 +104,7 @@ def _keys(folder: str | None, local: bool) -> EdgeKeys | None:
 
 def _open_map(path: Path) -> MapStore:
     """Says what is in it, and what is wrong with it. Raises UsageError, ShareError."""
-    from share.io.map_store import MapStore
+    from share.store.map_store import MapStore
 
     store = MapStore.open(path)
     kept = store.peek()

@@ -108,9 +108,9 @@ def emulate(
     Example:  share emulate --scene warehouse --motion ann=walk: --motion bob=walk: --out room1
               share track room1/ann
     """
-    from share.emulate.recipe import Recipe
-    from share.emulate.sensor.effects import parse
-    from share.emulate.session import make_session
+    from share.lab.emulate.recipe import Recipe
+    from share.lab.emulate.sensor.effects import parse
+    from share.lab.emulate.session import make_session
 
     euroc = form == "euroc"
     recipe = Recipe(
@@ -132,9 +132,9 @@ def emulate(
 
 def _described(folder: Path, euroc: bool) -> dict[str, Any]:
     """What is in the new folder, as plain data."""
-    from share.io.describe import describe
-    from share.io.section import read_yaml
-    from share.io.source import open_source
+    from share.files.yaml_file import read_yaml
+    from share.recordings.describe import describe
+    from share.runtime.source import open_source
 
     top = read_yaml(folder / ("emulation.yaml" if euroc else "session.yaml"))
     agents = {name: describe(open_source(str(folder / name))) for name in top.section("agents").data}

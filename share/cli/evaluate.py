@@ -20,8 +20,8 @@ from share.config import POLICIES
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.run.annex import Annex
-    from share.run.trial import Trial
+    from share.lab.evaluate.report import Annex
+    from share.lab.evaluate.trial import Trial
 
 BASE = "covins-g"  # what the others are told as a part of
 
@@ -66,10 +66,10 @@ def run(
     \b
     Example:  share evaluate run room1 --policy covins-g --link wifi5 --out runs/covins
     """
-    from share.io.session import read_session
-    from share.run.figures import figures
-    from share.run.play import Terms
-    from share.run.trial import run_trial
+    from share.lab.evaluate.play import Terms
+    from share.lab.evaluate.scoring import figures
+    from share.lab.evaluate.trial import run_trial
+    from share.recordings.session import read_session
 
     opened, live = read_session(session), LiveLine()
     config, terms = settings(config_file, told, [opened]), Terms(policy, seed=seed, **told)
@@ -94,12 +94,12 @@ def score(runs: tuple[Path, ...], csv_file: Path | None, plots: Path | None, as_
     \b
     Example:  share evaluate score runs/* --plots plots
     """
-    from share.io.files import atomic_write, check_writable, writable_dir
-    from share.io.json_file import known
-    from share.run.figures import figures
-    from share.run.pictures import draw_each
-    from share.run.report import PROTOCOL, agents_csv
-    from share.run.trial import read_trial
+    from share.files.json_file import known
+    from share.files.writing import atomic_write, check_writable, writable_dir
+    from share.lab.evaluate.pictures import draw_each
+    from share.lab.evaluate.report import PROTOCOL, agents_csv
+    from share.lab.evaluate.scoring import figures
+    from share.lab.evaluate.trial import read_trial
 
     if csv_file is not None:
         check_writable(csv_file)
@@ -169,12 +169,11 @@ def ablation(
     """
     if workers > 1 and not told["virtual"]:
         raise UsageError("--workers: runs in real time would slow each other down; it goes with --virtual")
-    from share.io.files import writable_dir
-    from share.io.session import read_session
-    from share.run.ablation import plan
-    from share.run.annex import annex
-    from share.run.campaign import side_by_side
-    from share.run.play import Terms
+    from share.files.writing import writable_dir
+    from share.lab.evaluate.campaign import plan, side_by_side
+    from share.lab.evaluate.play import Terms
+    from share.lab.evaluate.report import annex
+    from share.recordings.session import read_session
 
     policies = chosen or tuple(policy for policy in POLICIES if policy != "streamed")
     also = [annex(path, number) for number, path in enumerate(annexes, 1)]
@@ -190,13 +189,13 @@ def ablation(
 
 
 def _write(out: Path, trials: list[Trial], failed: list[str], also: list[Annex]) -> None:
-    from share.io.files import atomic_write
-    from share.io.images import read_picture
-    from share.io.page import page
-    from share.metrics.comparison import policies
-    from share.run.figures import figures
-    from share.run.pictures import draw
-    from share.run.report import agents_csv, markdown, runs_csv
+    from share.files.writing import atomic_write
+    from share.lab.evaluate.page import page
+    from share.lab.evaluate.pictures import draw
+    from share.lab.evaluate.report import agents_csv, markdown, runs_csv
+    from share.lab.evaluate.scoring import figures
+    from share.lab.evaluate.statistics import policies
+    from share.recordings.images import read_picture
 
     found = [figures(trial) for trial in trials]
     names = policies(found)

@@ -37,7 +37,7 @@ def generate(name: str | None, keys: str | None) -> None:
     \b
     Example:  share keys generate
     """
-    from share.io.keys import generate as make
+    from share.net.keys import generate as make
 
     folder = _folder(keys)
     pair = make(folder, name)
@@ -66,7 +66,7 @@ def authorize(name: str, public_key: str, agents: tuple[str, ...], keys: str | N
     Example:  share keys authorize ann ann.public
               share keys authorize headset1 headset1.public --agent ann
     """
-    from share.io import keys as store
+    from share.net import keys as store
 
     store.authorize(_folder(keys), name, store.public_key(public_key), agents)
 
@@ -80,7 +80,7 @@ def revoke(name: str, keys: str | None) -> None:
     \b
     Example:  share keys revoke ann
     """
-    from share.io.keys import revoke as drop
+    from share.net.keys import revoke as drop
 
     drop(_folder(keys), name)
 
@@ -94,7 +94,7 @@ def show(keys: str | None, as_json: bool) -> None:
     \b
     Example:  share keys list
     """
-    from share.io.keys import edge_keys
+    from share.net.keys import edge_keys
 
     folder = _folder(keys)
     found = edge_keys(folder)
@@ -111,6 +111,6 @@ def show(keys: str | None, as_json: bool) -> None:
 
 
 def _folder(given: str | None) -> Path:
-    from share.io.keys import default_folder
+    from share.net.keys import default_folder
 
     return default_folder() if given is None else Path(given)

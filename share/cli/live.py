@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from share.cli.progress import LiveLine
-from share.core.rate import Every
 from share.errors import UsageError
+from share.rates import Every
 
 if TYPE_CHECKING:
+    from share.cameras.feed import Feed
+    from share.cameras.realsense.streams import Wanted
     from share.config import Config
-    from share.estimator.result import TrackResult
-    from share.io.feed import Feed
-    from share.io.realsense.streams import Wanted
-    from share.io.source import Source
+    from share.odometry.result import TrackResult
+    from share.runtime.source import Source
 
 PROFILE = "d435i"
 
@@ -48,8 +48,8 @@ class Asked:
 
     def wanted(self) -> Wanted:
         """Raises ConfigError for an unknown profile or mode."""
-        from share.io.profile import profile
-        from share.io.realsense.streams import Wanted
+        from share.cameras.realsense.streams import Wanted
+        from share.sensors.profile import profile
 
         rgbd = self.sensors == "rgbd"
         return Wanted(profile(self.profile_name or PROFILE, self.mode), depth=rgbd, right=not rgbd)
@@ -84,16 +84,16 @@ def open_source(
 
     Raises UsageError, ConfigError, DataError, ShareError.
     """
-    from share.io.realsense.devices import is_camera
-    from share.io.source import open_source
+    from share.cameras.realsense.devices import is_camera
+    from share.runtime.source import open_source
 
     if not is_camera(source):
         camera.check_recording(source)
         return open_source(source, calib, frames)
     if frames is not None:
         raise UsageError("--frames: goes with a recording, not with a live camera")
-    from share.io.realsense.live import open_live
-    from share.io.source import calibration_of
+    from share.cameras.realsense.live import open_live
+    from share.runtime.source import calibration_of
 
     live = open_live(source, camera.wanted(), settings.sequencer, say, calibration_of(calib))
     click.get_current_context().with_resource(closing(live))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from share import process
+from share import startup
 
-process.prepare()  # before anything below can import numpy
+startup.prepare()  # before anything below can import numpy
 
 import contextlib  # noqa: E402
 import difflib  # noqa: E402

@@ -13,8 +13,8 @@ from share.errors import UsageError, one_line
 
 if TYPE_CHECKING:
     from share.config import Config
-    from share.io.calibration import Calibration
-    from share.io.source import Source
+    from share.recordings.calibration import Calibration
+    from share.runtime.source import Source
 
 calib = click.option(
     "--calib",
@@ -37,7 +37,7 @@ target = click.option(
 
 
 def _cores() -> int:
-    from share.io.machine import cores
+    from share.runtime.machine import cores
 
     return cores()
 
@@ -83,14 +83,14 @@ frames = click.option(
 def load_config(path: str | None) -> Config:
     """The settings of a YAML file, or the defaults. Raises ConfigError or UsageError."""
     from share.config import Config
-    from share.io.settings_file import read_settings
+    from share.files.yaml_file import read_settings
 
     return Config() if path is None else read_settings(Path(path))
 
 
 def agent_name(value: str) -> str:
     """A name that can be a file's, as Unicode composes it (NFC). Raises UsageError."""
-    from share.io.session import AGENT_NAME, is_agent_name
+    from share.recordings.session import AGENT_NAME, is_agent_name
 
     name = normalize("NFC", value)
     if not is_agent_name(name):
@@ -123,7 +123,7 @@ def say_losses(source: Source) -> None:
 
 def say_another(name: str, said: Calibration | None, serial: str | None) -> None:
     """That a calibration which was given is of another device, on stderr, if it is."""
-    from share.core.whose import of_another
+    from share.recordings.unit import of_another
 
     if said is not None and (wrong := of_another(said.serials, serial)):
         click.echo(f"share: {name}: {wrong}", err=True)

@@ -13,9 +13,9 @@ from share.cli.progress import LiveLine
 from share.errors import ShareError
 
 if TYPE_CHECKING:
-    from share.run.campaign import Planned, Workers
-    from share.run.play import Progress
-    from share.run.trial import Trial
+    from share.lab.evaluate.campaign import Planned, Workers
+    from share.lab.evaluate.play import Progress
+    from share.lab.evaluate.trial import Trial
 
 _MANY = (
     click.option("--seeds", type=click.IntRange(1), default=1, show_default=True, help="How many: 0, 1, …"),
@@ -42,7 +42,7 @@ def played(
     named: Callable[[Planned], str],
 ) -> dict[Path, Trial]:
     """By folder, in the order of `runs`, those that did not fail; the others are said."""
-    from share.run.campaign import go_through
+    from share.lab.evaluate.campaign import go_through
 
     live, done = LiveLine(), dict[Path, "Trial"]()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from share.cli.table import aligned
-from share.metrics.figures import AgentFigures, Conditions, RunFigures
+from share.lab.evaluate.figures import AgentFigures, Conditions, RunFigures
 
 _LATENCY = ("", "latency", "frames", "50 %", "95 %", "99 %", "> 20 ms")
 _CORRECTED = ("corrected", "50 %", "95 %", "99 %", "of")

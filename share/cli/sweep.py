@@ -14,8 +14,8 @@ from share.config import POLICIES
 from share.errors import UsageError
 
 if TYPE_CHECKING:
-    from share.run.sweep import Axis, Point
-    from share.run.trial import Trial
+    from share.lab.evaluate.sweep import Axis, Point
+    from share.lab.evaluate.trial import Trial
 
 _HEAT = ("AR latency", "AR ATE in the map", "merges a metre", "AR QoE")
 
@@ -62,12 +62,12 @@ def sweep(
     if (workers > 1 or scheduler) and not told["virtual"]:
         which = "--scheduler" if scheduler else "--workers"
         raise UsageError(f"{which}: runs in real time would slow each other down; it goes with --virtual")
-    from share.io.cluster import Cluster
-    from share.io.files import writable_dir
-    from share.io.session import read_session
-    from share.run.campaign import side_by_side
-    from share.run.play import Terms
-    from share.run.sweep import Axis, drawn, grid, planned
+    from share.files.writing import writable_dir
+    from share.lab.evaluate.campaign import side_by_side
+    from share.lab.evaluate.cluster import Cluster
+    from share.lab.evaluate.play import Terms
+    from share.lab.evaluate.sweep import Axis, drawn, grid, planned
+    from share.recordings.session import read_session
 
     axes = [Axis.parse(text) for text in said]
     points = grid(axes) if count is None else drawn(axes, count, seed=0)
@@ -84,12 +84,12 @@ def sweep(
 
 
 def _write(out: Path, axes: list[Axis], points: list[Point], trials: list[Trial]) -> None:
-    from share.io.charts import draw_heat
-    from share.io.files import atomic_write
-    from share.metrics.comparison import MEASURES
-    from share.run.figures import figures
-    from share.run.report import sweep_csv, sweep_markdown
-    from share.run.sweep import heat, table
+    from share.files.writing import atomic_write
+    from share.lab.evaluate.charts import draw_heat
+    from share.lab.evaluate.report import sweep_csv, sweep_markdown
+    from share.lab.evaluate.scoring import figures
+    from share.lab.evaluate.statistics import MEASURES
+    from share.lab.evaluate.sweep import heat, table
 
     runs = [figures(trial) for trial in trials]
     rows = table(axes, list(zip(points, runs, strict=True)))

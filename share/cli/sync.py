@@ -14,9 +14,9 @@ from share.cli.table import aligned
 from share.errors import ShareError, UsageError
 
 if TYPE_CHECKING:
-    from share.core.time_server import TimeServer
-    from share.io.udp import Host
-    from share.run.clocks import Row
+    from share.devices.clocks import Row
+    from share.devices.time_server import TimeServer
+    from share.net.udp import Host
 
 PORT = 11123  # NTP's own, 123, needs root
 
@@ -55,10 +55,9 @@ def server(bind: str, stratum: int) -> None:
     """
     from contextlib import closing
 
-    from share.core.time_server import TimeServer
-    from share.io.udp import Host, StampedSocket, clock_precision, parse_host
-    from share.run.stop import on_stop
-    from share.run.time_server import TimeServerRun
+    from share.devices.time_server import TimeServer, TimeServerRun
+    from share.net.udp import Host, StampedSocket, clock_precision, parse_host
+    from share.runtime.stop import on_stop
 
     host = parse_host(bind, PORT, bind=True)
     live = LiveLine()
@@ -74,8 +73,8 @@ def server(bind: str, stratum: int) -> None:
 
 
 def _introduce(at: Host, stratum: int, by_kernel: bool) -> None:
-    from share.io.chrony import follow
-    from share.io.udp import Host
+    from share.devices.chrony import follow
+    from share.net.udp import Host
 
     stamps = "by the kernel" if by_kernel else "by this program, which is less exact"
     click.echo(f"telling this machine's own time at {at} (UDP); arrivals are stamped {stamps}", err=True)
@@ -116,8 +115,8 @@ def check(hosts: tuple[str, ...], count: int, limit_ms: float, as_json: bool) ->
     \b
     Example:  share sync check 192.168.1.10 192.168.1.20:123
     """
-    from share.io.udp import parse_host
-    from share.run.clocks import of_chrony, of_servers
+    from share.devices.clocks import of_chrony, of_servers
+    from share.net.udp import parse_host
 
     asked = [parse_host(text, PORT) for text in hosts]
     if asked:
@@ -156,7 +155,7 @@ def _judge(rows: Sequence[Row], limit_ms: float) -> None:
 
 
 def _advise(host: Host) -> None:
-    from share.io.chrony import follow
+    from share.devices.chrony import follow
 
     click.echo(
         "to follow it: install chrony, put this at the end of /etc/chrony/chrony.conf, restart it:", err=True

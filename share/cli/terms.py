@@ -13,7 +13,7 @@ from share.errors import UsageError
 
 if TYPE_CHECKING:
     from share.config import Config
-    from share.io.session import Session
+    from share.recordings.session import Session
 
 _TERMS = (
     click.option(
@@ -35,7 +35,7 @@ _TERMS = (
 
 
 def on_terms(command: Callable[..., None]) -> Callable[..., None]:
-    """The options on which any run is played; by name as fields of `share.run.play.Terms`."""
+    """The options on which any run is played; by name as fields of `share.lab.evaluate.play.Terms`."""
     for option in reversed(_TERMS):
         command = option(command)
     return command
@@ -43,13 +43,13 @@ def on_terms(command: Callable[..., None]) -> Callable[..., None]:
 
 def settings(config_file: str | None, told: dict[str, Any], sessions: Sequence[Session]) -> Config:
     """What is wrong with them or with the terms is said before anything is played."""
-    from share.io.transport.links import Links
+    from share.net.emulated import Links
 
     config, links = options.load_config(config_file), Links.parse(told["link"])
     for session in sessions:
         links.check(session.agents)
     if told["costs"] is not None:
-        from share.run.costs import costs_of
+        from share.lab.evaluate.virtual import costs_of
 
         if not told["virtual"]:
             raise UsageError("--costs: in real time things take as long as they take; it goes with --virtual")

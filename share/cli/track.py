@@ -14,8 +14,8 @@ from share.errors import DataError, UsageError
 
 if TYPE_CHECKING:
     from share.config import Config
-    from share.io.source import Source
-    from share.run.track import TrackRun
+    from share.runtime.source import Source
+    from share.runtime.track import TrackRun
 
 _SOON_S = 1.0  # a first pose that needs no word
 
@@ -53,9 +53,9 @@ def track(
     """
     settings = options.load_config(config_file)
     named = {"--out": out, "--report": report_file}
-    from share.io.files import atomic_write
-    from share.io.trajectory import format_tum
-    from share.run.track import accuracy
+    from share.files.writing import atomic_write
+    from share.recordings.trajectory import format_tum
+    from share.runtime.track import accuracy
 
     line = LiveLine()
     opened = live.open_source(
@@ -84,7 +84,7 @@ def track(
 
 def _targets(named: dict[str, str | None], source: str) -> dict[str, Path]:
     """The files to write, by option. Raises UsageError if one cannot be, or would take another's place."""
-    from share.io.files import check_writable, is_special
+    from share.files.writing import check_writable, is_special
 
     wanted = {option: check_writable(Path(name)) for option, name in named.items() if name is not None}
     for option, path in wanted.items():
@@ -98,9 +98,9 @@ def _targets(named: dict[str, str | None], source: str) -> dict[str, Path]:
 
 def _tracked(opened: Source, settings: Config, line: LiveLine) -> TrackRun:
     """All of a recording, or of a camera until somebody ends it."""
-    from share.io.live import LiveSource
-    from share.run.stop import on_stop
-    from share.run.track import track
+    from share.cameras.live import LiveSource
+    from share.runtime.stop import on_stop
+    from share.runtime.track import track
 
     def say(text: str) -> None:
         line.say(f"share: {opened.name}: {text}")

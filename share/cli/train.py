@@ -65,9 +65,9 @@ def labels(
     Example:  share train labels rooms/* --runs 8 --out labels
     """
     config, live = options.load_config(config_file), LiveLine()
-    from share.io.files import writable_dir
-    from share.io.session import read_session
-    from share.run.labels import make, plan
+    from share.files.writing import writable_dir
+    from share.lab.train.labels import make, plan
+    from share.recordings.session import read_session
 
     jobs = plan([read_session(folder) for folder in sessions], runs, seed, not without_imu, out)
     writable_dir(out)
@@ -101,13 +101,13 @@ def fit(labels: Path, epochs: int, seed: int, base: Path | None, out: Path) -> N
               share train export fit --labels labels --out error_model.onnx
     """
     _need_extra()
-    from share.io.files import writable_dir
-    from share.io.network import deep_of, open_network, read_model
-    from share.train.fit import FitOptions
-    from share.train.fitted import write_fitted
-    from share.train.graph import backbone_id
-    from share.train.table import collect
-    from share.train.teach import teach
+    from share.files.writing import writable_dir
+    from share.lab.train.fit import FitOptions
+    from share.lab.train.fitted import write_fitted
+    from share.lab.train.graph import backbone_id
+    from share.lab.train.table import collect
+    from share.lab.train.teach import teach
+    from share.odometry.error_model.network import deep_of, open_network, read_model
 
     collection, live, taken = collect(labels, seed), LiveLine(), read_model(_base(base))
     writable_dir(out)
@@ -142,11 +142,11 @@ def export(fitted: Path, labels: Path, base: Path | None, out: Path) -> None:
     Example:  share train export fit --labels labels --out error_model.onnx
     """
     _need_extra()
-    from share.io.files import atomic_write, check_writable
-    from share.train.assembly import assemble
-    from share.train.card import card
-    from share.train.compare import of_network
-    from share.train.graph import origin
+    from share.files.writing import atomic_write, check_writable
+    from share.lab.train.assembly import assemble
+    from share.lab.train.card import card
+    from share.lab.train.compare import of_network
+    from share.lab.train.graph import origin
 
     check_writable(out)
     made = assemble(fitted, labels, _base(base))
@@ -178,9 +178,9 @@ def compare(labels: Path, fitted: Path, base: Path | None, as_json: bool) -> Non
     Example:  share train compare labels --fit fit
     """
     _need_extra()
-    from share.train.assembly import assemble
-    from share.train.compare import of_network, of_rivals
-    from share.train.score import table, to_json
+    from share.lab.train.assembly import assemble
+    from share.lab.train.compare import of_network, of_rivals
+    from share.lab.train.score import table, to_json
 
     live = LiveLine()
     live.write("pictures go through the backbone")
@@ -199,7 +199,7 @@ def compare(labels: Path, fitted: Path, base: Path | None, as_json: bool) -> Non
 
 
 def _base(given: Path | None) -> Path:
-    from share.io.network import SHIPPED
+    from share.odometry.error_model.network import SHIPPED
 
     if given is None and not SHIPPED.is_file():
         raise UsageError("--base: SHARE comes with no model yet; make a backbone with tools/make_backbone.py")

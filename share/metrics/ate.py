@@ -13,10 +13,8 @@ from typing import Literal
 
 import numpy as np
 
-from share.geometry.align import umeyama
-from share.geometry.se3 import inverse, transform
-from share.metrics.association import MAX_GAP_NS, Trajectory, associate, require
-from share.metrics.spread import Spread, spread
+from share.geometry.interpolation import MAX_GAP_NS, Trajectory, associate, require
+from share.geometry.se3 import inverse, transform, umeyama
 from share.types import F64
 
 Alignment = Literal["se3", "origin", "none"]
@@ -94,3 +92,28 @@ def _align(T_est: F64, T_truth: F64, alignment: Alignment) -> F64:
 
 def _ate(s: Spread, T: F64) -> Ate:
     return Ate(s.rmse, s.mean, s.median, s.max, s.n, T)
+
+
+# ---- How a set of errors is summed up.
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Of n errors, in their unit."""
+
+    rmse: float
+    mean: float
+    median: float
+    max: float
+    n: int
+
+
+def spread(errors: F64) -> Spread:
+    """Of errors (N,), N >= 1, none negative."""
+    return Spread(
+        rmse=float(np.sqrt(np.mean(errors**2))),
+        mean=float(errors.mean()),
+        median=float(np.median(errors)),
+        max=float(errors.max()),
+        n=len(errors),
+    )

@@ -10,9 +10,8 @@ from collections import deque
 
 import numpy as np
 
-from share.geometry.align import umeyama
-from share.geometry.se3 import transform
-from share.metrics.association import Trajectory, interpolate
+from share.geometry.interpolation import Trajectory, interpolate
+from share.geometry.se3 import transform, umeyama
 from share.types import F64
 
 WINDOW_S = 5.0

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.errors import DataError
+from share.geometry.interpolation import MAX_GAP_NS, Trajectory, associate
 from share.geometry.se3 import angle, inverse
-from share.metrics.association import MAX_GAP_NS, Trajectory, associate
-from share.metrics.spread import Spread, spread
+from share.metrics.ate import Spread, spread
 from share.types import F64, I64
 
 

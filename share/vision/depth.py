@@ -8,7 +8,7 @@ import numpy as np
 from share.geometry import se3
 from share.geometry.camera import Rig, rays
 from share.types import F32, F64, U8
-from share.vision import klt
+from share.vision import optical_flow
 
 EDGE = 0.05  # relative depth step within 3x3 px that marks an object's edge
 MIN_DEPTH, MAX_DEPTH = 0.2, 12.0  # m
@@ -87,12 +87,12 @@ def from_stereo(image0: U8, image1: U8, rig: Rig, px: F32, uv: F64, guess_m: F64
         guess = rig.cam1.project(se3.transform(rig.T_cam1_cam0, ray[todo] * z[:, None]))
         start = np.where(np.isnan(guess), px[todo], guess).astype(np.float32)
         levels = 1 if guess_m is not None and fallback == _FIRST else 2
-        right, found = klt.follow(
+        right, found = optical_flow.follow(
             image0, image1, px[todo], start, window=15, levels=levels, back_check_px=None
         )
         depth, error_px = _two_rays(rig, ray[todo], rig.cam1.normalise(right.astype(np.float64)))
         found &= (error_px < 1.5) & (depth > MIN_DEPTH) & (depth < MAX_DEPTH * 2)
-        found &= klt.resemblance(image0, image1, px[todo], right) > 0.8
+        found &= optical_flow.resemblance(image0, image1, px[todo], right) > 0.8
         out[todo[found]] = depth[found]
     return out
 

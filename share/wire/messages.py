@@ -212,7 +212,7 @@ class Pong:
 @dataclass(frozen=True, eq=False)
 class Tracked:
     """What a streamed frame came to: its index and stamp, and of the tracker's result what an agent uses
-    (`share.estimator.result`). T_odom_body (4, 4) where the state has a pose."""
+    (`share.odometry.result`). T_odom_body (4, 4) where the state has a pose."""
 
     index: int
     stamp_ns: int

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from share.calibration.allan import allan_deviation
 from share.errors import DataError
+from share.lab.calibrate.allan import allan_deviation
 
 
 def test_white_noise_falls_with_the_square_root_of_time(rng):

@@ -4,18 +4,15 @@ import cv2
 import numpy as np
 import pytest
 
-from share.calibration import bundle
-from share.calibration.bundle import View, calibrate
-from share.calibration.coverage import GRID as COVER_GRID
-from share.calibration.coverage import Coverage, choose, coverage
-from share.calibration.detect import Detection
-from share.calibration.epipolar import off_line, typical_miss
-from share.calibration.projection import camera_of, intrinsics, moved, names, project
-from share.calibration.start import enough
-from share.calibration.verdict import judge
 from share.geometry import se3
 from share.geometry.camera import Camera
-from share.geometry.target import AprilGrid, CharucoBoard
+from share.lab.calibrate import camera_bundle
+from share.lab.calibrate.camera_bundle import View, calibrate
+from share.lab.calibrate.camera_start import camera_of, enough, intrinsics, moved, names, project
+from share.lab.calibrate.camera_verdict import GRID as COVER_GRID
+from share.lab.calibrate.camera_verdict import Coverage, choose, coverage, judge, off_line, typical_miss
+from share.lab.calibrate.corners import Detection
+from share.lab.calibrate.target import AprilGrid, CharucoBoard
 from share.types import F64
 
 SIZE = (752, 480)
@@ -93,7 +90,7 @@ def test_without_noise_a_stereo_pair_is_found_exactly(rng: np.random.Generator) 
 
 
 def test_k3_is_taken_where_the_views_tell_it(rng: np.random.Generator) -> None:
-    def one_camera(pair: tuple[Camera, Camera]) -> bundle.State:
+    def one_camera(pair: tuple[Camera, Camera]) -> camera_bundle.State:
         views = [View(view.name, view.seen[:1]) for view in _views(rng, 0.1, 12, pair=pair)]
         solution = calibrate(views, GRID, SIZE)
         off = (intrinsics(solution.state.cameras[0]) - intrinsics(pair[0])) / solution.sigmas
@@ -130,7 +127,7 @@ def test_a_fisheye_pair_is_found(rng: np.random.Generator) -> None:
 def test_with_corners_of_one_weight_it_is_opencvs_solution(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bundle, "_HUBER", 1e6)  # OpenCV doubts no corner
+    monkeypatch.setattr(camera_bundle, "_HUBER", 1e6)  # OpenCV doubts no corner
     views = [View(v.name, v.seen[:1]) for v in _views(rng, 0.2)]
     solution = calibrate(views, GRID, SIZE)
     boards = [GRID.corners[v.seen[0].ids].astype(np.float32) for v in views]

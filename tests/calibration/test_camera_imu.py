@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from camera_imu_sim import GRAVITY, NOISE, SHIFT_S, START_NS, T_IMU_CAM0, TARGET, Dance, Recorded, record
 
-from share.calibration.camera_imu import normal
-from share.calibration.camera_imu.batch import Batch
-from share.calibration.camera_imu.fit import Fit, fit
-from share.calibration.camera_imu.sights import sights
-from share.calibration.camera_imu.solve import arrow, solve
-from share.calibration.camera_imu.spline import EDGE, ORDER, Curve
-from share.calibration.camera_imu.start import align
-from share.calibration.camera_imu.state import KNOTS, LOCAL, SHARED, State, nodes
-from share.calibration.camera_imu.verdict import compare, judge
-from share.calibration.projection import camera_of, intrinsics
 from share.errors import DataError, MisfitError
 from share.geometry import se3
+from share.lab.calibrate.camera_imu import normal
+from share.lab.calibrate.camera_imu.batch import Batch
+from share.lab.calibrate.camera_imu.fit import Fit, fit
+from share.lab.calibrate.camera_imu.sights import sights
+from share.lab.calibrate.camera_imu.solve import arrow, solve
+from share.lab.calibrate.camera_imu.spline import EDGE, ORDER, Curve
+from share.lab.calibrate.camera_imu.start import align
+from share.lab.calibrate.camera_imu.state import KNOTS, LOCAL, SHARED, State, nodes
+from share.lab.calibrate.camera_imu.verdict import compare, judge
+from share.lab.calibrate.camera_start import camera_of, intrinsics
 from share.types import F64
 
 SIGMAS = normal.Sigmas(0.1, 3e-3, 2e-2, huber=1e6)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from share.calibration.camera_imu.spline import EDGE, ORDER, Curve, blending
 from share.geometry import se3
+from share.lab.calibrate.camera_imu.spline import EDGE, ORDER, Curve, blending
 
 STEP = 0.05
 

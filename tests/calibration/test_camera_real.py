@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from share.calibration.bundle import View, calibrate
-from share.calibration.detect import detector
-from share.geometry.target import AprilGrid
-from share.io.calibration import read_euroc
+from share.lab.calibrate.camera_bundle import View, calibrate
+from share.lab.calibrate.corners import detector
+from share.lab.calibrate.target import AprilGrid
+from share.recordings.calibration import read_euroc
 
 
 @pytest.mark.slow

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from share.calibration.bundle import Solution, State
-from share.calibration.coverage import GRID, Coverage
-from share.calibration.verdict import judge
 from share.geometry.camera import Camera
+from share.lab.calibrate.camera_bundle import Solution, State
+from share.lab.calibrate.camera_verdict import GRID, Coverage, judge
 from share.types import F64
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, (0.0,) * 4)

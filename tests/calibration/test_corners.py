@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from share.calibration.corners import kept, lost, reach
+from share.lab.calibrate.corners import kept, lost, reach
 
 
 def test_where_a_lens_is_no_longer_of_its_model(rng: np.random.Generator) -> None:

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from share.calibration.detect import detector
-from share.geometry.target import AprilGrid, CharucoBoard, Target
+from share.lab.calibrate.corners import detector
+from share.lab.calibrate.target import AprilGrid, CharucoBoard, Target
+from share.lab.calibrate.target_sheet import darkness, ink
 from share.types import F64, U8
-from share.vision.target_picture import darkness, ink
 
 _TEXEL = 0.002  # m: tags of 44 px
 _MARGIN = 0.04

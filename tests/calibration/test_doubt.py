@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from share.calibration.doubt import jackknife, larger
+from share.lab.calibrate.camera_bundle import jackknife, larger
 
 
 def test_the_jackknife_of_a_mean_is_its_squared_standard_error(rng: np.random.Generator) -> None:

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from share.calibration.handeye import hand_eye
 from share.errors import DataError
 from share.geometry import se3
+from share.lab.calibrate.handeye import hand_eye
 
 X = se3.exp(np.array([0.4, -1.1, 2.0, 0.08, -0.05, 0.12]))
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from share.calibration.neighbours import by_neighbours
-from share.geometry.target import AprilGrid
+from share.lab.calibrate.corners import by_neighbours
+from share.lab.calibrate.target import AprilGrid
 from share.types import F64
 
 BOARD = AprilGrid().corners[:, :2]

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from share.calibration.allan import allan_deviation
-from share.calibration.noise import fit, together
-from share.calibration.scatter import scatter
 from share.errors import DataError
+from share.lab.calibrate.allan import allan_deviation, scatter
+from share.lab.calibrate.imu_noise import fit, together
 
 N, K = 3e-3, 4e-4  # white noise and walk cross at 13 s
 

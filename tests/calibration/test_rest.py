@@ -1,11 +1,10 @@
 import numpy as np
 import pytest
 
-from share.calibration.imu import characterise
-from share.calibration.rest import rest
-from share.emulate.sensor.imu import measured
 from share.errors import DataError
-from share.io.profile import profile
+from share.lab.calibrate.imu import characterise, rest
+from share.lab.emulate.sensor.imu import measured
+from share.sensors.profile import profile
 from share.types import ImuBatch
 
 RATE_HZ = 200.0

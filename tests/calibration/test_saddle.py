@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from share.calibration.saddle import is_saddle, refined
+from share.lab.calibrate.corners import is_saddle, refined
 from share.types import F64, U8
 
 RADII = np.full(3, 5)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from share.calibration.sheet import FOOT_MM, MARGIN_MM, sheet
+from share.lab.calibrate.target_sheet import FOOT_MM, MARGIN_MM, sheet
 
 
 def ends(made):

@@ -21,7 +21,7 @@ import pytest
 from recordings import make_euroc, make_tum
 from shell import Done
 
-from share.io.transport import bind
+from share.net.transport import bind
 from share.types import Keyframe
 from share.wire import messages as m
 from share.wire.codec import decode, encode

@@ -12,9 +12,8 @@ from shell import Done
 
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
-from share.geometry.target import CharucoBoard
-from share.io.calibration import read_calibration
-from share.io.kalibr import to_kalibr
+from share.lab.calibrate.target import CharucoBoard
+from share.recordings.calibration import read_calibration, to_kalibr
 
 K = np.array([[420, 0, 319.5], [0, 424, 241], [0, 0, 1]])
 

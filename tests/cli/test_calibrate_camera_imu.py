@@ -12,12 +12,11 @@ from board_pictures import printed
 from camera_imu_sim import NOISE, SHIFT_S, T_IMU_CAM0, Dance, record
 from shell import Done
 
-from share.calibration.projection import intrinsics, names
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
-from share.geometry.target import CharucoBoard
-from share.io.calibration import read_calibration
-from share.io.kalibr import to_kalibr
+from share.lab.calibrate.camera_start import intrinsics, names
+from share.lab.calibrate.target import CharucoBoard
+from share.recordings.calibration import read_calibration, to_kalibr
 
 SECONDS, HZ = 7.5, 8.0
 CAMERA = Camera(400, 300, 241.0, 241.0, 199.5, 150.0)

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from share.core.measurement import Measurement
-from share.emulate.sensor.imu import measured
-from share.io.calibration import imu_noise
-from share.io.mcap.recorder import Recorder
-from share.io.profile import profile
-from share.io.section import read_yaml
+from share.files.yaml_file import read_yaml
+from share.lab.emulate.sensor.imu import measured
+from share.recordings.calibration import imu_noise
+from share.recordings.mcap.recorder import Recorder
+from share.sensors.measurement import Measurement
+from share.sensors.profile import profile
 
 IMU = profile("euroc").device.imu
 

@@ -9,13 +9,13 @@ import pytest
 from field_sim import RATE_HZ, export
 from mocap_sim import BODY, NOISE, START_NS, TILT, Motion, record_imu, record_mocap, stamps
 
-from share.core.measurement import IMU, Measurement
+from share.files.yaml_file import read_yaml
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
-from share.io.mcap.recorder import Recorder
-from share.io.mocap_file import read_mocap
-from share.io.section import read_yaml
-from share.io.trajectory import Trajectory, format_tum
+from share.lab.mocap.files import read_mocap
+from share.recordings.mcap.recorder import Recorder
+from share.recordings.trajectory import Trajectory, format_tum
+from share.sensors.measurement import IMU, Measurement
 
 LATE_NS = 12_345_678
 CHAIN = f"""imu0:

@@ -12,7 +12,7 @@ import pytest
 from shell import Done
 from software_camera import BASELINE, T_GYRO_IR, SoftwareCamera
 
-from share.io.calibration import read_calibration
+from share.recordings.calibration import read_calibration
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 

@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from share.geometry.target import AprilGrid
-from share.io.target import read_target
+from share.lab.calibrate.target import AprilGrid, read_target
 
 
 def test_the_yaml_file_is_of_what_is_printed(share, tmp_path):

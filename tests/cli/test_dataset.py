@@ -10,8 +10,8 @@ import pytest
 from live import RIG, live
 from recordings import make_euroc, make_tum
 
-from share.io.kalibr import kalibr_texts
-from share.io.mcap.recorder import Recorder
+from share.recordings.calibration import kalibr_texts
+from share.recordings.mcap.recorder import Recorder
 
 
 def share(*arguments: object) -> subprocess.CompletedProcess:

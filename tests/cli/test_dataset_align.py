@@ -15,14 +15,14 @@ from field_sim import FIRST, Watched, export, export_motive, offset_of, paths, r
 from field_sim import RATE_HZ as MOCAP_HZ
 from small_session import RATE_HZ, small_profile, small_recipe
 
-from share.emulate.session import make_session
+from share.files.json_file import read_json
 from share.geometry import se3
-from share.io.json_file import read_json
-from share.io.mocap_report import read_mounting
-from share.io.session import read_session
-from share.io.source import open_source
-from share.io.trajectory import Trajectory, read_tum
+from share.lab.emulate.session import make_session
+from share.lab.mocap.report import read_mounting
 from share.metrics.ate import ate, joint_ate
+from share.recordings.session import read_session
+from share.recordings.trajectory import Trajectory, read_tum
+from share.runtime.source import open_source
 
 SECONDS = 12.0
 WATCHED = {

@@ -7,7 +7,7 @@ import pytest
 from map_changes import keyframe, small_map
 from test_dataset import bad, good, share
 
-from share.io.map_store import MapStore
+from share.store.map_store import MapStore
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from recordings import make_euroc
 from shell import Done
 from small_session import small_profile
 
-from share.emulate.types import START_NS
+from share.lab.emulate.types import START_NS
 
 SHARE = [sys.executable, "-m", "share"]
 QUICK = ["--scene", "plain", "--seconds", "3", "--workers", "1", "--effect", "blur=off"]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from share.cameras.feed import feed_report
 from share.cli.live import met, summary
-from share.core.intake import Intake
-from share.core.watchdog import Watchdog
-from share.io.feed_status import feed_report
+from share.sensors.intake import Intake
+from share.sensors.watchdog import Watchdog
 
 RATES = {"cam0": 30.0, "cam1": 30.0, "accel": 250.0, "gyro": 400.0}
 

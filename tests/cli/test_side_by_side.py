@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from share import __version__
-from share.peers import PEERS
+from share.lab.peers import PEERS
 
 SHARE = f"SHARE {__version__}"
 INTERPRETER = f"""#!{sys.executable}

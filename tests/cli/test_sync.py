@@ -19,9 +19,9 @@ from shell import Done
 from time_servers import shifted, udp
 
 from share.cli.agent import _clock
-from share.core.clock_claim import ClockClaim
-from share.run import time_check
-from share.wire.ntp import Mode, Packet
+from share.devices import time_client
+from share.net.ntp import Mode, Packet
+from share.protocol.edge_clock import ClockClaim
 
 SHARE = [sys.executable, "-m", "share"]
 Share = Callable[..., Done]
@@ -29,7 +29,7 @@ Share = Callable[..., Done]
 
 @pytest.fixture(autouse=True)
 def _brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(time_check, "PAUSE_S", 0.02)
+    monkeypatch.setattr(time_client, "PAUSE_S", 0.02)
 
 
 def asked(done: Done) -> dict[str, object]:
@@ -116,7 +116,7 @@ def test_nobody_at_that_port_is_said_at_once(share: Share) -> None:
 
 
 def test_who_does_not_answer_is_given_up_after_three(share: Share, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(time_check, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(time_client, "PATIENCE_S", 0.05)
     questions = []
     with udp(lambda data: questions.append(data) or []) as port:  # type: ignore[func-returns-value]
         done = share("sync", "check", f"127.0.0.1:{port}", "--count", 50)

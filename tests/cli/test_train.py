@@ -7,9 +7,9 @@ import shutil
 import numpy as np
 import pytest
 
-from share.evaluator.recent import RECENT
+from share.lab.train.labels import read_labels
 from share.metrics.local_error import LocalError
-from share.train.label_file import read_labels
+from share.odometry.error_model.features import RECENT
 
 
 @pytest.mark.slow
@@ -59,8 +59,8 @@ def test_without_a_truth_there_is_nothing_to_learn(share, plain_session, tmp_pat
 @pytest.mark.slow
 def test_labels_are_the_errors_of_the_run(share, plain_session, tmp_path):
     """As `share track` and the truth give them, frame by frame."""
-    from share.io.source import open_source
-    from share.io.trajectory import read_tum
+    from share.recordings.trajectory import read_tum
+    from share.runtime.source import open_source
 
     out = tmp_path / "labels"
     assert share("train", "labels", plain_session, "--runs", 1, "--out", out).code == 0

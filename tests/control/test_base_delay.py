@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from share.control.base_delay import BaseDelay
+from share.scheduling.policies import BaseDelay
 
 MINUTE = 60_000_000_000
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from share.config import ControlConfig
-from share.control.gate import Gate
+from share.scheduling.gate import Gate
 
 volumes = st.lists(st.floats(0, 1e3), max_size=40)
 

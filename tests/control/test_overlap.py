@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from share.config import ControlConfig
-from share.control.overlap import Frustum, Seen, ious, volumes
 from share.errors import ConfigError
 from share.geometry.camera import Camera
 from share.geometry.se3 import exp, transform
-from share.strict import from_mapping
+from share.plain_data import from_mapping
+from share.scheduling.overlap import Frustum, Seen, ious, volumes
 from share.types import F64
 
 WIDE = Frustum(math.radians(87), math.radians(58), 0.3, 5.0)

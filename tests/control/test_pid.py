@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from share.config import ControlConfig
-from share.control.pid import Gains, State, step
+from share.scheduling.pid import Gains, State, step
 
 GAINS = Gains(0.8, 0.15, 0.2, 0.25, integral_max_hz=0.1, rate_min_hz=0.5, rate_max_hz=10, gap_s=5)
 S = 1_000_000_000

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from share import config as settings
 from share.config import ControlConfig
-from share.control.policies import POLICIES, Policy
+from share.scheduling.policies import POLICIES, Policy
 from share.types import AgentKind
 
 S = 1_000_000_000

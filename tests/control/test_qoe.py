@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from share import config as settings
 from share.config import ControlConfig
-from share.control.qoe import Needs, accuracy, factors, qoe
 from share.errors import ConfigError
-from share.strict import to_mapping
+from share.plain_data import to_mapping
+from share.scheduling.qoe import Needs, accuracy, factors, qoe
 from share.types import AgentKind
 
 AR = Needs(AgentKind.AR, beta=0.01, gamma=0.5, theta_ms=20, target=0.9)

@@ -10,10 +10,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from hellos import hello_of
 
-from share.core import events as ev
-from share.core.agent import Agent
-from share.core.inorder import InOrder
 from share.geometry import se3
+from share.protocol import agent_events as ev
+from share.protocol.agent import Agent
+from share.protocol.peer import InOrder
 from share.types import Candidate, Correction, Keyframe, TrackState, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode

@@ -11,10 +11,10 @@ import pytest
 from model_edge import COV, HELLO, MS, UP, S, handle, tracked
 
 from share.config import AgentConfig, ClockConfig, Config
-from share.core import events as ev
-from share.core.agent import Agent
 from share.errors import UsageError
 from share.geometry import se3
+from share.protocol import agent_events as ev
+from share.protocol.agent import Agent
 from share.types import Candidate, Correction, Keyframe, TrackState, View
 from share.wire import messages as m
 from share.wire.codec import VERSION, decode, encode, size

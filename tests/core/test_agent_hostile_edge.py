@@ -9,9 +9,9 @@ from liar import Liar
 from model_edge import COV, HELLO, MS, ModelEdge, S, handle, tracked
 
 from share.config import Config
-from share.core import events as ev
-from share.core.agent import Agent
 from share.geometry import se3
+from share.protocol import agent_events as ev
+from share.protocol.agent import Agent
 from share.types import MAX_ID, MAX_STAMP_NS, Correction, Keyframe
 from share.wire import messages as m
 from share.wire.codec import decode, encode

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from model_edge import HELLO, MS, ModelEdge, Network, S, World, tracked
 
 from share.config import AgentConfig, Config
-from share.core import events as ev
-from share.core.agent import Agent
 from share.geometry import se3
+from share.protocol import agent_events as ev
+from share.protocol.agent import Agent
 from share.types import Keyframe
 
 FRAMES = 240  # 12 s at 20 Hz

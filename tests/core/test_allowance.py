@@ -10,11 +10,11 @@ import pytest
 from hellos import hello_of
 
 from share.config import Config
-from share.core.allowance import Allowance
-from share.core.edge import Edge
-from share.core.edge_events import Add, Received, Send
-from share.core.lookups import Lookups
-from share.core.turns import Turns
+from share.mapping.candidates import Lookups
+from share.protocol.admission import Allowance
+from share.protocol.edge import Edge
+from share.protocol.edge_events import Add, Received, Send
+from share.protocol.edge_records import Turns
 from share.types import AgentKind, Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode

@@ -1,6 +1,6 @@
 """Pauses before a process is started again."""
 
-from share.core.backoff import Backoff
+from share.rates import Backoff
 
 S = 1_000_000_000
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.core.channel import NETWORKS, Channel, Way
-from share.strict import from_mapping
+from share.net.channel import NETWORKS, Channel, Way
+from share.plain_data import from_mapping
 
 MS = 1_000_000
 

@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from share.core.checkup import State, boot, camera, host
-from share.core.checkup.calibration import calibration, device
-from share.core.checkup.camera import Sdk, UsbCamera
+from share.devices import camera_check, checks
+from share.devices import host as facts
+from share.devices.camera_check import Sdk, UsbCamera
+from share.devices.checks import State, calibration, device
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.geometry.se3 import inverse
-from share.io import host as facts
 
 
 @pytest.mark.parametrize(("mbit_s", "state"), [(480, "FAIL"), (5000, "OK"), (10000, "OK")])
 def test_a_link_is_usb_3_from_5000_mbit_on(mbit_s: float, state: str) -> None:
-    assert camera.link([UsbCamera("2-1", mbit_s)]).state.value == state
-    assert camera.link([]).state is camera.link(None).state is State.FAIL
+    assert camera_check.link([UsbCamera("2-1", mbit_s)]).state.value == state
+    assert camera_check.link([]).state is camera_check.link(None).state is State.FAIL
 
 
 @pytest.mark.parametrize(
@@ -28,20 +28,20 @@ def test_a_link_is_usb_3_from_5000_mbit_on(mbit_s: float, state: str) -> None:
 )
 def test_firmware_is_compared_by_numbers_not_letters(found: str, state: str) -> None:
     good = ["5.13.0.50", "5.16.0.1"]
-    told = camera.firmware(Sdk(firmware=(found,)), good, "5.12.0.0")
+    told = camera_check.firmware(Sdk(firmware=(found,)), good, "5.12.0.0")
     assert told.state.value == state
     assert any("librealsense2-utils" in line for line in told.mend) == (state != "OK")
 
 
 def test_nobody_is_told_to_go_back_to_an_older_firmware() -> None:
-    found = camera.firmware(Sdk(firmware=("5.17.0.10",)), ["5.9.0.1", "5.16.0.1", "5.13"], None)
+    found = camera_check.firmware(Sdk(firmware=("5.17.0.10",)), ["5.9.0.1", "5.16.0.1", "5.13"], None)
     assert (found.state, found.mend) == (State.OK, ())
     assert found.what.startswith("5.17.0.10, newer than those tried")
 
 
 def test_a_processor_for_which_there_is_no_poselib_is_told() -> None:
-    assert host.libraries({"numpy": None, "poselib": None}).what == "numpy, poselib load"
-    found = host.libraries({"numpy": None})
+    assert checks.libraries({"numpy": None, "poselib": None}).what == "numpy, poselib load"
+    found = checks.libraries({"numpy": None})
     assert (found.state, found.mend) == (State.OK, ())
     assert found.what.startswith("numpy load; no poselib for this processor")
 
@@ -49,19 +49,24 @@ def test_a_processor_for_which_there_is_no_poselib_is_told() -> None:
 def test_into_a_frozen_program_nothing_can_be_installed() -> None:
     for frozen in (False, True):
         mends = [
-            *camera.sdk(Sdk("no module pyrealsense2"), [], frozen).mend,
-            *host.libraries({"zmq": "no", "numpy": None}, frozen).mend,
+            *camera_check.sdk(Sdk("no module pyrealsense2"), [], frozen).mend,
+            *checks.libraries({"zmq": "no", "numpy": None}, frozen).mend,
         ]
         assert ["pip" in mend for mend in mends] == [not frozen] * 2
         assert ["tools/deploy" in mend for mend in mends] == [frozen] * 2
-    assert camera.sdk(Sdk("libusb-1.0.so.0: not there"), [], True).mend == ("sudo apt install libusb-1.0-0",)
+    assert camera_check.sdk(Sdk("libusb-1.0.so.0: not there"), [], True).mend == (
+        "sudo apt install libusb-1.0-0",
+    )
 
 
 def test_a_camera_that_is_plugged_in_must_be_one_that_the_sdk_sees() -> None:
     here, seen = UsbCamera("2-1", 5000), Sdk(firmware=("5.16.0.1",))
-    assert camera.sdk(seen, [here]).state is camera.sdk(Sdk(), []).state is State.OK
-    assert camera.sdk(seen, [here, here]).state is State.FAIL
-    unseen, closed = camera.sdk(Sdk(), [here]), camera.sdk(Sdk(), [UsbCamera("2-1", 5000, may_open=False)])
+    assert camera_check.sdk(seen, [here]).state is camera_check.sdk(Sdk(), []).state is State.OK
+    assert camera_check.sdk(seen, [here, here]).state is State.FAIL
+    unseen, closed = (
+        camera_check.sdk(Sdk(), [here]),
+        camera_check.sdk(Sdk(), [UsbCamera("2-1", 5000, may_open=False)]),
+    )
     assert unseen.state is closed.state is State.FAIL
     assert unseen.what == "loads, but sees 0 of 1 cameras: not permitted, or in use"
     assert closed.what == "loads, but sees 0 of 1 cameras: this user may not open 2-1"
@@ -69,17 +74,17 @@ def test_a_camera_that_is_plugged_in_must_be_one_that_the_sdk_sees() -> None:
 
 
 def test_what_cannot_be_seen_is_skipped() -> None:
-    found = [host.governor([], "performance"), host.throttling([]), camera.usb_memory(None, 128)]
-    found += [camera.firmware(Sdk("no"), [], None), camera.autosuspend([], False)]
+    found = [checks.governor([], "performance"), checks.throttling([]), camera_check.usb_memory(None, 128)]
+    found += [camera_check.firmware(Sdk("no"), [], None), camera_check.autosuspend([], False)]
     assert {one.state for one in found} == {State.SKIPPED}
 
 
 def test_the_host_is_held_against_the_profile() -> None:
-    assert host.governor(["performance"] * 4, "performance").state is State.OK
-    assert "1 of 2 cores" in host.governor(["performance", "powersave"], "performance").what
-    assert host.throttling([0, 3]).state is camera.usb_memory(16, 128).state is State.WARN
-    assert camera.usb_memory(128, 128).state is State.OK
-    assert camera.udev([], is_root=False).state is State.FAIL
+    assert checks.governor(["performance"] * 4, "performance").state is State.OK
+    assert "1 of 2 cores" in checks.governor(["performance", "powersave"], "performance").what
+    assert checks.throttling([0, 3]).state is camera_check.usb_memory(16, 128).state is State.WARN
+    assert camera_check.usb_memory(128, 128).state is State.OK
+    assert camera_check.udev([], is_root=False).state is State.FAIL
 
 
 @pytest.mark.parametrize(
@@ -93,46 +98,46 @@ def test_the_host_is_held_against_the_profile() -> None:
     ],
 )
 def test_a_raspberry_pi_tells_of_its_supply_and_of_heat(bits: int, what: str, mend: str) -> None:
-    found = host.throttling([], bits)
+    found = checks.throttling([], bits)
     assert found.state is (State.WARN if bits else State.OK)
     assert found.what.startswith(what)
     assert all(mend in line for line in found.mend) and bool(found.mend) == bool(bits)
-    assert len(host.throttling([], bits | 0x90000).mend) == 2  # each has a remedy of its own
+    assert len(checks.throttling([], bits | 0x90000).mend) == 2  # each has a remedy of its own
 
 
 def test_an_edge_without_keys_or_agents_serves_its_own_machine_only() -> None:
-    assert (host.no_edge_keys("k").state, host.no_edge_keys("k").mend) == (
+    assert (checks.no_edge_keys("k").state, checks.no_edge_keys("k").mend) == (
         State.WARN,
         ("share keys generate",),
     )
-    assert host.edge_keys("edge", []).state is State.WARN
-    assert host.edge_keys("edge", ["ann", "bob"]).what == "edge; lets in: ann, bob"
+    assert checks.edge_keys("edge", []).state is State.WARN
+    assert checks.edge_keys("edge", ["ann", "bob"]).what == "edge; lets in: ann, bob"
 
 
 def test_what_mends_the_host_outlives_a_start() -> None:
-    lines, mend = boot.lines("performance", 128), boot.mend("performance", 128)
+    lines, mend = checks.lines("performance", 128), checks.mend("performance", 128)
     assert [line.split()[-1] for line in lines] == ["performance", "128"]
     assert all(f"'{line}'" in mend[0] for line in lines)
-    assert boot.FILE in mend[0] and boot.FILE in mend[1]
-    assert boot.lines("", 0) == ()
-    asleep = camera.autosuspend([UsbCamera("2-1", 5000, "auto")], allowed=False)
+    assert checks.FILE in mend[0] and checks.FILE in mend[1]
+    assert checks.lines("", 0) == ()
+    asleep = camera_check.autosuspend([UsbCamera("2-1", 5000, "auto")], allowed=False)
     assert any('ATTR{power/control}="on"' in line and "rules.d" in line for line in asleep.mend)
 
 
 @pytest.mark.parametrize(("minutes", "state"), [(4, "FAIL"), (6, "WARN"), (61, "OK")])
 def test_a_disk_is_told_in_minutes(minutes: int, state: str) -> None:
-    assert host.disk("/", minutes * 60 * 10_000_000, 1e7).state.value == state
+    assert checks.disk("/", minutes * 60 * 10_000_000, 1e7).state.value == state
 
 
 def test_a_disk_that_may_not_be_written_to_is_of_no_use() -> None:
-    found = host.disk("/data", 10**12, 1e7, may_write=False)
+    found = checks.disk("/data", 10**12, 1e7, may_write=False)
     assert (found.state, found.what) == (State.FAIL, "/data: this user may not write there")
 
 
 @pytest.mark.parametrize(("offset", "state"), [(0.5, State.OK), (-0.5, State.OK), (0.8, State.WARN)])
 def test_the_clock_counts_with_its_uncertainty(offset: float, state: State) -> None:
-    assert host.clock((offset, 0.3), None).state is state
-    assert host.clock(None, None).state is State.WARN
+    assert checks.clock((offset, 0.3), None).state is state
+    assert checks.clock(None, None).state is State.WARN
 
 
 def test_an_inverted_extrinsic_is_told_from_one_that_is_elsewhere() -> None:
@@ -193,16 +198,21 @@ def test_facts_are_read_from_a_tree(tmp_path: Path) -> None:
         (usb / name).write_text(text + "\n")
     assert facts.cameras(tmp_path) == [UsbCamera("2-1", 480.0, "auto", may_open=False, may_start_imu=None)]
     (usb / "speed").write_text("unknown\n")  # on its way out
-    assert camera.link(facts.cameras(tmp_path)).state is State.FAIL
+    assert camera_check.link(facts.cameras(tmp_path)).state is State.FAIL
     (usb / "speed").write_text("480\n")
     node = tmp_path / "dev/bus/usb/002/013"
     node.parent.mkdir(parents=True)
     node.touch()
     assert facts.cameras(tmp_path) == [UsbCamera("2-1", 480.0, "auto", may_open=True, may_start_imu=None)]
-    for told in ([], [f"# {rule}" for rule in camera.RULES], camera.RULES[:1], camera.RULES[1:2]):
+    for told in (
+        [],
+        [f"# {rule}" for rule in camera_check.RULES],
+        camera_check.RULES[:1],
+        camera_check.RULES[1:2],
+    ):
         (rules / "9.rules").write_text("\n".join(told))
         assert facts.camera_rules(tmp_path) == []  # the IMU as well as the camera
-    (rules / "9.rules").write_text("\n".join(camera.RULES))
+    (rules / "9.rules").write_text("\n".join(camera_check.RULES))
     assert facts.camera_rules(tmp_path) == ["/etc/udev/rules.d/9.rules"]
 
 
@@ -218,11 +228,13 @@ def test_the_imu_is_started_by_files_that_we_must_be_able_to_write(
         (switches / name).write_text("0\n")
     shut: set[str] = set()
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name not in shut)  # root may anything
-    assert camera.imu(facts.cameras(tmp_path) or ()).state is State.OK
+    assert camera_check.imu(facts.cameras(tmp_path) or ()).state is State.OK
     shut.add("in_accel_x_en")
-    found = camera.imu(facts.cameras(tmp_path) or ())
+    found = camera_check.imu(facts.cameras(tmp_path) or ())
     assert found.state is State.FAIL
-    assert [rule for rule in camera.RULES if not any(f"echo '{rule}'" in line for line in found.mend)] == []
+    assert [
+        rule for rule in camera_check.RULES if not any(f"echo '{rule}'" in line for line in found.mend)
+    ] == []
     (switches / "in_accel_x_en").unlink()
-    assert camera.imu(facts.cameras(tmp_path) or ()).state is State.WARN
-    assert camera.imu([]).state is State.SKIPPED
+    assert camera_check.imu(facts.cameras(tmp_path) or ()).state is State.WARN
+    assert camera_check.imu([]).state is State.SKIPPED

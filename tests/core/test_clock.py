@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from share.config import ClockConfig
-from share.core.clock import ClockFilter
+from share.protocol.edge_clock import ClockFilter
 
 S = 1_000_000_000
 US = 1_000

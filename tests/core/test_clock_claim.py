@@ -6,8 +6,7 @@ import pytest
 from test_clock import US, S, World, run
 
 from share.config import ClockConfig
-from share.core.clock import ClockFilter
-from share.core.clock_claim import ClockClaim
+from share.protocol.edge_clock import ClockClaim, ClockFilter
 
 MS = 1000 * US
 END = 120 * S

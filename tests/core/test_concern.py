@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from share.core.concern import Concern
 from share.geometry import se3
+from share.mapping.corrections import Concern
 from share.types import Correction
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from model_edge import EMPTY, MS, UP, S
 
-from share.core.drift import Drift
 from share.geometry import se3
+from share.protocol.agent_status import Drift
 from share.types import Keyframe
 
 COV = np.diag([1e-6, 1e-6, 1e-6, 4e-6, 4e-6, 4e-6])

@@ -12,14 +12,14 @@ from edge_sim import MS, ModelRun, Person, Town, walls
 from hellos import hello_of
 
 from share.config import AgentNeeds, Config, ControlConfig, EdgeConfig, GraphConfig
-from share.core import edge_events as ed
-from share.core import events as ev
-from share.core.edge import Edge
-from share.core.mapper import Mapper
-from share.core.steps import Query, Solve, Verify
 from share.geometry import se3
-from share.graph.solver import Solver
-from share.place.verify import Refusal, Verified
+from share.mapping.graph.solver import Solver
+from share.mapping.mapper import Mapper
+from share.mapping.recognition.verification import Refusal, Verified
+from share.mapping.steps import Query, Solve, Verify
+from share.protocol import agent_events as ev
+from share.protocol import edge_events as ed
+from share.protocol.edge import Edge
 from share.types import AgentKind
 from share.wire import messages as m
 from share.wire.codec import decode, encode

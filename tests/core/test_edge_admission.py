@@ -10,13 +10,13 @@ import pytest
 from hellos import hello_of
 
 from share.config import Config
-from share.core import edge_events as ed
-from share.core.admission import Newcomers
-from share.core.edge import Edge
-from share.core.edge_events import Keep
-from share.core.keeping import KeepKeyframe, KeepRun
-from share.core.peer import Foot, Known
-from share.core.tracking_edge import Room, TrackingEdge
+from share.mapping.changes import KeepKeyframe, KeepRun
+from share.protocol import edge_events as ed
+from share.protocol.admission import Newcomers
+from share.protocol.edge import Edge
+from share.protocol.edge_events import Keep
+from share.protocol.peer import Foot, Known
+from share.protocol.remote_tracking import Room, TrackingEdge
 from share.types import AgentKind, Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode

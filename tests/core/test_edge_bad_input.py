@@ -10,15 +10,15 @@ from edge_sim import Person, Town, walls
 from hellos import hello_of
 
 from share.config import Config, EdgeConfig
-from share.core import edge_events as ed
-from share.core import events as ev
-from share.core.agent import Agent
-from share.core.edge import Edge
-from share.core.mapper import Mapper
-from share.core.peer import Foot, Known
-from share.core.steps import Query
 from share.errors import WireError
 from share.geometry import se3
+from share.mapping.mapper import Mapper
+from share.mapping.steps import Query
+from share.protocol import agent_events as ev
+from share.protocol import edge_events as ed
+from share.protocol.agent import Agent
+from share.protocol.edge import Edge
+from share.protocol.peer import Foot, Known
 from share.types import Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode

@@ -10,11 +10,11 @@ import pytest
 from hellos import hello_of
 
 from share.config import Config
-from share.core import edge_events as ed
-from share.core.edge import Edge
-from share.core.keeping import KeepVoice
-from share.core.peer import Foot, Known
+from share.mapping.changes import KeepVoice
 from share.names import checked_name
+from share.protocol import edge_events as ed
+from share.protocol.edge import Edge
+from share.protocol.peer import Foot, Known
 from share.types import Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode

@@ -9,11 +9,11 @@ import pytest
 from hellos import hello_of
 
 from share.config import Config
-from share.core import edge_events as ed
-from share.core.edge import Edge
-from share.core.keeping import KeepKeyframe, KeepRun
-from share.core.peer import Foot, Known
 from share.geometry import se3
+from share.mapping.changes import KeepKeyframe, KeepRun
+from share.protocol import edge_events as ed
+from share.protocol.edge import Edge
+from share.protocol.peer import Foot, Known
 from share.types import F64, Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode
@@ -195,7 +195,7 @@ def test_a_runs_number_is_not_shared_by_two_names() -> None:
 
 def test_what_waits_for_the_disk_is_bounded(monkeypatch) -> None:
     """An agent that does not wait for acknowledgements is not taken in beyond a bound, and loses nothing."""
-    monkeypatch.setattr("share.core.peer._MAX_UNSAFE", 5)
+    monkeypatch.setattr("share.protocol.peer._MAX_UNSAFE", 5)
     edge = Edge(Config(), 7, keeps=True)
     tell(edge, HELLO)
     keeps = [keep for k in range(20) for keep in of(tell(edge, keyframe(k, k - 1)), ed.Keep)]

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from share.core.exchange import Exchange
+from share.protocol.edge_clock import Exchange
 
 SPANS = st.integers(0, 10**10)
 

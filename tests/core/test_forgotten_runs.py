@@ -10,14 +10,14 @@ import numpy as np
 from hellos import hello_of
 
 from share.config import Config
-from share.core import edge_events as ed
-from share.core.edge import Edge
-from share.core.keeping import ForgetRun, Retire
-from share.core.mapper import Mapper
-from share.core.peer import known_runs
 from share.geometry import se3
-from share.io.map_store import MapStore
-from share.merge.join import Key, Loop
+from share.mapping.changes import ForgetRun, Retire
+from share.mapping.loops import Key, Loop
+from share.mapping.mapper import Mapper
+from share.protocol import edge_events as ed
+from share.protocol.edge import Edge
+from share.protocol.peer import known_runs
+from share.store.map_store import MapStore
 from share.types import F64, Keyframe, View
 from share.wire import messages as m
 from share.wire.codec import decode, encode

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from share.config import ControlConfig
-from share.core.history import History
-from share.core.schedule import Schedule
+from share.rates import History
+from share.scheduling.policies import Schedule
 from share.types import AgentKind
 from share.wire.messages import Evaluation
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from share.config import SequencerConfig
-from share.core.imu_check import ImuCheck, ImuRange
-from share.core.measurement import Measurement
-from share.core.sequencer import SequencerCounters, sequence
+from share.sensors.imu_check import ImuCheck, ImuRange
+from share.sensors.measurement import Measurement
+from share.sensors.sequencer import SequencerCounters, sequence
 
 STEP = 5_000_000
 MOTION = Path(__file__).parents[3] / "shared" / "data" / "motion"

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from share.core.inertial_join import InertialJoin
+from share.sensors.intake import InertialJoin
 
 GAP = 20
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.core.inorder import InOrder
+from share.protocol.peer import InOrder
 from share.types import Keyframe, View
 from share.wire.messages import MAX_HELD, Ack
 

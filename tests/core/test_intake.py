@@ -7,9 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from share.core.gaps import Gaps
-from share.core.intake import Intake, Sample
-from share.core.stamps import WRAP_NS
+from share.sensors.intake import Intake, Sample
+from share.sensors.stamps import WRAP_NS, Gaps
 
 MS = 10**6
 RATES = {"cam0": 30.0, "accel": 250.0, "gyro": 400.0}

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from share.config import InertialConfig
-from share.core.known_bias import POWER_ON_ACCEL, POWER_ON_GYRO, aged
 from share.geometry.camera import ImuBias, ImuNoise
+from share.sensors.imu_memory import POWER_ON_ACCEL, POWER_ON_GYRO, aged
 
 CONFIG = InertialConfig()
 BMI055 = ImuNoise(2.44e-4, 1.47e-3, 1.0e-5, 1.5e-4, 400.0)

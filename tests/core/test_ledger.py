@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from share.config import AgentConfig, LinkConfig
-from share.core.chain import Chain
-from share.core.ledger import Entry, Ledger
 from share.geometry import se3
+from share.protocol.agent_ledger import Chain, Entry, Ledger
 from share.types import Candidate, View
 from share.wire.messages import Ack, Welcome
 

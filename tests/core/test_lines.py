@@ -1,6 +1,6 @@
 """Lines that a peer causes are few."""
 
-from share.core.lines import Lasting
+from share.protocol.edge_trust import Lasting
 
 S = 10**9
 

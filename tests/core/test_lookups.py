@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 from share.config import EdgeConfig
-from share.core.lookups import Lookups
+from share.mapping.candidates import Lookups
 from share.types import AgentKind
 
 AR, ROBOT = AgentKind.AR, AgentKind.ROBOT

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from share.config import AgentConfig
-from share.core.map_frame import MapFrame
 from share.geometry import se3
+from share.protocol.localisation import MapFrame
 from share.types import Correction
 
 

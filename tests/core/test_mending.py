@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 from map_changes import ANN, BOB, kept_keyframe, pose
 
-from share.core.keeping import KeepLink
-from share.core.mending import mended
 from share.geometry import se3
-from share.merge.join import Key
+from share.mapping.changes import KeepLink
+from share.mapping.loops import Key
+from share.mapping.repair import mended
 
 
 def test_nothing_to_mend():

@@ -10,10 +10,10 @@ from edge_sim import Person, walls
 from test_world import MS, seen
 
 from share.config import Config, EdgeConfig
-from share.core.channel import NETWORKS
-from share.core.modelled import ModelledMapper, Odds, Truth
-from share.core.world import Costs, World
 from share.geometry import se3
+from share.lab.evaluate.modelled_mapper import ModelledMapper, Odds, Truth
+from share.lab.evaluate.world import Costs, World
+from share.net.channel import NETWORKS
 
 ROOM = walls(1)
 SECONDS = 6.0

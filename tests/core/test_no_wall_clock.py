@@ -4,19 +4,21 @@ import ast
 from pathlib import Path
 
 SHARE = Path(__file__).resolve().parents[2] / "share"
-LIVE = ("core", "control", "estimator", "graph", "io", "merge", "place", "run", "vision", "wire")
+LIVE = (
+    *("cameras", "devices", "files", "mapping", "net", "odometry", "protocol", "recordings"),
+    *("runtime", "scheduling", "sensors", "store", "vision", "wire"),
+)
 WALL = {"time.time", "time.time_ns", "time.localtime", "time.gmtime", "time.ctime", "datetime.now"}
 WALL |= {"datetime.utcnow", "datetime.today", "date.today", "datetime.datetime.now", "time.clock_settime"}
 WALL |= {"time.CLOCK_REALTIME"}
 
 # What the wall clock is for: to compare it between machines (`share sync`), and a date for a person.
 ALLOWED = {
-    "io/udp.py": {"time.time_ns"},  # of `share sync`: stamps of datagrams
-    "run/time_check.py": {"time.time_ns"},
-    "run/time_server.py": {"time.time_ns"},
-    "run/imu_memory.py": {"time.time_ns", "time.gmtime"},  # how old the bias of an earlier run is
-    "run/doctor.py": {"time.time"},  # how old a calibration's file is
-    "run/trial.py": {"datetime.now"},  # when an evaluation was made
+    "net/udp.py": {"time.time_ns"},  # of `share sync`: stamps of datagrams
+    "devices/time_client.py": {"time.time_ns"},
+    "devices/time_server.py": {"time.time_ns"},
+    "runtime/imu_memory.py": {"time.time_ns", "time.gmtime"},  # how old the bias of an earlier run is
+    "runtime/doctor.py": {"time.time"},  # how old a calibration's file is
 }
 
 

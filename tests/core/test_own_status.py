@@ -8,8 +8,8 @@ from dataclasses import replace
 from model_edge import HELLO, MS, S, tracked
 
 from share.config import Config
-from share.core import events as ev
-from share.core.agent import Agent
+from share.protocol import agent_events as ev
+from share.protocol.agent import Agent
 from share.types import TrackState, Wait
 from share.wire import messages as m
 from share.wire.codec import decode, encode

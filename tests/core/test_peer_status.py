@@ -7,10 +7,9 @@ from hellos import hello_of
 from model_edge import MS, S
 
 from share.config import Config
-from share.core.edge import Edge
-from share.core.edge_events import Received, Tick
-from share.core.peer import Foot, Known
-from share.core.peer_status import PeerStatus
+from share.protocol.edge import Edge
+from share.protocol.edge_events import Received, Tick
+from share.protocol.peer import Foot, Known, PeerStatus
 from share.types import TrackState
 from share.wire import messages as wire
 from share.wire.codec import encode

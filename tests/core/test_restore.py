@@ -10,12 +10,12 @@ import pytest
 from edge_sim import Person, walls
 
 from share.config import Config
-from share.core.keeping import Change, KeepKeyframe, KeepRun, Kept
-from share.core.mapper import Mapper
-from share.core.peer import known_runs
 from share.geometry import se3
-from share.graph.solver import Solver
-from share.io.map_store import MapStore
+from share.mapping.changes import Change, KeepKeyframe, KeepRun, Kept
+from share.mapping.graph.solver import Solver
+from share.mapping.mapper import Mapper
+from share.protocol.peer import known_runs
+from share.store.map_store import MapStore
 from share.types import AgentKind, Keyframe
 
 ROOM = walls(1)

@@ -11,11 +11,11 @@ import pytest
 from edge_sim import Person, walls
 
 from share.config import Config
-from share.core.keeping import Change, KeepKeyframe, KeepRun, Kept, with_keys
-from share.core.mapper import Mapper
 from share.geometry import se3
-from share.graph.solver import Solver
-from share.io.map_store import MapStore
+from share.mapping.changes import Change, KeepKeyframe, KeepRun, Kept, with_keys
+from share.mapping.graph.solver import Solver
+from share.mapping.mapper import Mapper
+from share.store.map_store import MapStore
 from share.types import Keyframe, View
 
 ROOM = walls(1)

@@ -7,12 +7,12 @@ import pytest
 from hellos import hello_of, rig_of
 
 from share.config import Config, ControlConfig, EdgeConfig
-from share.control.policies import POLICIES
-from share.control.qoe import Needs, qoe
-from share.core import edge_events as ed
-from share.core.edge import Edge
-from share.core.gating import Gating
 from share.geometry import se3
+from share.protocol import edge_events as ed
+from share.protocol.edge import Edge
+from share.scheduling.gate import Gating
+from share.scheduling.policies import POLICIES
+from share.scheduling.qoe import Needs, qoe
 from share.types import AgentKind
 from share.wire import messages as m
 from share.wire.codec import decode, encode

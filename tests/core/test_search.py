@@ -1,7 +1,7 @@
 """How many candidates are tried, while nobody waits and while somebody does."""
 
 from share.config import Config
-from share.core.search import Effort, Search
+from share.mapping.candidates import Effort, Search
 
 EFFORT = Effort(enough=3, hurried=2)
 

@@ -9,9 +9,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from share.config import SequencerConfig
-from share.core.measurement import Measurement
-from share.core.sequencer import SequencerCounters, _Merger, sequence
-from share.core.stamps import WRAP_NS
+from share.sensors.measurement import Measurement
+from share.sensors.sequencer import SequencerCounters, _Merger, sequence
+from share.sensors.stamps import WRAP_NS
 
 MS = 1_000_000
 RATE = 20.0

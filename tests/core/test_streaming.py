@@ -10,15 +10,15 @@ import pytest
 from hellos import NOISE, hello_of, rig_of
 
 from share.config import Config, EdgeConfig, StreamConfig
-from share.core import edge_events as ed
-from share.core import events as ev
-from share.core.agent import Agent
-from share.core.edge import Edge
-from share.core.streaming import Streaming
-from share.core.tracking_edge import Room, TrackingEdge
 from share.errors import UsageError
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
+from share.protocol import agent_events as ev
+from share.protocol import edge_events as ed
+from share.protocol.agent import Agent
+from share.protocol.edge import Edge
+from share.protocol.remote_tracking import Room, TrackingEdge
+from share.protocol.streaming import Streaming
 from share.types import F64, Frame, ImuBatch, TrackState
 from share.wire import messages as m
 from share.wire.codec import decode, encode

@@ -6,8 +6,8 @@ import re
 
 from model_edge import S
 
-from share.core.records import Records
-from share.core.throttle import Throttle
+from share.protocol.edge_records import Records
+from share.rates import Throttle
 
 
 def test_a_burst_then_so_many_a_second_and_the_rest_is_counted() -> None:

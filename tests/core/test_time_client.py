@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from share.core.exchange import Exchange
-from share.core.time_client import Answer, KissError, estimate, read, request
-from share.wire.ntp import Mode, Packet, to_stamp
+from share.devices.time_client import Answer, KissError, estimate, read, request
+from share.net.ntp import Mode, Packet, to_stamp
+from share.protocol.edge_clock import Exchange
 
 MS = 1_000_000
 S = 1000 * MS

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from share.core.time_server import BURST, CLIENTS, PER_S, TimeServer
-from share.wire.ntp import Mode, Packet, to_stamp
+from share.devices.time_server import BURST, CLIENTS, PER_S, TimeServer
+from share.net.ntp import Mode, Packet, to_stamp
 
 S = 1_000_000_000
 NOW = 1_795_446_605 * S

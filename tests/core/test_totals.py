@@ -7,11 +7,11 @@ from typing import Any
 from hellos import hello_of
 
 from share.config import Config
-from share.core.edge import Edge
-from share.core.edge_events import Join, Received
-from share.core.mapper import Mapper
-from share.core.totals import Totals
-from share.run import status_metrics
+from share.mapping.mapper import Mapper
+from share.protocol.edge import Edge
+from share.protocol.edge_events import Join, Received
+from share.protocol.edge_records import Totals
+from share.runtime import status_metrics
 from share.wire import messages as m
 from share.wire.codec import encode
 

@@ -12,12 +12,12 @@ from hellos import hello_of
 from recorded_traffic import VERSIONS, Message, traffic
 
 from share.config import Config, EdgeConfig
-from share.core import edge_events as ed
-from share.core import events as ev
-from share.core.agent import Agent
-from share.core.edge import Edge
-from share.core.tracking_edge import TrackingEdge
 from share.errors import VersionError
+from share.protocol import agent_events as ev
+from share.protocol import edge_events as ed
+from share.protocol.agent import Agent
+from share.protocol.edge import Edge
+from share.protocol.remote_tracking import TrackingEdge
 from share.types import TrackState
 from share.wire import messages as m
 from share.wire.codec import VERSION, decode, encode

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from share.core.watchdog import Action, Health, Watchdog
+from share.sensors.watchdog import Action, Health, Watchdog
 
 MS = 10**6
 IMU = ("accel", "gyro")

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from share.core.whose import as_read, of_another, unused
 from share.geometry.camera import Camera, ImuNoise, Rig
 from share.geometry.se3 import compose
+from share.recordings.unit import as_read, of_another, unused
 
 LENS = Camera(640, 480, 385.0, 385.0, 320.0, 240.0)
 STEREO = Rig(LENS, np.eye(4), cam1=LENS, T_cam1_cam0=compose(np.eye(3), np.array([-0.05, 0, 0])))

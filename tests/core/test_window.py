@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from share.core.window import Window
+from share.protocol.streaming import Window
 from share.types import Frame, ImuBatch
 from share.wire.messages import MAX_SAMPLES
 

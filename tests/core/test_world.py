@@ -9,9 +9,9 @@ import pytest
 from edge_sim import Person, walls
 
 from share.config import Config, EdgeConfig
-from share.core.channel import NETWORKS
-from share.core.world import Cost, Costs, Seen, World
 from share.geometry import se3
+from share.lab.evaluate.world import Cost, Costs, Seen, World
+from share.net.channel import NETWORKS
 from share.types import Candidate
 
 MS = 1_000_000

@@ -4,15 +4,15 @@ IMU are calibrated from corners that are projected, not drawn."""
 import numpy as np
 import pytest
 
-from share.calibration.bundle import View
-from share.calibration.camera_imu.fit import fit
-from share.calibration.camera_imu.verdict import judge
-from share.calibration.detect import Detection
-from share.emulate.motion.plan import plan
-from share.emulate.sensor.device import Device
-from share.emulate.world.scenes import layout
 from share.geometry import se3
-from share.io.profile import profile
+from share.lab.calibrate.camera_bundle import View
+from share.lab.calibrate.camera_imu.fit import fit
+from share.lab.calibrate.camera_imu.verdict import judge
+from share.lab.calibrate.corners import Detection
+from share.lab.emulate.motion.plan import plan
+from share.lab.emulate.sensor.device import Device
+from share.lab.emulate.world.scenes import layout
+from share.sensors.profile import profile
 from share.types import F64
 
 SECONDS, SHIFT_S, NOISE_PX = 30.0, 0.005, 0.06

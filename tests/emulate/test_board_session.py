@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from share.emulate.motion.plan import plan
-from share.emulate.recipe import Recipe
-from share.emulate.render.context import missing
-from share.emulate.sensor.effects import parse
-from share.emulate.session import make_session
-from share.emulate.world.scenes import layout
 from share.geometry import se3
-from share.io.source import open_source
-from share.io.target import session_target
+from share.lab.calibrate.target import session_target
+from share.lab.emulate.motion.plan import plan
+from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.render.context import missing
+from share.lab.emulate.sensor.effects import parse
+from share.lab.emulate.session import make_session
+from share.lab.emulate.world.scenes import layout
+from share.runtime.source import open_source
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(missing() is not None, reason=f"cannot draw: {missing()}")]
 SCENE, MOTION, SECONDS, OFFSET_MS = "charuco-board", "board:", 6.0, 5.0

@@ -9,9 +9,9 @@ import pytest
 from click.testing import CliRunner
 
 from share.cli.main import cli
-from share.emulate.recipe import Recipe
-from share.emulate.render.context import missing
-from share.emulate.session import make_session
+from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.render.context import missing
+from share.lab.emulate.session import make_session
 
 pytestmark = pytest.mark.slow
 TOOLS = Path(__file__).resolve().parents[2] / "tools"

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from share.config import SequencerConfig
-from share.core.measurement import CAM0, CAM1, IMU, Measurement
-from share.core.sequencer import SequencerCounters, sequence
-from share.emulate import mover
-from share.emulate.faults import FAULTS, apply
-from share.emulate.panel import Panel, drawn, share_of_view
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.io.images import ArrayImage
-from share.io.trajectory import Trajectory
+from share.lab.emulate import mover
+from share.lab.emulate.faults import FAULTS, apply
+from share.lab.emulate.panel import Panel, drawn, share_of_view
+from share.recordings.images import ArrayImage
+from share.recordings.trajectory import Trajectory
+from share.sensors.measurement import CAM0, CAM1, IMU, Measurement
+from share.sensors.sequencer import SequencerCounters, sequence
 from share.types import Frame, ImuBatch
 
 RATE_HZ, SECONDS, IMU_HZ = 10, 20, 200

@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 from small_session import RATE_HZ, SIZE, files, small_profile, small_recipe, write_poses
 
-from share.core.measurement import CAM0, CAM1, DEPTH, IMU
-from share.emulate import session as sessions
-from share.emulate.preparation import prepare
-from share.emulate.progress import silent
-from share.emulate.session import cached_session, make_session
-from share.emulate.types import START_NS
 from share.errors import ShareError, UsageError
 from share.geometry import se3
-from share.io.profile import profile
-from share.io.session import read_session
-from share.io.source import open_source
-from share.io.trajectory import read_tum
+from share.lab.emulate import session as sessions
+from share.lab.emulate.preparation import prepare
+from share.lab.emulate.progress import silent
+from share.lab.emulate.session import cached_session, make_session
+from share.lab.emulate.types import START_NS
+from share.recordings.session import read_session
+from share.recordings.trajectory import read_tum
+from share.runtime.source import open_source
+from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU
+from share.sensors.profile import profile
 from share.types import AgentKind
 
 SECONDS = 3.0
@@ -198,7 +198,7 @@ def test_a_folder_that_exists_is_not_touched(recipe, tmp_path):
 
 
 def test_two_at_a_time_are_told_apart(recipe, tmp_path):
-    from share.io.files import claim
+    from share.files.writing import claim
 
     held = claim(tmp_path / ".session.partial")
     try:

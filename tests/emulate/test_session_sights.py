@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from small_session import files, small_profile, small_recipe
 
-from share.emulate.preparation import keep_room, prepare
-from share.emulate.progress import silent
-from share.emulate.render.context import missing
-from share.emulate.room_file import open_renderer
-from share.emulate.session import make_session
-from share.emulate.stage import Stage, T_body
 from share.geometry import se3
-from share.io.source import open_source
+from share.lab.emulate.preparation import keep_room, prepare
+from share.lab.emulate.progress import silent
+from share.lab.emulate.render.context import missing
+from share.lab.emulate.room_file import open_renderer
+from share.lab.emulate.session import make_session
+from share.lab.emulate.stage import Stage, T_body
+from share.runtime.source import open_source
 
 pytestmark = pytest.mark.skipif(missing() is not None, reason=f"cannot draw: {missing()}")
 CHEST_M = 0.3  # below the eyes

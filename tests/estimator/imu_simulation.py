@@ -8,13 +8,13 @@ import numpy as np
 from imu_world import CAMERA, GRAVITY, NOISE, Path, imu_of, rig
 
 from share.config import InertialConfig
-from share.emulate.sensor.vibration import turning, vibration
-from share.estimator.inertial import ekf, observe
-from share.estimator.inertial.guess import guess
-from share.estimator.inertial.noise import shaken
-from share.estimator.inertial.samples import Samples
-from share.estimator.inertial.state import CORE, State, begin
 from share.geometry import se3
+from share.lab.emulate.sensor.vibration import turning, vibration
+from share.odometry import filter, measurement
+from share.odometry.depth_prior import guess
+from share.odometry.imu_buffer import Samples
+from share.odometry.imu_propagation import shaken
+from share.odometry.state import CORE, State, begin
 from share.types import ImuBatch
 
 FRAME_HZ = 20
@@ -77,7 +77,7 @@ def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
     first = rng.normal(0, 1, CORE) * sigma
     state = begin(0, T0, v0, bg[0], ba[0], sensors.T_body_cam0, sigma)
     first[15:] = 0
-    ekf.move(state, -first)
+    filter.move(state, -first)
     state.T_body_cam = sensors.T_body_cam0 @ se3.exp(extrinsic)
     log, next_id, keyframe_at = [], 0, -np.inf
     for k in range(1, int(setup.seconds * FRAME_HZ)):
@@ -86,17 +86,17 @@ def run(seed: int, setup: Setup = Setup()) -> Run:  # noqa: B008
         near = slice(*np.searchsorted(imu.stamps_ns, (state.stamp_ns - 10**7, to_ns + 10**7)))
         part = imu.take(near)
         samples.all = imu.take(slice(int(np.searchsorted(imu.stamps_ns, to_ns)) + 1))
-        rate = ekf.propagate(state, part, to_ns, shaken(noise, samples.latest(to_ns)), GRAVITY)
+        rate = filter.propagate(state, part, to_ns, shaken(noise, samples.latest(to_ns)), GRAVITY)
         taken = stamp + offset
         level = world.see(state, taken, rate)
         if len(state.ids) < 0.7 * setup.features or stamp - keyframe_at > 1.0:
             keyframe_at = stamp
-            host = ekf.add_keyframe(state, k, rate)
+            host = filter.add_keyframe(state, k, rate)
             next_id = world.new(state, host, k, taken, setup.features - len(state.ids), next_id)
             _forget_idle(state)
         true = path.poses(np.array([state.stamp_ns * 1e-9]))[0]
         error = se3.log(se3.inverse(state.T) @ true)
-        cov = ekf.pose_cov(state)
+        cov = filter.pose_cov(state)
         nees = [error[a:b] @ np.linalg.solve(cov[a:b, a:b], error[a:b]) for a, b in ((0, 3), (3, 6))]
         calib = se3.log(se3.inverse(state.T_body_cam) @ sensors.T_body_cam0)
         log.append((stamp, *nees, *error, *calib, state.offset_s - offset, level))
@@ -125,7 +125,7 @@ def _sigmas(setup: Setup) -> np.ndarray:
 def _forget_idle(state: State) -> None:
     busy = np.unique(state.host)
     idle = np.setdiff1d(np.arange(len(state.keyframes)), busy)
-    ekf.drop_keyframes(state, state.keyframes[idle])
+    filter.drop_keyframes(state, state.keyframes[idle])
 
 
 class _World:
@@ -159,10 +159,10 @@ class _World:
         sigma = np.full(len(which), self._sigma_px / CAMERA.focal)
         lasts = np.full(len(which), LASTING_PX / CAMERA.focal)
         first, *others = (
-            ekf.sight(
+            filter.sight(
                 state,
                 which,
-                observe.predict(state, which, T),
+                measurement.predict(state, which, T),
                 CAMERA.normalise(px[which]),
                 sigma,
                 lasts,
@@ -174,8 +174,8 @@ class _World:
         rows = rows.take(np.argsort(rows.host, kind="stable"))
         level = 1.0
         if len(which):
-            level = ekf.update(state, rows, *ekf.gains(state, rows)) / (2 * len(rows.which))
-        ekf.keep_features(state, inside)
+            level = filter.update(state, rows, *filter.gains(state, rows)) / (2 * len(rows.which))
+        filter.keep_features(state, inside)
         self._px = seen[0][inside].astype(np.float32)
         return level
 
@@ -198,10 +198,10 @@ class _World:
         ids = np.arange(next_id, next_id + count)
         if self._mono:
             g = guess(state, px.astype(np.float32), self._px)
-            ekf.add_features(state, ids, np.full(count, host), uv, g.rho, g.sigma, g.like, g.common)
+            filter.add_features(state, ids, np.full(count, host), uv, g.rho, g.sigma, g.like, g.common)
             return next_id + count
         sigma = self._sigma_px / CAMERA.fx / self._rig.baseline
         rho = np.maximum(1 / z + self._rng.normal(0, sigma, count), 0.02)
         hosts = np.full(count, host)
-        ekf.add_features(state, np.arange(next_id, next_id + count), hosts, uv, rho, np.full(count, sigma))
+        filter.add_features(state, np.arange(next_id, next_id + count), hosts, uv, rho, np.full(count, sigma))
         return next_id + count

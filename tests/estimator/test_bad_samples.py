@@ -10,8 +10,8 @@ import rig_fuzzer
 from plain_walk import RIG
 
 from share.config import Config
-from share.estimator.inertial.tracker import InertialTracker
-from share.estimator.result import TrackResult
+from share.odometry.result import TrackResult
+from share.odometry.tracker import InertialTracker
 from share.types import Frame, ImuBatch, TrackState
 
 AT = 5  # the frame that they come in

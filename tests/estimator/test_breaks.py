@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from share.estimator.inertial.breaks import Breaks
-from share.estimator.inertial.samples import Samples
+from share.odometry.imu_buffer import Samples
+from share.odometry.imu_outliers import Breaks
 from share.types import ImuBatch
 
 STEP = 5_000_000

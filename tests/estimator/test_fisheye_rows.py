@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from share.estimator.inertial import observe
-from share.estimator.inertial.observe import Prediction
 from share.geometry.camera import Camera
+from share.odometry import measurement
+from share.odometry.measurement import Prediction
 
 LENS = (0.00348, 0.000715, -0.00205, 0.000203)
 FISHEYE = Camera(512, 512, 190.0, 190.0, 254.93, 256.90, LENS, "equidistant")
@@ -22,7 +22,7 @@ def test_what_is_predicted_keeps_its_derivatives(rng):
     uv, eps = rng.uniform(-2, 2, (6, 2)), 1e-6
     by_rho, mine = rng.normal(size=(6, 2)), np.array([True, True, True, True, False, False])
     by_pose = rng.normal(size=(6, 2, 6))
-    seen = observe.evened(Prediction(uv, by_pose, -by_pose, by_rho), FISHEYE, mine)
+    seen = measurement.evened(Prediction(uv, by_pose, -by_pose, by_rho), FISHEYE, mine)
     high, low = (FISHEYE.distort(uv + s * eps * by_rho) for s in (1, -1))
     np.testing.assert_allclose(seen.by_rho[mine], ((high - low) / (2 * eps * 190.0))[mine], atol=1e-6)
     for k in range(6):

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from share.config import Config, InertialConfig, TrackerConfig
-from share.core.sequencer import SequencerCounters
-from share.estimator.inertial.tracker import InertialTracker
-from share.estimator.result import TrackResult
-from share.estimator.visual import VisualTracker
-from share.io.source import open_source
-from share.run.pipeline import frames_of
+from share.odometry.result import TrackResult
+from share.odometry.tracker import InertialTracker
+from share.odometry.visual_tracker import VisualTracker
+from share.runtime.pipeline import frames_of
+from share.runtime.source import open_source
+from share.sensors.sequencer import SequencerCounters
 from share.types import Footing, Frame
 from share.vision.depth import from_stereo
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from share.estimator.gravity import AtRest
+from share.odometry.initialisation import AtRest
 from share.types import ImuBatch
 
 UP = np.array([0.6, 0.0, 0.8])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.estimator.inertial.health import Agreement, Straying
+from share.odometry.outliers import Agreement, Straying
 
 FRAME_S = 1 / 30
 MANY = 60  # features

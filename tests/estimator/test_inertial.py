@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from share.config import Config, InertialConfig, TrackerConfig
-from share.core.measurement import IMU
-from share.core.sequencer import SequencerCounters
-from share.estimator.inertial.tracker import InertialTracker
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
-from share.io.source import open_source
-from share.io.trajectory import Trajectory
-from share.metrics.association import interpolate
+from share.geometry.interpolation import interpolate
 from share.metrics.ate import ate
-from share.run.pipeline import frames_of
+from share.odometry.tracker import InertialTracker
+from share.recordings.trajectory import Trajectory
+from share.runtime.pipeline import frames_of
+from share.runtime.source import open_source
+from share.sensors.measurement import IMU
+from share.sensors.sequencer import SequencerCounters
 from share.types import ImuBatch, TrackState, Wait
 
 OK, BLIND, DEAF, LOST = TrackState.OK, TrackState.INERTIAL_ONLY, TrackState.VISION_ONLY, TrackState.LOST

@@ -5,11 +5,10 @@ import pytest
 from imu_world import GRAVITY, NOISE, rig
 
 from share.config import InertialConfig
-from share.estimator.inertial.beginning import first_state, unknown_bias
-from share.estimator.inertial.readiness import learnt_bias, tilt
-from share.estimator.inertial.state import ACCEL_BIAS, CORE, GYRO_BIAS, begin
 from share.geometry import se3
 from share.geometry.camera import ImuBias
+from share.odometry.initialisation import first_state, learnt_bias, tilt, unknown_bias
+from share.odometry.state import ACCEL_BIAS, CORE, GYRO_BIAS, begin
 from share.types import ImuBatch
 
 CONFIG = InertialConfig()

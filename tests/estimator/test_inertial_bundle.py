@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from imu_world import CAMERA, GRAVITY, NOISE, Path, imu_of, rig
 
-from share.estimator.inertial import ekf
-from share.estimator.inertial.bundle import Model, Shot, fit
-from share.estimator.inertial.shooting import SIDE, gap
-from share.estimator.inertial.state import ACCEL_BIAS, CORE, GYRO_BIAS, VELOCITY, begin
 from share.geometry import se3
+from share.odometry import filter
+from share.odometry.mono_bundle import SIDE, Model, Shot, fit, gap
+from share.odometry.state import ACCEL_BIAS, CORE, GYRO_BIAS, VELOCITY, begin
 
 SIGMA, SHOTS, STEP_S, KEYFRAMES, EACH = 0.5 / CAMERA.focal, 16, 0.12, (0, 6), 50
 MODEL = Model(NOISE, GRAVITY, SIGMA, 1e-12 * np.eye(6), 0.4, 0.8, 0.5)
@@ -29,7 +28,7 @@ def scene(seed, outliers=0.0):
     T, v = path.poses(t), path.velocity(t)
     first = begin(0, T[0], v[0], bg[0], ba[0], sensors.T_body_cam0, unsure())
     error = np.r_[rng.normal(0, 1, SIDE) * unsure()[:SIDE], np.zeros(CORE - SIDE)]
-    ekf.move(first, -error)
+    filter.move(first, -error)
     cams = T @ sensors.T_body_cam0
     hosts = np.repeat(KEYFRAMES, EACH)
     ray = CAMERA.normalise(rng.uniform((5, 5), (634, 474), (len(hosts), 2)))

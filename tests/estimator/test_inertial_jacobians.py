@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from imu_world import GRAVITY, NOISE, Path, imu_of, rig
 
-from share.estimator.inertial import ekf, observe
-from share.estimator.inertial.imu import integrate
-from share.estimator.inertial.state import CORE, OFFSET, begin
 from share.geometry import se3
+from share.odometry import filter, measurement
+from share.odometry.imu_propagation import integrate
+from share.odometry.state import CORE, OFFSET, begin
 
 RIG = rig()
 STEP = 1e-6
@@ -32,8 +32,8 @@ def state():
     )
     for k in range(2):
         s.T = T[k]
-        ekf.add_keyframe(s, 10 + k, np.array([0.1, 0.2, -0.3]))
-        ekf.add_features(
+        filter.add_keyframe(s, 10 + k, np.array([0.1, 0.2, -0.3]))
+        filter.add_features(
             s,
             np.arange(5) + 5 * k,
             np.full(5, k),
@@ -49,7 +49,7 @@ def state():
 
 def moved(state, error):
     out = copy.deepcopy(state)
-    ekf.move(out, error)
+    filter.move(out, error)
     return out
 
 
@@ -61,7 +61,7 @@ def basis(state, k):
 
 def looked(state, T):
     """Where features show in an image."""
-    return observe.predict(state, np.arange(10), T).uv
+    return measurement.predict(state, np.arange(10), T).uv
 
 
 @pytest.mark.parametrize("right", [False, True])
@@ -69,8 +69,8 @@ def test_what_is_seen(state, right):
     T = RIG.T_cam1_cam0 if right else None
     which = np.arange(10)
     rate = np.array([0.3, -0.2, 0.5])
-    seen = observe.predict(state, which, T)
-    rows = ekf.sight(state, which, seen, np.zeros((10, 2)), np.ones(10), np.zeros(10), rate)
+    seen = measurement.predict(state, which, T)
+    rows = filter.sight(state, which, seen, np.zeros((10, 2)), np.ones(10), np.zeros(10), rate)
     H = np.zeros((20, state.size))
     H[:, :CORE] = rows.core.reshape(20, CORE)
     for i in range(10):
@@ -82,11 +82,11 @@ def test_what_is_seen(state, right):
         up, down = (looked(moved(state, s * basis(state, k)), T) for s in (1, -1))
         assert np.allclose(H[:, k], ((up - down) / (2 * STEP)).ravel(), atol=1e-6, rtol=1e-6)
     later, sooner = copy.deepcopy(state), copy.deepcopy(state)
-    V = ekf.twist(state, rate)
+    V = filter.twist(state, rate)
     later.T, sooner.T = se3.exp(V * STEP) @ state.T, se3.exp(-V * STEP) @ state.T
     up, down = (looked(s, T) for s in (later, sooner))
     assert np.allclose(H[:, OFFSET], ((up - down) / (2 * STEP)).ravel(), atol=1e-6, rtol=1e-6)
-    HP, S = ekf.gains(state, rows)
+    HP, S = filter.gains(state, rows)
     assert np.allclose(HP, H @ state.cov, atol=1e-14)
     assert np.allclose(S, H @ state.cov @ H.T + np.eye(20), atol=1e-14)
 
@@ -95,15 +95,17 @@ def test_what_lasts_is_the_same_in_both_cameras(state):
     which, rate = np.arange(10), np.zeros(3)
     sigma, lasting = np.full(10, 0.5), np.full(10, 0.3)
     left, right = (
-        ekf.sight(state, which, observe.predict(state, which, T), np.zeros((10, 2)), sigma, lasting, rate)
+        filter.sight(
+            state, which, measurement.predict(state, which, T), np.zeros((10, 2)), sigma, lasting, rate
+        )
         for T in (None, RIG.T_cam1_cam0)
     )
     right = right.take(np.arange(3, 7))
     rows = left.join(right)
     rows = rows.take(np.argsort(rows.host, kind="stable"))
-    alone, together = (ekf.gains(state, r)[1] for r in (replace(rows, lasting=0 * rows.lasting), rows))
+    alone, together = (filter.gains(state, r)[1] for r in (replace(rows, lasting=0 * rows.lasting), rows))
     same = (rows.which[:, None] == rows.which)[:, None, :, None] * np.eye(2)[:, None, :]
-    shared = ekf.AS_ONE * 0.3**2 * same.reshape(alone.shape)
+    shared = filter.AS_ONE * 0.3**2 * same.reshape(alone.shape)
     assert np.allclose(together - alone, shared, atol=1e-14)
 
 
@@ -118,7 +120,7 @@ def test_covariance_of_a_motion(state):
         up, down = (motion(moved(state, sign * basis(state, k))) for sign in (1, -1))
         J[:, k] = se3.log(se3.inverse(motion(state)) @ up) - se3.log(se3.inverse(motion(state)) @ down)
     J /= 2 * STEP
-    assert np.allclose(ekf.motion_cov(state, 0, 1), J @ state.cov @ J.T, atol=1e-9, rtol=1e-5)
+    assert np.allclose(filter.motion_cov(state, 0, 1), J @ state.cov @ J.T, atol=1e-9, rtol=1e-5)
 
 
 def test_the_twist_is_how_the_pose_moves():
@@ -126,7 +128,7 @@ def test_the_twist_is_how_the_pose_moves():
     s = begin(0, path.poses(t)[0], path.velocity(t)[0], np.zeros(3), np.zeros(3), np.eye(4), np.ones(CORE))
     rate = path.inertial(t)[0][0]
     moved = path.poses(t + 1e-4)[0] @ se3.inverse(path.poses(t - 1e-4)[0])
-    assert np.allclose(ekf.twist(s, rate), se3.log(moved) / 2e-4, atol=1e-5)
+    assert np.allclose(filter.twist(s, rate), se3.log(moved) / 2e-4, atol=1e-5)
 
 
 def test_integration_follows_the_path():

@@ -3,9 +3,9 @@
 import numpy as np
 from imu_world import NOISE, Path, imu_of
 
-from share.estimator.inertial import ekf
-from share.estimator.inertial.samples import Samples, unclipped
-from share.estimator.inertial.state import CORE, VELOCITY, begin
+from share.odometry import filter
+from share.odometry.imu_buffer import Samples, unclipped
+from share.odometry.state import CORE, VELOCITY, begin
 from share.types import ImuBatch
 
 
@@ -23,12 +23,12 @@ def heard(imu):
 
 def test_velocity_is_nought_unless_the_filter_knows_better():
     drifting = state([0.1, -0.05, 0.02], 0.1)
-    assert ekf.rest(drifting, 0.02, 12.0)
+    assert filter.rest(drifting, 0.02, 12.0)
     assert np.linalg.norm(drifting.v) < 0.006
     assert np.sqrt(drifting.cov[6, 6]) < 0.02
     cruising = state([0.3, 0.0, 0.0], 0.01)
     before = cruising.cov.copy()
-    assert not ekf.rest(cruising, 0.02, 12.0)
+    assert not filter.rest(cruising, 0.02, 12.0)
     assert (cruising.v == [0.3, 0.0, 0.0]).all()
     assert (cruising.cov == before).all()
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from share.config import Config, InertialConfig
-from share.core.sequencer import SequencerCounters
-from share.estimator.inertial import find
-from share.estimator.inertial.scene import Scene
-from share.estimator.inertial.state import CORE, begin
-from share.io.source import open_source
-from share.run.pipeline import frames_of
+from share.odometry import measurement
+from share.odometry.landmarks import Scene
+from share.odometry.state import CORE, begin
+from share.runtime.pipeline import frames_of
+from share.runtime.source import open_source
+from share.sensors.sequencer import SequencerCounters
 
 CONFIG, STILL = InertialConfig(), np.zeros(3)
 ENOUGH = CONFIG.weak // 2
@@ -38,7 +38,7 @@ def scene(source, frames):
 def look(scene, rig, frame, movers=0):
     """At a frame in which the first few features went their own way."""
     scene.step(1 / 15)
-    sought = find.seek(frame, rig, scene.state, scene.looks, CONFIG)
+    sought = measurement.seek(frame, rig, scene.state, scene.looks, CONFIG)
     sought.astray[:movers] = True
     scene.seen(sought, sought.found & ~sought.astray)
 

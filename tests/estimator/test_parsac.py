@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from imu_world import CAMERA, rig
 
-from share.estimator.inertial import ekf, observe, parsac
-from share.estimator.inertial.state import CORE, VELOCITY, begin
+from share.odometry import filter, measurement, outliers
+from share.odometry.state import CORE, VELOCITY, begin
 
 RIG, SIZE = rig(), (CAMERA.width, CAMERA.height)
 SIGMA = 0.5 / CAMERA.focal
@@ -18,22 +18,22 @@ def state():
     rng, sigma = np.random.default_rng(1), np.full(CORE, 1e-4)
     sigma[VELOCITY] = 0.01
     s = begin(0, np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), RIG.T_body_cam0, sigma)
-    host = ekf.add_keyframe(s, 0, np.zeros(3))
+    host = filter.add_keyframe(s, 0, np.zeros(3))
     px = np.stack(np.meshgrid(np.linspace(40, SIZE[0] - 40, 10), np.linspace(40, SIZE[1] - 40, 10)), -1)
     ray = RIG.cam0.normalise(px.reshape(-1, 2))
-    ekf.add_features(s, np.arange(N), np.full(N, host), ray, rng.uniform(0.2, 1.0, N), np.full(N, 1e-3))
+    filter.add_features(s, np.arange(N), np.full(N, host), ray, rng.uniform(0.2, 1.0, N), np.full(N, 1e-3))
     s.cov[:6, :6] += np.diag(np.repeat([1e-3, 2e-3], 3) ** 2)
     return s
 
 
 def judged(state, shift_px, proven=None, noise=0.3):
     """Which of the features are taken for the room seen shift_px (N, 2) from where they should be."""
-    seen = observe.predict(state, np.arange(N))
+    seen = measurement.predict(state, np.arange(N))
     rng = np.random.default_rng(2)
     uv = seen.uv + (shift_px + noise * rng.normal(size=(N, 2))) / CAMERA.focal
-    rows = ekf.sight(state, np.arange(N), seen, uv, np.full(N, SIGMA), np.zeros(N), np.zeros(3))
+    rows = filter.sight(state, np.arange(N), seen, uv, np.full(N, SIGMA), np.zeros(N), np.zeros(3))
     px = RIG.cam0.distort(uv).astype(np.float32)
-    return parsac.of_the_room(state, rows, px, np.ones(N, bool) if proven is None else proven, RIG.cam0)
+    return outliers.of_the_room(state, rows, px, np.ones(N, bool) if proven is None else proven, RIG.cam0)
 
 
 def mistaken(room, mover):
@@ -43,7 +43,7 @@ def mistaken(room, mover):
 
 def part(state, left_of):
     """Features in the left part of the image."""
-    return RIG.cam0.distort(observe.predict(state, np.arange(N)).uv)[:, 0] < left_of * SIZE[0]
+    return RIG.cam0.distort(measurement.predict(state, np.arange(N)).uv)[:, 0] < left_of * SIZE[0]
 
 
 def test_noise_is_no_reason_to_doubt(state):
@@ -77,7 +77,7 @@ def test_what_is_new_has_no_vote(state):
 
 def test_a_motion_that_the_imu_missed_is_no_split(state):
     """All of the room shifts alike, by what the filter holds for possible."""
-    seen = observe.predict(state, np.arange(N))
+    seen = measurement.predict(state, np.arange(N))
     shift = seen.by_pose[:, :, 3:] @ np.array([2e-3, -2e-3, 1e-3]) * CAMERA.focal
     assert np.abs(shift).max() > 1.0
     assert judged(state, shift).all()
@@ -85,9 +85,9 @@ def test_a_motion_that_the_imu_missed_is_no_split(state):
 
 def test_too_few_are_believed(state):
     few = np.arange(5)
-    seen = observe.predict(state, few)
-    rows = ekf.sight(state, few, seen, seen.uv + 1.0, np.full(5, SIGMA), np.zeros(5), np.zeros(3))
-    assert parsac.of_the_room(state, rows, np.zeros((5, 2), np.float32), np.ones(5, bool), RIG.cam0).all()
+    seen = measurement.predict(state, few)
+    rows = filter.sight(state, few, seen, seen.uv + 1.0, np.full(5, SIGMA), np.zeros(5), np.zeros(3))
+    assert outliers.of_the_room(state, rows, np.zeros((5, 2), np.float32), np.ones(5, bool), RIG.cam0).all()
 
 
 @pytest.mark.parametrize(("share", "as_expected"), [(0.05, True), (0.3, False), (1.0, False)])
@@ -95,4 +95,4 @@ def test_the_imu_alone_explains_an_image_where_nothing_moves(share, as_expected)
     """Else somebody is asked; so too if all of the image moves."""
     off_px = np.random.default_rng(4).normal(0, 0.3, (N, 2))
     off_px[: round(share * N)] += 3.0
-    assert parsac.as_expected(off_px, 0.15, 0.3) == as_expected
+    assert outliers.as_expected(off_px, 0.15, 0.3) == as_expected

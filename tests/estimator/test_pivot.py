@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from share.estimator.inertial.pivot import Pivot
 from share.geometry import se3
+from share.odometry.tracker import Pivot
 
 BEGAN = np.array([1.0, 0.0, 0.0])
 

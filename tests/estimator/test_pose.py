@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from share.estimator.pose import consensus, refine, reprojection
 from share.geometry import se3
+from share.odometry.relocalisation import consensus, refine, reprojection
 
 FOCAL = 400.0
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.estimator.inertial.readiness import converged, tilt, waits_for, worth_telling
-from share.estimator.inertial.state import CORE, VELOCITY, State, begin
+from share.odometry.initialisation import converged, tilt, waits_for, worth_telling
+from share.odometry.state import CORE, VELOCITY, State, begin
 from share.types import Wait
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from share.config import Config, InertialConfig
-from share.core.sequencer import SequencerCounters
-from share.estimator.inertial.scene import Scene
-from share.estimator.inertial.state import CORE, begin
-from share.io.source import open_source
-from share.run.pipeline import frames_of
+from share.odometry.landmarks import Scene
+from share.odometry.state import CORE, begin
+from share.runtime.pipeline import frames_of
+from share.runtime.source import open_source
+from share.sensors.sequencer import SequencerCounters
 
 STILL = np.zeros(3)
 

@@ -6,10 +6,10 @@ import pytest
 from imu_simulation import Setup, run
 from imu_world import NOISE, Path, imu_of
 
-from share.emulate.sensor.vibration import vibration
-from share.estimator.inertial.noise import shaken
-from share.estimator.inertial.samples import Samples
 from share.geometry.camera import ImuNoise
+from share.lab.emulate.sensor.vibration import vibration
+from share.odometry.imu_buffer import Samples
+from share.odometry.imu_propagation import shaken
 from share.types import ImuBatch
 
 QUIET = ImuNoise(1e-9, 1e-9, 1e-9, 1e-9, 400.0)

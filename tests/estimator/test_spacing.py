@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.estimator.relocalise import Turns
-from share.estimator.spacing import Spacing
 from share.geometry import se3
+from share.odometry.keyframes import Spacing
+from share.odometry.relocalisation import Turns
 
 SECOND = 1_000_000_000
 

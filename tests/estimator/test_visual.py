@@ -5,10 +5,10 @@ import pytest
 from plain_walk import CAMERA, STEREO, T_CAM1_CAM0, pairs, poses
 
 from share.config import TrackerConfig
-from share.estimator import gravity
-from share.estimator.visual import VisualTracker
 from share.geometry import se3
 from share.geometry.camera import ImuNoise, Rig
+from share.odometry import initialisation
+from share.odometry.visual_tracker import VisualTracker
 from share.types import Frame, ImuBatch, TrackState, Wait
 
 HZ = 20
@@ -185,9 +185,9 @@ def test_an_imu_that_falls_silent_is_seen_and_ends_nothing(walk):
 
 
 def test_level_looks_ahead_and_survives_looking_down():
-    T = gravity.level(np.array([0, -1.0, 0]), np.array([0, 0, 1.0]))
+    T = initialisation.level(np.array([0, -1.0, 0]), np.array([0, 0, 1.0]))
     assert np.allclose(T[:3, :3] @ [0, -1, 0], (0, 0, 1))
     assert np.allclose(T[:3, :3] @ [0, 0, 1], (1, 0, 0))
-    down = gravity.level(np.array([0, 0, -1.0]), np.array([0, 0, 1.0]))
+    down = initialisation.level(np.array([0, 0, -1.0]), np.array([0, 0, 1.0]))
     assert np.allclose(down[:3, :3] @ [0, 0, -1], (0, 0, 1))
     assert np.linalg.det(down[:3, :3]) == pytest.approx(1)

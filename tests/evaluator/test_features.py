@@ -8,10 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from share.evaluator.features import PICTURE_PX, Features, features
-from share.evaluator.odometer import Fared, Lately
-from share.evaluator.psd import psd
-from share.evaluator.scalars import NAMES, scalars
+from share.odometry.error_model.features import NAMES, PICTURE_PX, Features, features, psd, scalars
+from share.odometry.error_model.history import Fared, Lately
 from share.types import U8, Footing, TrackState
 
 SIZE = (640, 480)

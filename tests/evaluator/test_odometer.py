@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.evaluator.odometer import Fared, Odometer
 from share.geometry import se3
+from share.odometry.error_model.history import Fared, Odometer
 from share.types import Candidate, TrackState, View
 
 S = 1_000_000_000

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from share.evaluator.odometer import Fared, Lately
-from share.evaluator.recent import RECENT, recent
+from share.odometry.error_model.features import RECENT, recent
+from share.odometry.error_model.history import Fared, Lately
 from share.types import TrackState
 
 S = 1_000_000_000

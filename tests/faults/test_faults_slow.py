@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from share.emulate.faults import FAULTS
-from share.emulate.recipe import Recipe
-from share.emulate.render.context import missing
-from share.emulate.session import cached_session
+from share.lab.emulate.faults import FAULTS
+from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.render.context import missing
+from share.lab.emulate.session import cached_session
 
 pytestmark = [
     pytest.mark.slow,

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from share.geometry import se3
-from share.geometry.align import umeyama
+from share.geometry.se3 import umeyama
 
 
 def test_recovers_a_rigid_motion(rng):

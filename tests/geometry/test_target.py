@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from share.geometry.target import AprilGrid, CharucoBoard
+from share.lab.calibrate.target import AprilGrid, CharucoBoard
 
 
 def test_aprilgrid_counts_tags_from_the_lower_left_and_corners_against_the_clock():

@@ -9,7 +9,7 @@ import pytest
 
 from share.geometry import se3
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.geometry.trackable import lens_objection, objection
+from share.geometry.rig_check import lens_objection, objection
 
 LENS = (-0.28340811, 0.07395907, 0.00019359, 1.76e-05)
 EUROC = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, LENS)

@@ -10,7 +10,7 @@ import numpy as np
 
 from share.config import GraphConfig
 from share.geometry import se3
-from share.graph.posegraph import Edge
+from share.mapping.graph.edges import Edge
 from share.types import F64
 
 ANCHOR_SIGMA = 1e-4  # rad and m; holds the gauge, removed again after solving

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from share.geometry import se3
-from share.graph.posegraph import Edge
+from share.mapping.graph.edges import Edge
 from share.types import F64
 
 ODOMETRY = np.diag([0.004**2] * 3 + [0.01**2] * 3)

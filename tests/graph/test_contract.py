@@ -6,10 +6,9 @@ from rooms import LOOP, Room, measured, simulate
 
 from share.config import GraphConfig
 from share.geometry import se3
-from share.graph.change import Change, Solution
-from share.graph.contract import contract, fuse
-from share.graph.posegraph import Edge
-from share.graph.solver import Solver
+from share.mapping.graph.edges import Edge
+from share.mapping.graph.solver import Solver
+from share.mapping.graph.updates import Change, Solution, contract, fuse
 from share.types import F64
 
 # to the end, and covariances by nearly every way there is

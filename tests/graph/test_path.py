@@ -3,8 +3,8 @@ import pytest
 from rooms import LOOP, Room, simulate
 from walking import covariance_between, surest
 
-from share.graph.path import Roads
-from share.graph.posegraph import Edge
+from share.mapping.graph.covariance import Roads
+from share.mapping.graph.edges import Edge
 
 
 def roads_of(room: Room, seed: int) -> tuple[Roads, list[Edge]]:

@@ -10,10 +10,9 @@ from rooms import LOOP, Room, false_loops, simulate
 
 from share.config import GraphConfig
 from share.geometry import se3
-from share.graph.change import Change
-from share.graph.linear import Edges, jacobians, residuals
-from share.graph.posegraph import Edge
-from share.graph.solver import Solver
+from share.mapping.graph.edges import Edge, Edges, jacobians, residuals
+from share.mapping.graph.solver import Solver
+from share.mapping.graph.updates import Change
 from share.types import F64
 
 CONFIG = GraphConfig()

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from share.geometry import se3
-from share.graph.posegraph import Edge
+from share.mapping.graph.edges import Edge
 from share.types import F64
 
 Placed = Sequence[F64] | Mapping[int, F64] | F64

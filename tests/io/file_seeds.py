@@ -23,34 +23,32 @@ from small_session import small_profile, small_recipe
 
 from share import config
 from share.cli.options import load_config
-from share.core.sequencer import SequencerCounters
-from share.emulate.session import make_session
-from share.emulate.world.gltf import load_gltf
 from share.errors import ShareError, UsageError
-from share.evaluator.features import SHAPES, kind_of
-from share.evaluator.model import estimate
-from share.io.calibration import read_calibration
-from share.io.describe import describe
-from share.io.imu_table import read_imu
-from share.io.kalibr import kalibr_texts
-from share.io.keys import AllowList
-from share.io.map_describe import describe_map
-from share.io.map_store import MapStore
-from share.io.mcap.recorder import Recorder
-from share.io.mcap.recover import recover
-from share.io.mocap_file import read_bodies
-from share.io.network import error_model
-from share.io.profile import host_profile, profile
-from share.io.session import read_session
-from share.io.source import open_source
-from share.run.costs import costs_of
-from share.run.figures import figures
-from share.run.pipeline import frames_of, tracker_for
-from share.run.play import Terms
-from share.run.traces import merges, traces
-from share.run.trial import read_trial, run_trial
-from share.train.label_file import Labels, read_labels, write_labels
-from share.train.table import collect, tabulate
+from share.lab.calibrate.imu_table import read_imu
+from share.lab.emulate.session import make_session
+from share.lab.emulate.world.gltf import load_gltf
+from share.lab.evaluate.play import Terms
+from share.lab.evaluate.scoring import figures, merges, traces
+from share.lab.evaluate.trial import read_trial, run_trial
+from share.lab.evaluate.virtual import costs_of
+from share.lab.mocap.files import read_bodies
+from share.lab.train.labels import Labels, read_labels, write_labels
+from share.lab.train.table import collect, tabulate
+from share.net.keys import AllowList
+from share.odometry.error_model.features import SHAPES, kind_of
+from share.odometry.error_model.model import estimate
+from share.odometry.error_model.network import error_model
+from share.recordings.calibration import kalibr_texts, read_calibration
+from share.recordings.describe import describe
+from share.recordings.mcap.recorder import Recorder
+from share.recordings.mcap.recover import recover
+from share.recordings.session import read_session
+from share.runtime.pipeline import frames_of, tracker_for
+from share.runtime.source import open_source
+from share.sensors.profile import host_profile, profile
+from share.sensors.sequencer import SequencerCounters
+from share.store.export import describe_map
+from share.store.map_store import MapStore
 
 
 def _tracked(source: object) -> None:

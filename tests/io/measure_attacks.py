@@ -29,7 +29,7 @@ from map_changes import small_map
 from onnx_bytes import ints, node, number, small_error_model, tensor
 from recordings import make_euroc, make_tum
 
-from share.io.map_store import MapStore
+from share.store.map_store import MapStore
 
 CPU_S, MEMORY = 60, 8 * 10**9  # where a run is ended
 Attack = Callable[[Path], list[str]]

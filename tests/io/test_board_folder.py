@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 import yaml
 
-from share.calibration.bundle import View
-from share.calibration.detect import Detection
 from share.errors import DataError, UsageError
 from share.geometry.camera import Camera, Rig
-from share.geometry.target import AprilGrid
-from share.io import rig_pictures
-from share.io.board_views import open_pictures
-from share.io.rig_pictures import RigPictures, find_stamped
+from share.lab.calibrate import board_views
+from share.lab.calibrate.board_views import RigPictures, find_stamped, open_pictures
+from share.lab.calibrate.camera_bundle import View
+from share.lab.calibrate.corners import Detection
+from share.lab.calibrate.target import AprilGrid
 
 CORNER = Detection(np.array([3]), np.array([[10.0, 20.0]]))
 
@@ -45,7 +44,7 @@ def test_where_pictures_are_missing_it_is_said_how_to_do_without(tmp_path: Path)
     with pytest.raises(
         DataError, match=r"in cam0 and cam1; for one camera, give --camera a camchain without"
     ):
-        rig_pictures.open_rig_pictures(str(tmp_path / "mono"), str(tmp_path / "stereo.yaml"))
+        board_views.open_rig_pictures(str(tmp_path / "mono"), str(tmp_path / "stereo.yaml"))
     flat = written(tmp_path / "flat", "1.png")
     with pytest.raises(
         UsageError, match=r"flat: has pictures, but no cam0 .*; give a folder with cam0/\*\.png"
@@ -53,10 +52,10 @@ def test_where_pictures_are_missing_it_is_said_how_to_do_without(tmp_path: Path)
         open_pictures(str(flat), ("cam0",))
 
 
-def stamped(monkeypatch: pytest.MonkeyPatch, *names: str) -> rig_pictures.Stamped:
+def stamped(monkeypatch: pytest.MonkeyPatch, *names: str) -> board_views.Stamped:
     """What is found in pictures of these names, which all show the board."""
     views = [View(name, (CORNER,)) for name in names]
-    monkeypatch.setattr(rig_pictures, "find_views", lambda *_: (views, [(12, 8)]))
+    monkeypatch.setattr(board_views, "find_views", lambda *_: (views, [(12, 8)]))
     rig = Rig(Camera(12, 8, 9.0, 9.0, 6.0, 4.0), np.eye(4))
     return find_stamped(RigPictures("dance", None, rig, None), AprilGrid(), 1, lambda done, total: None)  # type: ignore[arg-type]
 

@@ -6,11 +6,18 @@ import numpy as np
 import pytest
 
 from share.errors import ConfigError
+from share.files.yaml_file import Section, read_yaml
 from share.geometry import se3
-from share.geometry.trackable import objection
-from share.io.calibration import CAMCHAIN, IMU_CHAIN, kalibr, read_calibration, read_camera_yaml
-from share.io.kalibr import kalibr_texts, to_kalibr
-from share.io.section import Section, read_yaml
+from share.geometry.rig_check import objection
+from share.recordings.calibration import (
+    CAMCHAIN,
+    IMU_CHAIN,
+    kalibr,
+    kalibr_texts,
+    read_calibration,
+    read_camera_yaml,
+    to_kalibr,
+)
 
 CAM = """
   camera_model: pinhole

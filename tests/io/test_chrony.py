@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from time_servers import chronyd, needs_chrony
 
+from share.devices import chrony
 from share.errors import DataError
-from share.io import chrony
-from share.io.udp import Host
+from share.net.udp import Host
 
 # Printed by chronyc 4.3 beside "0.004984827 seconds slow of NTP time", "Root delay: 0.000034467", "Root
 # dispersion: 0.000007578" and "RMS offset: 0.000002491" for people.

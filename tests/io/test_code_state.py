@@ -5,12 +5,12 @@ import sys
 from pathlib import Path
 
 import share
-from share.io.code_state import code_state
+from share.runtime.machine import code_state
 
 
 def test_it_is_another_once_a_source_is(tmp_path, monkeypatch):
     copy = tmp_path / "share"
-    shutil.copytree(Path(share.__file__).parent / "control", copy / "control")
+    shutil.copytree(Path(share.__file__).parent / "scheduling", copy / "scheduling")
     (copy / "__init__.py").write_text("")
     monkeypatch.setattr(share, "__file__", str(copy / "__init__.py"))
     states = [code_state.__wrapped__()]

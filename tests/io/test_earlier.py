@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from share.io.earlier import places
+from share.lab.calibrate.camera_report import places
 
 
 def test_what_is_to_be_believed_takes_the_place(tmp_path: Path) -> None:

@@ -13,10 +13,10 @@ from onnx_bytes import FLOAT, field, ints, model, node, number, small_error_mode
 from special_files import KINDS, special
 
 from share.errors import DataError, ShareError
-from share.evaluator.features import SHAPES, features
-from share.evaluator.model import MOST_CM, Estimate, estimate
-from share.evaluator.odometer import Fared, Lately
-from share.io.network import SHIPPED, deep_of, error_model, open_network, read_model
+from share.odometry.error_model.features import SHAPES, features
+from share.odometry.error_model.history import Fared, Lately
+from share.odometry.error_model.model import MOST_CM, Estimate, estimate
+from share.odometry.error_model.network import SHIPPED, deep_of, error_model, open_network, read_model
 from share.types import Footing, TrackState
 
 

@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from share.core.intake import Sample
-from share.core.watchdog import Health, Watchdog
+from share.cameras.feed import Feed
+from share.cameras.handover import Handover
 from share.errors import NotAttachedError, ShareError, UsageError
 from share.geometry.camera import Rig
-from share.io.feed import Feed
-from share.io.handover import Handover
-from share.io.profile import profile
+from share.sensors.intake import Sample
+from share.sensors.profile import profile
+from share.sensors.watchdog import Health, Watchdog
 
 RATES = {"cam0": 30.0, "accel": 250.0, "gyro": 400.0}
 

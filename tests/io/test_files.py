@@ -11,8 +11,8 @@ import pytest
 from special_files import special
 
 from share.errors import ShareError, UsageError
-from share.io.files import atomic_write, check_replaceable, check_writable, new_file, writable_dir
-from share.io.line_file import LineFile
+from share.files.line_file import LineFile
+from share.files.writing import atomic_write, check_replaceable, check_writable, new_file, writable_dir
 
 
 def test_atomic_write_replaces_and_leaves_nothing_else(tmp_path):
@@ -34,7 +34,7 @@ def test_a_reader_never_sees_half(tmp_path):
     """Another process writes as fast as it can; every read is one of its two texts, whole."""
     path = tmp_path / "x"
     code = (
-        "import sys; from pathlib import Path; from share.io.files import atomic_write\n"
+        "import sys; from pathlib import Path; from share.files.writing import atomic_write\n"
         "for i in range(60): atomic_write(Path(sys.argv[1]), 'ab'[i % 2] * 200_000)"
     )
     writer = subprocess.Popen([sys.executable, "-c", code, str(path)])

@@ -1,6 +1,6 @@
 """A file that is read while it is written."""
 
-from share.io.growing_file import GrowingFile
+from share.files.line_file import GrowingFile
 
 
 def test_each_whole_line_comes_once(tmp_path):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from share.core.intake import Sample
-from share.io.handover import Handover, KeepNewest
+from share.cameras.handover import Handover, KeepNewest
+from share.sensors.intake import Sample
 
 
 def filled(queue: Handover, pairs: int) -> list[tuple[str, int]]:

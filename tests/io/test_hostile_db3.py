@@ -13,12 +13,12 @@ from made_db3 import ACCEL, DEPTH, EYE, image, make_db3, motion, text
 from special_files import KINDS, special
 
 from share.config import Config
-from share.core.sequencer import SequencerCounters
 from share.errors import DataError, ShareError
-from share.io.imu_table import read_imu
-from share.io.realsense import db3
-from share.io.source import open_source
-from share.run.pipeline import frames_of
+from share.lab.calibrate.imu_table import read_imu
+from share.recordings import realsense_db3
+from share.runtime.pipeline import frames_of
+from share.runtime.source import open_source
+from share.sensors.sequencer import SequencerCounters
 
 pytestmark = pytest.mark.usefixtures("soon")
 
@@ -98,9 +98,9 @@ def test_what_hangs_on_tables_is_never_run(path):
 
 def test_a_search_ends(path, monkeypatch):
     """Rows of other topics, of which there may be any number."""
-    monkeypatch.setattr("share.io.sqlite_file._STEPS", 1000)
-    monkeypatch.setattr("share.io.sqlite_file._STEPS_A_BYTE", 0)
-    monkeypatch.setattr("share.io.sqlite_file._EVERY", 100)
+    monkeypatch.setattr("share.files.sqlite_file._STEPS", 1000)
+    monkeypatch.setattr("share.files.sqlite_file._STEPS_A_BYTE", 0)
+    monkeypatch.setattr("share.files.sqlite_file._EVERY", 100)
     with pytest.raises(DataError, match="interrupted"):
         open_source(str(path))
 
@@ -164,7 +164,11 @@ def test_samples_that_are_not_finite_and_images_that_are_none(path):
 
 
 def test_a_message_larger_than_any_is_not_read(path, monkeypatch):
-    monkeypatch.setattr(db3, "_DATA_OR_NULL", db3._DATA_OR_NULL.replace(str(db3._MOST_MESSAGE), "100000"))
+    monkeypatch.setattr(
+        realsense_db3,
+        "_DATA_OR_NULL",
+        realsense_db3._DATA_OR_NULL.replace(str(realsense_db3._MOST_MESSAGE), "100000"),
+    )
     change(path, "UPDATE messages SET data = zeroblob(200000) WHERE id = (SELECT id FROM messages "
            f"WHERE topic_id = {topic(path, EYE_DATA)} LIMIT 1)")  # fmt: skip
     assert read(path) == (23, {"samples of cam0": 1})

@@ -15,23 +15,21 @@ from recordings import HEIGHT, WIDTH, depth_mm, make_euroc, make_tum, picture
 from special_files import KINDS, special
 
 from share.config import Config
-from share.core.sequencer import SequencerCounters
 from share.errors import ConfigError, DataError, MisfitError, one_line
-from share.io.calibration import read_calibration
-from share.io.files import atomic_write, fresh
-from share.io.image_header import image_header
-from share.io.images import EncodedImage, decode_gray
-from share.io.inside import inside
-from share.io.json_file import read_json
-from share.io.line_file import LineFile
-from share.io.mcap.recorder import Recorder
-from share.io.regular_file import read_bytes
-from share.io.section import read_yaml
-from share.io.session import read_session
-from share.io.source import open_source
-from share.io.tables import longest_rising, read_table
-from share.run.pipeline import frames_of
-from share.strict import load_yaml
+from share.files.json_file import read_json
+from share.files.line_file import LineFile
+from share.files.reading import inside, read_bytes
+from share.files.writing import atomic_write, fresh
+from share.files.yaml_file import read_yaml
+from share.plain_data import load_yaml
+from share.recordings.calibration import read_calibration
+from share.recordings.images import EncodedImage, decode_gray, image_header
+from share.recordings.mcap.recorder import Recorder
+from share.recordings.session import read_session
+from share.recordings.tables import longest_rising, read_table
+from share.runtime.pipeline import frames_of
+from share.runtime.source import open_source
+from share.sensors.sequencer import SequencerCounters
 
 pytestmark = pytest.mark.usefixtures("soon")
 

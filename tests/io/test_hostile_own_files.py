@@ -14,27 +14,26 @@ import pytest
 from matplotlib import pyplot
 from special_files import KINDS, special
 
-from share.emulate.chunks import read_chunk
-from share.emulate.room_file import open_renderer
-from share.emulate.world.files import load_room
 from share.errors import ConfigError, DataError, ShareError, UsageError
-from share.evaluator.features import SHAPES, kind_of
-from share.io import figure
-from share.io.arrays import read_array, read_arrays
-from share.io.charts import draw_bars
-from share.io.growing_file import GrowingFile
-from share.io.json_file import parse_json, read_json, read_json_lines
-from share.io.keys import AllowList
-from share.io.page import page
-from share.io.section import read_yaml
-from share.io.settings_file import read_settings
-from share.io.tables import read_table
-from share.run.annex import annex
-from share.run.costs import costs_of
-from share.run.trial import read_trial
-from share.train.fitted import Fitted, read_fitted, write_fitted
-from share.train.label_file import Labels, read_labels, write_labels
-from share.train.score import read_scores
+from share.files.arrays import read_array, read_arrays
+from share.files.json_file import parse_json, read_json, read_json_lines
+from share.files.line_file import GrowingFile
+from share.files.yaml_file import read_settings, read_yaml
+from share.lab.emulate.chunks import read_chunk
+from share.lab.emulate.room_file import open_renderer
+from share.lab.emulate.world.files import load_room
+from share.lab.evaluate import charts
+from share.lab.evaluate.charts import draw_bars
+from share.lab.evaluate.page import page
+from share.lab.evaluate.report import annex
+from share.lab.evaluate.trial import read_trial
+from share.lab.evaluate.virtual import costs_of
+from share.lab.train.fitted import Fitted, read_fitted, write_fitted
+from share.lab.train.labels import Labels, read_labels, write_labels
+from share.lab.train.score import read_scores
+from share.net.keys import AllowList
+from share.odometry.error_model.features import SHAPES, kind_of
+from share.recordings.tables import read_table
 
 pytestmark = pytest.mark.usefixtures("soon")
 
@@ -335,6 +334,6 @@ def test_pictures_replace_a_link_and_are_whole(tmp_path, monkeypatch):
 
     monkeypatch.setattr(pyplot, "close", lambda figure: None)
     with pytest.raises(MemoryError):
-        figure.save(Broken(), path, 100)
+        charts.save(Broken(), path, 100)
     assert path.read_bytes().startswith(b"\x89PNG")
     assert sorted(one.name for one in tmp_path.iterdir()) == ["link.png", "precious", "symlink.png"]

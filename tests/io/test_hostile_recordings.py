@@ -14,19 +14,19 @@ from recordings import STEP_NS
 from special_files import KINDS, special
 
 from share.config import Config
-from share.core.keeping import KeepLink, Kept
-from share.core.measurement import Measurement
-from share.core.sequencer import SequencerCounters
 from share.errors import DataError, ShareError, UsageError
 from share.geometry import se3
-from share.io.images import ArrayImage
-from share.io.map_store import MapStore
-from share.io.mcap.chunks import MOST_CHUNK
-from share.io.mcap.recorder import Recorder
-from share.io.mcap.recover import recover
-from share.io.source import open_source
-from share.merge.join import Key
-from share.run.pipeline import frames_of
+from share.mapping.changes import KeepLink, Kept
+from share.mapping.loops import Key
+from share.recordings.images import ArrayImage
+from share.recordings.mcap.chunks import MOST_CHUNK
+from share.recordings.mcap.recorder import Recorder
+from share.recordings.mcap.recover import recover
+from share.runtime.pipeline import frames_of
+from share.runtime.source import open_source
+from share.sensors.measurement import Measurement
+from share.sensors.sequencer import SequencerCounters
+from share.store.map_store import MapStore
 
 pytestmark = pytest.mark.usefixtures("soon")
 
@@ -57,8 +57,8 @@ def test_a_chunk_is_unpacked_no_further_than_it_says(tmp_path, compression, said
     import zstandard
     from mcap.records import Chunk
 
-    from share.io.mcap.chunks import records_of
-    from share.io.mcap.file import damage
+    from share.recordings.mcap.chunks import records_of
+    from share.recordings.mcap.file import damage
 
     pack = zstandard.ZstdCompressor().compress if compression == "zstd" else lz4.frame.compress
     data = pack(bytes(50 * 10**6))
@@ -204,7 +204,7 @@ def test_a_map_whose_tables_are_not_ours_is_read_without_them(tmp_path, name):
 
 
 def test_rows_that_say_what_cannot_be_cost_themselves(tmp_path):
-    from share.io.map_store.rows import COLUMNS, check
+    from share.store.rows import COLUMNS, check
 
     path = tmp_path / "map.sqlite"
     kept = filled(path)

@@ -6,7 +6,7 @@ import pytest
 from recordings import HEIGHT, WIDTH, depth_mm, picture
 
 from share.errors import DataError
-from share.io.images import EncodedImage, decode_gray
+from share.recordings.images import EncodedImage, decode_gray
 
 
 def encoded(extension: str, image: np.ndarray, scale: float = 0.0, width: int = WIDTH) -> EncodedImage:

@@ -12,7 +12,7 @@ import pytest
 
 from share.errors import DataError, ShareError, UsageError
 from share.geometry.camera import ImuBias
-from share.io.imu_memory import Remembered, file_of, folder, recall, remember
+from share.sensors.imu_memory import Remembered, file_of, folder, recall, remember
 
 SERIAL = "845112070914"
 WHAT = Remembered(1_790_000_000_123_456_789, ImuBias([0.004, -0.005, 1 / 3e3], [0.1, -0.2, 0.25], 2e-4, 4e-3))

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from recordings import make_euroc, make_tum
 
-from share.core.measurement import IMU, Measurement
-from share.core.stamps import WRAP_NS
 from share.errors import DataError, UsageError
-from share.io.convert import to_mcap
-from share.io.imu_table import read_imu
-from share.io.losses import Losses
-from share.io.mcap import imu as fast
-from share.io.mcap import types as ros
-from share.io.mcap.recorder import Recorder
-from share.io.profile import profile
-from share.io.source import open_source
+from share.lab.calibrate.imu_table import read_imu
+from share.recordings.convert import to_mcap
+from share.recordings.losses import Losses
+from share.recordings.mcap import imu as fast
+from share.recordings.mcap import types as ros
+from share.recordings.mcap.recorder import Recorder
+from share.runtime.source import open_source
+from share.sensors.measurement import IMU, Measurement
+from share.sensors.profile import profile
+from share.sensors.stamps import WRAP_NS
 
 
 def recorded(path: Path, stamps: list[int], values: np.ndarray, log: list[int] | None = None) -> Path:

@@ -3,7 +3,7 @@
 import pytest
 
 from share.errors import DataError
-from share.io.json_file import read_json, read_json_lines
+from share.files.json_file import read_json, read_json_lines
 
 
 def test_what_was_written_is_read(tmp_path):

@@ -15,9 +15,9 @@ import zmq
 from zmq.utils import z85
 
 from share.errors import ShareError, UsageError
-from share.io import keys
-from share.io.keys import AgentKeys, AllowList, EdgeKeys, KeyPair
-from share.io.transport import AgentLink, EdgeLink, bind, connect
+from share.net import keys
+from share.net.keys import AgentKeys, AllowList, EdgeKeys, KeyPair
+from share.net.transport import AgentLink, EdgeLink, bind, connect
 from share.wire.messages import peer_id
 
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from share.core.channel import NETWORKS, Network, Way
 from share.errors import UsageError
-from share.io.transport.links import Links
+from share.net.channel import NETWORKS, Network, Way
+from share.net.emulated import Links
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from share.io.machine import free_bytes
+from share.runtime.machine import free_bytes
 
 GB = 1_000_000_000
 

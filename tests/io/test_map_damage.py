@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from map_changes import ANN, BOB, keyframe, run, small_map, solution, told
 
-from share.core.keeping import KeepLink, Retire
 from share.errors import ShareError
-from share.io.map_store import MapStore, is_map, salvage
-from share.io.map_store.schema import PAGE_BYTES
-from share.merge.join import Key
+from share.mapping.changes import KeepLink, Retire
+from share.mapping.loops import Key
+from share.store import salvage
+from share.store.map_store import MapStore, is_map
+from share.store.schema import PAGE_BYTES
 
 
 @pytest.fixture(scope="module")

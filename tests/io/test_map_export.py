@@ -8,13 +8,13 @@ import pytest
 from hellos import hello_of
 from map_changes import ANN, BOB, keyframe, loop, pose, run, small_map, solution
 
-from share.core.keeping import KeepLoop, KeepRun, placed
 from share.errors import UsageError
 from share.geometry import se3
-from share.io.map_export import COLOURS, export, file_names
-from share.io.map_store import MapStore
-from share.io.trajectory import read_tum
-from share.merge.join import Key
+from share.mapping.changes import KeepLoop, KeepRun, placed
+from share.mapping.loops import Key
+from share.recordings.trajectory import read_tum
+from share.store.export import COLOURS, export, file_names
+from share.store.map_store import MapStore
 from share.types import AgentKind
 
 

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from share.io.map_store import MapStore
+from share.store.map_store import MapStore
 
 WRITER = """
 import random, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[3])
 from map_changes import ANN, keyframe, run, solution
-from share.io.map_store import MapStore
+from share.store.map_store import MapStore
 
 draw = random.Random(int(sys.argv[2]))
 with MapStore.open(Path(sys.argv[1])) as store:

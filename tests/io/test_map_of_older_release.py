@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 from recorded_traffic import VERSIONS, map_file
 
-from share.core.peer import known_runs
 from share.errors import StoreError
-from share.io.map_store import MapStore, rows
+from share.protocol.peer import known_runs
+from share.store import rows
+from share.store.map_store import MapStore
 from share.wire.codec import VERSION
 
 pytestmark = pytest.mark.parametrize("old", [version for version in VERSIONS if version < VERSION])

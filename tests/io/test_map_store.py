@@ -18,7 +18,8 @@ import pytest
 from map_changes import ANN, BOB, keyframe, loop, pose, run, small_map, solution, told
 from special_files import KINDS, special
 
-from share.core.keeping import (
+from share.errors import StoreError, UsageError
+from share.mapping.changes import (
     DropLoop,
     ForgetRun,
     KeepLink,
@@ -28,10 +29,10 @@ from share.core.keeping import (
     Retire,
     with_keys,
 )
-from share.errors import StoreError, UsageError
-from share.io.map_store import MapStore, is_map, schema
-from share.io.map_store.rows import insert
-from share.merge.join import Key
+from share.mapping.loops import Key
+from share.store import schema
+from share.store.map_store import MapStore, is_map
+from share.store.rows import insert
 from share.wire import codec
 
 
@@ -198,7 +199,7 @@ def test_one_edge_a_map_but_any_number_of_readers(path):
 def keyframes_for_a_reader(path) -> int:
     """In a process of its own."""
     code = (
-        "import sys; from pathlib import Path; from share.io.map_store import MapStore\n"
+        "import sys; from pathlib import Path; from share.store.map_store import MapStore\n"
         "print(len(MapStore.read(Path(sys.argv[1])).load().keyframes))"
     )
     return int(
@@ -325,7 +326,7 @@ def test_a_map_that_may_only_be_read(killed):
             (folder / name).chmod(0o444)
         folder.chmod(0o555)
         code = (
-            "import os, sys; from pathlib import Path; from share.io.map_store import MapStore\n"
+            "import os, sys; from pathlib import Path; from share.store.map_store import MapStore\n"
             "if os.geteuid() == 0: os.setuid(65534)\n"
             "store = MapStore.open(Path(sys.argv[1]))\n"
             "print(len(store.load().keyframes), store.writable, store.reason)"
@@ -391,7 +392,7 @@ import resource, sys
 from pathlib import Path
 from map_changes import small_map
 from share.errors import StoreError
-from share.io.map_store import MapStore
+from share.store.map_store import MapStore
 path, limit = Path(sys.argv[1]), int(sys.argv[2])
 store = MapStore.open(path) if limit > 50_000 else None
 resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))

@@ -12,19 +12,19 @@ import pytest
 from live import CAMERA, RIG, frames, live
 from recordings import HEIGHT, STEP_NS, WIDTH, depth_mm, make_euroc, make_tum, picture
 
-from share.core.measurement import Measurement
 from share.errors import ConfigError, DataError, UsageError
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
-from share.io.convert import to_euroc, to_mcap
-from share.io.describe import describe
-from share.io.images import ArrayImage
-from share.io.imu_table import read_imu
-from share.io.kalibr import kalibr_texts
-from share.io.mcap import rig as ros_rig
-from share.io.mcap import types as ros
-from share.io.mcap.recorder import Recorder
-from share.io.source import open_source
+from share.lab.calibrate.imu_table import read_imu
+from share.recordings.calibration import kalibr_texts
+from share.recordings.convert import to_euroc, to_mcap
+from share.recordings.describe import describe
+from share.recordings.images import ArrayImage
+from share.recordings.mcap import rig as ros_rig
+from share.recordings.mcap import types as ros
+from share.recordings.mcap.recorder import Recorder
+from share.runtime.source import open_source
+from share.sensors.measurement import Measurement
 
 
 def assert_same(a, b):

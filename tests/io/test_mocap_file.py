@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from share.errors import DataError, UsageError
-from share.io.mocap_file import pick_body, read_bodies, read_mocap
-from share.mocap.mocap import Mocap
+from share.lab.mocap.files import pick_body, read_bodies, read_mocap
+from share.lab.mocap.mocap import Mocap
 
 TUM = "1.0 1 2 3 0 0 0 1\n1.1 1 2 4 0 0 0 1\n1.2 1 2 5 0 0 0 1\n"
 CSV = "1000000000,1,2,3,1,0,0,0\n1100000000,1,2,4,1,0,0,0\n1200000000,1,2,5,1,0,0,0\n"

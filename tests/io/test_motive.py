@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from share.errors import DataError
-from share.io.mocap_file import read_bodies
+from share.lab.mocap.files import read_bodies
 
 FIRST = (
     "Format Version,{version},Take Name,Take 1,Take Notes,,Capture Frame Rate,120.000000,"

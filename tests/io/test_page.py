@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from share.io.page import page
+from share.lab.evaluate.page import page
 
 TEXT = """# Two < three
 

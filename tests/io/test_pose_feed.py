@@ -14,8 +14,8 @@ import pytest
 
 from share.errors import UsageError
 from share.geometry.se3 import compose, matrix_from_quat, so3_exp
-from share.io.pose_feed import PoseFeed
-from share.io.trajectory import read_tum
+from share.recordings.trajectory import read_tum
+from share.runtime.pose_feed import PoseFeed
 
 
 @pytest.fixture

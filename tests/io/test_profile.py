@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from share.errors import ConfigError
-from share.io import profile as profiles
-from share.io.calibration import read_calibration
-from share.io.profile import host_profile, profile, shipped
+from share.recordings.calibration import read_calibration
+from share.sensors import profile as profiles
+from share.sensors.profile import host_profile, profile, shipped
 
 ROOT = Path(__file__).resolve().parents[2]
 

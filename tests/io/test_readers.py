@@ -11,7 +11,7 @@ from recordings import HEIGHT, START_NS, STEP_NS, WIDTH, depth_mm, make_euroc, m
 
 from share.errors import ConfigError, DataError, ShareError, UsageError
 from share.geometry import se3
-from share.io.source import open_source
+from share.runtime.source import open_source
 
 
 @pytest.fixture

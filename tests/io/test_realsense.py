@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from software_camera import BASELINE, T_GYRO_IR, Listed, SoftwareCamera
 
-from share.core.intake import Sample
+from share.cameras.realsense import camera as adapter
+from share.cameras.realsense.camera import RealSense
+from share.cameras.realsense.devices import Attached, choose
+from share.cameras.realsense.factory import camera as factory_camera
+from share.cameras.realsense.frames import metres
+from share.cameras.realsense.streams import Wanted
 from share.errors import ShareError, UsageError
-from share.io.mcap import types as ros
-from share.io.mcap.images import to_raw
-from share.io.profile import profile
-from share.io.realsense import camera as adapter
-from share.io.realsense.camera import RealSense
-from share.io.realsense.devices import Attached, choose
-from share.io.realsense.factory import camera as factory_camera
-from share.io.realsense.frames import metres
-from share.io.realsense.streams import Wanted
+from share.recordings.mcap import types as ros
+from share.recordings.mcap.images import to_raw
+from share.sensors.intake import Sample
+from share.sensors.profile import profile
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 
@@ -112,7 +112,7 @@ def test_the_factory_calibration_becomes_a_rig_with_the_body_in_the_imu(camera: 
 
 
 def test_a_rotation_of_the_sdk_is_read_column_by_column() -> None:
-    from share.io.realsense.factory import transform
+    from share.cameras.realsense.factory import transform
 
     class Told:
         rotation, translation = (0, 1, 0, -1, 0, 0, 0, 0, 1), (1, 2, 3)  # rs2_extrinsics: column-major

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from camera_imu_sim import CAM0, CAM1, T_CAM1_CAM0
 
-from share.calibration.projection import intrinsics, names
 from share.errors import DataError
 from share.geometry.camera import Rig
-from share.io.rig_doubt import rig_doubt
+from share.lab.calibrate.camera_report import rig_doubt
+from share.lab.calibrate.camera_start import intrinsics, names
 
 RIG = Rig(CAM0, np.eye(4), CAM1, T_CAM1_CAM0)
 COVARIANCE = np.diag(np.arange(1.0, 23)).tolist()

@@ -5,9 +5,9 @@ import pytest
 from recordings import make_euroc, make_tum
 
 from share.errors import ConfigError, ShareError, UsageError
-from share.io.convert import to_mcap
-from share.io.session import read_session
-from share.io.source import open_source
+from share.recordings.convert import to_mcap
+from share.recordings.session import read_session
+from share.runtime.source import open_source
 from share.types import AgentKind
 
 YAML = """schema: 1

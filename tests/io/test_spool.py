@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from share.errors import ShareError
-from share.io.spool import Spool
-from share.metrics.runlog import RunLog
-from share.run.agent_files import AgentFiles
+from share.files.line_file import Spool
+from share.metrics.frame_log import RunLog
+from share.runtime.agent_files import AgentFiles
 from share.types import TrackState
 
 LINES = [f"line {k}, {'é' * (k % 50)}" for k in range(30_000)]  # more than is read at once

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import yaml
 
-from share.core.measurement import IMU, Measurement
 from share.errors import UsageError
 from share.geometry.camera import Camera, ImuNoise, Rig
-from share.io.kalibr import to_kalibr
-from share.io.mcap.recorder import Recorder
-from share.io.stated_noise import stated_noise
+from share.lab.calibrate.imu_table import stated_noise
+from share.recordings.calibration import to_kalibr
+from share.recordings.mcap.recorder import Recorder
+from share.sensors.measurement import IMU, Measurement
 
 NOISE = ImuNoise(2.4e-4, 1.5e-3, 1e-5, 1.5e-4, 200.0)
 RIG = Rig(Camera(64, 48, 40.0, 40.0, 31.5, 23.5), np.eye(4), imu=NOISE)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from share.errors import ConfigError
-from share.io.section import Section
-from share.io.strict import read
+from share.files.yaml_file import Section, read
 from share.types import F64
 
 

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from share.errors import DataError
 from share.geometry import se3
-from share.io.losses import Losses
-from share.io.tables import parse_seconds, read_table
-from share.io.trajectory import Trajectory, format_seconds, format_tum, read_tum
+from share.recordings.losses import Losses
+from share.recordings.tables import parse_seconds, read_table
+from share.recordings.trajectory import Trajectory, format_seconds, format_tum, read_tum
 
 GOOD = "#t,a,b\n1403715273262142976,0.5,-1e-3\n1403715273267142912,1.5,2\n"
 

@@ -7,8 +7,7 @@ import pytest
 import yaml
 
 from share.errors import ConfigError
-from share.geometry.target import AprilGrid, CharucoBoard
-from share.io.target import read_target, session_target, to_plain
+from share.lab.calibrate.target import AprilGrid, CharucoBoard, read_target, session_target, to_plain
 
 KALIBR = """
 target_type: 'aprilgrid' #gridtype

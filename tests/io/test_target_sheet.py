@@ -4,9 +4,8 @@ import numpy as np
 import pypdfium2
 import pytest
 
-from share.calibration.detect import detector
-from share.calibration.sheet import sheet
-from share.io.target_sheet import pdf
+from share.lab.calibrate.corners import detector
+from share.lab.calibrate.target_sheet import pdf, sheet
 
 INCH = 25.4
 

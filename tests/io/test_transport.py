@@ -13,10 +13,13 @@ from typing import Any
 import pytest
 import zmq
 
-from share.core.channel import Network, Way
 from share.errors import ConfigError, TransportError, UsageError
-from share.io.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate
-from share.io.transport import (
+from share.net.channel import Network, Way
+from share.net.emulated import ShapedLink, network
+from share.net.guard import Guard
+from share.net.keys import AgentKeys, EdgeKeys, allow_list, authorize, generate
+from share.net.memory import MemoryNetwork
+from share.net.transport import (
     LINGER_MS,
     QUEUE_MESSAGES,
     AgentLink,
@@ -26,9 +29,6 @@ from share.io.transport import (
     connect,
     parse_address,
 )
-from share.io.transport.guard import Guard
-from share.io.transport.memory import MemoryNetwork
-from share.io.transport.shaped import ShapedLink, network
 from share.wire.codec import MAX_FRAME_BYTES, encode
 from share.wire.messages import Bye, Ping, peer_id
 

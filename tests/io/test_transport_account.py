@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from share.io.transport.account import PART_BYTES, TINY, Account, Bounds, wire_bytes
-from share.io.transport.keep_out import FIRST_S, MOST_S, KeepOut
+from share.net.account import PART_BYTES, TINY, Account, Bounds, wire_bytes
+from share.net.gate import FIRST_S, MOST_S, KeepOut
 from share.types import DESCRIPTOR_BYTES, MAX_KEYPOINTS
 from share.wire.codec import MAX_FRAME_BYTES, MAX_HEADER_BYTES, MAX_IMAGE_BYTES
 

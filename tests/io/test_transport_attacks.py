@@ -25,8 +25,8 @@ import pytest
 from raw_curve import CurvePeer
 from raw_zmtp import RawPeer, frame, greeting, message, parts, ready
 
-from share.io.keys import AgentKeys, authorize, generate
-from share.io.transport import connect
+from share.net.keys import AgentKeys, authorize, generate
+from share.net.transport import connect
 from share.wire.messages import peer_id
 
 GROWTH_BYTES = 100_000_000

@@ -10,8 +10,8 @@ from contextlib import closing, contextmanager
 import pytest
 
 from share.errors import TransportError, UsageError
-from share.io import udp
-from share.io.udp import Host, StampedSocket, clock_precision, parse_host
+from share.net import udp
+from share.net.udp import Host, StampedSocket, clock_precision, parse_host
 
 
 @contextmanager

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from share.errors import DataError
-from share.io.mocap_file import read_bodies
-from share.io.vicon import read_vicon
+from share.lab.mocap.files import read_bodies
+from share.lab.mocap.vicon import read_vicon
 
 HEAD = """Objects
 100

@@ -6,11 +6,10 @@ import numpy as np
 
 from share.config import GraphConfig
 from share.geometry import se3
-from share.graph.change import Solution
-from share.graph.solver import Solver
-from share.merge.atlas import Applied, Atlas
-from share.merge.join import Key, Loop
-from share.merge.solving import SolveJob
+from share.mapping.atlas import Applied, Atlas, SolveJob
+from share.mapping.graph.solver import Solver
+from share.mapping.graph.updates import Solution
+from share.mapping.loops import Key, Loop
 from share.types import F64, Keyframe, View
 
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
@@ -89,7 +88,7 @@ def settle(atlas: Atlas) -> list[Applied]:
 
 def error(poses: F64, truth: F64) -> float:
     """RMS position error, m, after one rigid alignment of all."""
-    from share.geometry.align import umeyama
+    from share.geometry.se3 import umeyama
 
     T = umeyama(poses[:, :3, 3], truth[:, :3, 3])
     return float(np.sqrt(((se3.transform(T, poses[:, :3, 3]) - truth[:, :3, 3]) ** 2).sum(1).mean()))

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from share.geometry import se3
-from share.graph.posegraph import Edge
-from share.merge.agreement import Agreement
-from share.merge.consistency import Walked, Witness, compare, points_scale
-from share.place.scale import Scale
+from share.mapping.agents.agreement import Agreement
+from share.mapping.agents.consistency import Walked, Witness, compare, points_scale
+from share.mapping.graph.edges import Edge
+from share.mapping.recognition.scale import Scale
 
 STEP_COV = np.diag([2e-4**2] * 3 + [2e-3**2] * 3)
 LOOP_COV = np.diag([4e-3**2] * 3 + [0.02**2] * 3)

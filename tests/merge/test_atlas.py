@@ -6,8 +6,8 @@ from atlas_sim import Walker, answer, error, loop, near_loops, settle
 
 from share.config import MergeConfig
 from share.geometry import se3
-from share.merge.atlas import Atlas
-from share.merge.join import Key, Loop
+from share.mapping.atlas import Atlas
+from share.mapping.loops import Key, Loop
 from share.types import F64
 
 # as careful as where copies of whole corridors are to be expected

@@ -10,10 +10,10 @@ from atlas_sim import EMPTY, STEP, UP, UP_SIGMA, Walker, loop
 
 from share.config import MergeConfig
 from share.geometry import se3
-from share.merge.atlas import Atlas
-from share.merge.bridges import bridging
-from share.merge.join import Key
-from share.merge.owners import Owners, dues
+from share.mapping.atlas import Atlas
+from share.mapping.loop_consistency import bridging
+from share.mapping.loops import Key
+from share.mapping.segments import Owners, dues
 from share.types import F64, Keyframe
 
 CONFIG = MergeConfig()

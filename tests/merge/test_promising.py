@@ -6,8 +6,8 @@ import numpy as np
 from atlas_sim import EMPTY, STEP, UP
 
 from share.geometry import se3
-from share.merge.chart import Chart
-from share.merge.promising import promising_first
+from share.mapping.candidates import promising_first
+from share.mapping.map_graph import Chart
 from share.types import Keyframe
 
 

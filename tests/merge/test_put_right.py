@@ -11,13 +11,13 @@ from atlas_sim import STEP, UP, UP_SIGMA, Walker, near_loops
 
 from share.config import MergeConfig
 from share.geometry import se3
-from share.graph.posegraph import Edge
-from share.merge.agreement import Agreement
-from share.merge.atlas import Atlas, Placed
-from share.merge.floors import believed
-from share.merge.join import Key
-from share.place.refine import Noise, refine
-from share.place.scale import Scale, relative_scale
+from share.mapping.agents.agreement import Agreement
+from share.mapping.agents.covariance_scale import believed
+from share.mapping.atlas import Atlas, Placed
+from share.mapping.graph.edges import Edge
+from share.mapping.loops import Key
+from share.mapping.recognition.refinement import Noise, refine
+from share.mapping.recognition.scale import Scale, relative_scale
 from share.types import Keyframe, View
 
 NOISE = Noise(1.5 / 400, 0.01)

@@ -8,14 +8,13 @@ from atlas_sim import Walker, near_loops
 
 from share.config import MergeConfig
 from share.geometry import se3
-from share.graph.posegraph import Edge
-from share.merge.agreement import Agreement
-from share.merge.atlas import Atlas
-from share.merge.join import Key, Loop
-from share.merge.judge import Decision
-from share.merge.subjects import Subjects
-from share.merge.votes import outvoted
-from share.place.scale import Scale
+from share.mapping.agents.agreement import Agreement
+from share.mapping.agents.subjects import Subjects, outvoted
+from share.mapping.atlas import Atlas
+from share.mapping.graph.edges import Edge
+from share.mapping.loop_acceptance import Decision
+from share.mapping.loops import Key, Loop
+from share.mapping.recognition.scale import Scale
 
 STEP = np.diag([2e-4**2] * 3 + [2e-3**2] * 3)
 LOOP = np.diag([4e-3**2] * 3 + [0.02**2] * 3)

@@ -9,12 +9,11 @@ import pytest
 from test_agent_consistency import FRAMES, LOOP_COV, STEP_COV, chain, ring, steps_of
 
 from share.geometry import se3
-from share.graph.posegraph import Edge
-from share.merge.agreement import Agreement
-from share.merge.claims import Claims
-from share.merge.consistency import Witness, equations, points_scale, solved
-from share.merge.sureness import Sureness
-from share.place.scale import Scale
+from share.mapping.agents.agreement import Agreement
+from share.mapping.agents.consistency import Witness, equations, points_scale, solved
+from share.mapping.agents.covariance_scale import Claims, Sureness
+from share.mapping.graph.edges import Edge
+from share.mapping.recognition.scale import Scale
 
 MOVED = se3.exp(np.array([0, 0, 0.05, 0.3, 0, 0]))
 WALKERS = {"ann": 0.0, "bob": 0.7, "eve": 1.4}

@@ -9,9 +9,9 @@ import pytest
 from atlas_sim import Walker, loop, settle
 
 from share.config import MergeConfig
-from share.merge.atlas import Atlas
-from share.merge.join import Loop
-from share.merge.surety import Found, Surety
+from share.mapping.atlas import Atlas
+from share.mapping.corrections import Found, Surety
+from share.mapping.loops import Loop
 
 ANN, BOB, EVE, ROBOT = ALL = range(4)  # stretches, the oldest first
 

@@ -6,11 +6,11 @@ from numpy.typing import NDArray
 
 from share.config import GraphConfig, MergeConfig
 from share.geometry import se3
-from share.graph.solver import Solver
-from share.merge.atlas import Atlas
-from share.merge.join import Loop
-from share.merge.judge import Decision
-from share.place.verify import Sight
+from share.mapping.atlas import Atlas
+from share.mapping.graph.solver import Solver
+from share.mapping.loop_acceptance import Decision
+from share.mapping.loops import Loop
+from share.mapping.recognition.verification import Sight
 from share.types import F64, U8, View
 
 FOCAL = 400.0

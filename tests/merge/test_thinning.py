@@ -11,11 +11,11 @@ from atlas_sim import Walker, error, loop, near_loops
 
 from share.config import GraphConfig, MergeConfig
 from share.geometry import se3
-from share.graph.solver import Solver
-from share.merge.atlas import Atlas
-from share.merge.chart import Chart
-from share.merge.join import Key
-from share.merge.thinning import redundant, take_out
+from share.mapping.atlas import Atlas
+from share.mapping.culling import redundant, take_out
+from share.mapping.graph.solver import Solver
+from share.mapping.loops import Key
+from share.mapping.map_graph import Chart
 from share.types import F64
 
 CONFIG = MergeConfig()

@@ -5,8 +5,8 @@ import math
 
 import pytest
 
-from share.metrics.comparison import MEASURES, compare, no_worse, no_worse_on_average, policies
-from share.metrics.figures import AgentFigures, Conditions, RunFigures
+from share.lab.evaluate.figures import AgentFigures, Conditions, RunFigures
+from share.lab.evaluate.statistics import MEASURES, compare, no_worse, no_worse_on_average, policies
 
 NAN = math.nan
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from share.geometry import se3
-from share.metrics.consistency import deviations, inside, nees, upright
+from share.lab.evaluate.statistics import deviations, inside, nees, upright
 
 COV = np.diag([0.02, 0.01, 0.03, 0.05, 0.1, 0.02]) ** 2
 COV[0, 4] = COV[4, 0] = 0.8 * 0.02 * 0.1

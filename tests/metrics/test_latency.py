@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from share.metrics.latency import Queue, latency, summary
+from share.metrics.frame_log import Queue, latency, summary
 
 
 def test_mean_is_over_the_multiset_of_both():

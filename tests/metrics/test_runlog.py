@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 
 from share.errors import DataError
-from share.io.spool import Spool
-from share.metrics.latency import latency
-from share.metrics.runlog import InMemory, RunLog
+from share.files.line_file import Spool
+from share.metrics.frame_log import InMemory, RunLog, latency
 from share.types import TrackState, Wait
 
 STATES = list(TrackState)

@@ -1,6 +1,6 @@
 """Who shares a map, as corrections come."""
 
-from share.metrics.together import Together
+from share.lab.evaluate.together import Together
 
 
 def test_agents_come_together_and_part():

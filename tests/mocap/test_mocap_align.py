@@ -8,15 +8,15 @@ import pytest
 from mocap_sim import BODY, NOISE, START_NS, TILT, Motion, record_imu, record_mocap
 
 from share.errors import DataError, MisfitError
+from share.files.yaml_file import read_yaml
 from share.geometry import se3
-from share.io.calibration import imu_noise
-from share.io.imu_table import read_imu
-from share.io.mocap_file import read_mocap
-from share.io.section import read_yaml
-from share.mocap.align import LEAST_LEAD, align, level
-from share.mocap.mocap import Mocap
-from share.mocap.offset import find_offset
-from share.mocap.options import FitOptions
+from share.lab.calibrate.imu_table import read_imu
+from share.lab.mocap.align import LEAST_LEAD, align, level
+from share.lab.mocap.files import read_mocap
+from share.lab.mocap.mocap import Mocap
+from share.lab.mocap.offset import find_offset
+from share.lab.mocap.state import FitOptions
+from share.recordings.calibration import imu_noise
 from share.types import F64
 
 AWAY_NS = 1_599_999_000_000_000_000 + 123_456  # the mocap's clock begins at about 1000 s

@@ -6,9 +6,9 @@ from mocap_sim import BODY, NOISE, START_NS, TILT, G, Motion, record_imu, record
 
 from share.errors import DataError, MisfitError
 from share.geometry import se3
-from share.mocap.fit import Fit, fit
-from share.mocap.mocap import Mocap
-from share.mocap.options import FitOptions
+from share.lab.mocap.fit import Fit, fit
+from share.lab.mocap.mocap import Mocap
+from share.lab.mocap.state import FitOptions
 from share.types import F64, ImuBatch
 
 DELAY = 12_345_678  # ns

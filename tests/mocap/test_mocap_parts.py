@@ -8,12 +8,12 @@ from mocap_sim import BODY, NOISE, START_NS, TILT, G, Motion, record_imu, record
 
 from share.errors import MisfitError
 from share.geometry import se3
-from share.mocap import factors
-from share.mocap.offset import coarse_offset
-from share.mocap.preintegrate import preintegrate
-from share.mocap.solve import node_covariances, normal_equations, solve
-from share.mocap.start import hand_eye
-from share.mocap.state import NODE, SHARED, State
+from share.lab.mocap import factors
+from share.lab.mocap.batch import node_covariances, normal_equations, solve
+from share.lab.mocap.factors import preintegrate
+from share.lab.mocap.offset import coarse_offset
+from share.lab.mocap.start import hand_eye
+from share.lab.mocap.state import NODE, SHARED, State
 from share.types import F64, I64, ImuBatch
 
 MS = 1_000_000

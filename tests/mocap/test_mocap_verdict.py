@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from share.errors import MisfitError
 from share.geometry import se3
-from share.mocap.align import Aligned, align
-from share.mocap.mocap import Mocap
-from share.mocap.options import FitOptions
-from share.mocap.verdict import sigmas
+from share.lab.mocap.align import Aligned, align
+from share.lab.mocap.mocap import Mocap
+from share.lab.mocap.state import FitOptions
+from share.lab.mocap.verdict import sigmas
 from share.types import F64
 
 SECONDS, NEAR = 16.0, FitOptions(within_s=1.0)

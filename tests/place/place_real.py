@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from share.core.measurement import CAM0, CAM1, DEPTH
 from share.geometry import se3
-from share.io.recording import FolderSource
-from share.io.source import open_source
-from share.place.verify import Sight
+from share.mapping.recognition.verification import Sight
+from share.recordings.recording import FolderSource
+from share.runtime.source import open_source
+from share.sensors.measurement import CAM0, CAM1, DEPTH
 from share.types import F64, Frame
-from share.vision.view import make_view
+from share.vision.orb import make_view
 
 
 class Seen(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from share.geometry import se3
-from share.place.verify import Sight
+from share.mapping.recognition.verification import Sight
 from share.types import F64, U8, View
 
 FOCAL = 458.0

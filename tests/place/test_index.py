@@ -3,8 +3,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from share.place.index import PlaceIndex
-from share.place.page import joined, written
+from share.mapping.recognition.index import PlaceIndex, joined, written
 from share.types import U8
 
 

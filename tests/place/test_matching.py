@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 
-from share.place.matching import Pairs, hamming, match, mutual, near
+from share.vision.matching import Pairs, hamming, match, mutual, near
 
 
 def test_hamming_agrees_with_opencv() -> None:

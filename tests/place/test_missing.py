@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from place_sim import bodies, sights
 
 from share.geometry import se3
-from share.place.missing import Gone, Missing, gone, missing
-from share.place.verify import Sight
+from share.mapping.recognition.missing import Gone, Missing, gone, missing
+from share.mapping.recognition.verification import Sight
 from share.types import View
 
 T_C_Q = se3.exp(np.array([0.02, -0.03, 0.01, 0.1, 0.05, -0.1]))

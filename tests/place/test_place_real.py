@@ -13,8 +13,8 @@ from place_real import Seen, load
 
 from share.config import PlaceConfig
 from share.geometry import se3
-from share.place.index import PlaceIndex
-from share.place.verify import Verified, verify
+from share.mapping.recognition.index import PlaceIndex
+from share.mapping.recognition.verification import Verified, verify
 
 CONFIG = PlaceConfig()
 

@@ -3,7 +3,7 @@ import pytest
 from place_sim import FOCAL, SIGMA_PX, SIGMA_RHO
 
 from share.geometry import se3
-from share.place.refine import Noise, by_keypoint, by_pose, move, refine
+from share.mapping.recognition.refinement import Noise, by_keypoint, by_pose, move, refine
 from share.types import F64
 
 NOISE = Noise(SIGMA_PX / FOCAL, SIGMA_RHO)

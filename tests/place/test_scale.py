@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from share.geometry import se3
-from share.place.refine import Noise
-from share.place.scale import Scale, relative_scale
+from share.mapping.recognition.refinement import Noise
+from share.mapping.recognition.scale import Scale, relative_scale
 
 NOISE = Noise(1.5 / 400, 0.01)
 T_C_Q = se3.exp(np.array([0.02, -0.1, 0.05, 0.3, 0.1, -0.2]))

@@ -7,7 +7,7 @@ from place_sim import bodies, sights
 
 from share.config import PlaceConfig
 from share.geometry import se3
-from share.place.verify import Refusal, Sight, Verified, verify
+from share.mapping.recognition.verification import Refusal, Sight, Verified, verify
 from share.types import MAX_M, MAX_UV, View
 
 CONFIG = PlaceConfig()

@@ -13,8 +13,8 @@ import pyrealsense2 as rs
 from software_camera import SoftwareCamera
 from software_share import share
 
-from share.core.measurement import Measurement
-from share.io.mcap.recorder import Recorder
+from share.recordings.mcap.recorder import Recorder
+from share.sensors.measurement import Measurement
 
 CAMERA = SoftwareCamera(rs)
 

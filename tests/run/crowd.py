@@ -10,10 +10,10 @@ import numpy as np
 from edge_sim import Person, walls
 
 from share.config import Config
-from share.core import events as ev
-from share.core.agent import Agent
 from share.geometry import se3
-from share.io.transport import AgentLink, connect
+from share.net.transport import AgentLink, connect
+from share.protocol import agent_events as ev
+from share.protocol.agent import Agent
 from share.types import F64, Candidate, TrackState, View
 from share.wire.messages import Hello
 

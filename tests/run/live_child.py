@@ -10,7 +10,7 @@ import pyrealsense2 as rs
 from room_camera import BEGIN_US, RoomCamera
 from software_share import share
 
-from share.io.source import open_source
+from share.runtime.source import open_source
 
 ROOM = RoomCamera(rs, open_source(sys.argv[1]))
 

@@ -8,11 +8,10 @@ import yaml
 
 from share.config import Config, from_mapping
 from share.errors import UsageError
-from share.io.session import Session
-from share.run.ablation import plan
-from share.run.campaign import Planned, dealt, go_through, play_all
-from share.run.play import Terms
-from share.run.trial import read_trial, settings_of
+from share.lab.evaluate.campaign import Planned, dealt, go_through, plan, play_all
+from share.lab.evaluate.play import Terms
+from share.lab.evaluate.trial import read_trial, settings_of
+from share.recordings.session import Session
 
 TERMS = Terms("", "wifi5")
 

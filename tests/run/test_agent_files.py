@@ -6,11 +6,11 @@ import json
 
 import numpy as np
 
-from share.io.trajectory import Trajectory, format_tum, read_tum
+from share.lab.evaluate.play import AgentScore, _joint
 from share.metrics.ate import ate
-from share.metrics.runlog import RunLog
-from share.run.agent_files import AgentFiles
-from share.run.score import AgentScore, _joint
+from share.metrics.frame_log import RunLog
+from share.recordings.trajectory import Trajectory, format_tum, read_tum
+from share.runtime.agent_files import AgentFiles
 
 
 def test_a_map_that_comes_after_the_last_pose_is_not_that_of_the_file(tmp_path):

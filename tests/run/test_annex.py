@@ -7,8 +7,8 @@ import math
 import pytest
 
 from share.errors import DataError, UsageError
-from share.run.annex import annex
-from share.train.score import Score, read_scores, to_json
+from share.lab.evaluate.report import annex
+from share.lab.train.score import Score, read_scores, to_json
 
 SCORES = [Score("always the mean", 2.5, 1.0, 0.0, 0.2), Score("ours", 1.5, 0.5, 0.8, 0.1, 0.9, 1.2)]
 

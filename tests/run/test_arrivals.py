@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from share.core.events import Tick
-from share.run.arrivals import READ_AHEAD, Played, Seen
-from share.run.late import Late
+from share.protocol.agent_events import Tick
+from share.runtime.arrivals import READ_AHEAD, Late, Played, Seen
 from share.types import Frame, ImuBatch
 
 _PATIENCE_S = 5.0

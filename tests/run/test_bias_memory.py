@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from plain_walk import RIG
 
+from share.cameras.live import LiveSource
 from share.config import Config
-from share.core.known_bias import POWER_ON_ACCEL
 from share.geometry.camera import ImuBias
-from share.io.imu_memory import file_of
-from share.io.live import LiveSource
-from share.run.imu_memory import ImuMemory
+from share.runtime.imu_memory import ImuMemory
+from share.sensors.imu_memory import POWER_ON_ACCEL, file_of
 
 DAY_NS = 86_400 * 10**9
 NOON_NS = 1_790_000_000 * 10**9

@@ -16,13 +16,13 @@ from capture_bench import quick
 from children import Child
 from room_camera import HZ, STEREO, RoomCamera
 
+from share.cameras.handover import KeepNewest
+from share.cameras.live import WAITING, LiveSource
 from share.config import Config
-from share.io.handover import KeepNewest
-from share.io.live import WAITING, LiveSource
-from share.io.pose_feed import PoseFeed
-from share.io.source import open_source
-from share.io.transport import connect
-from share.run.agent import AgentRun
+from share.net.transport import connect
+from share.runtime.agent import AgentRun
+from share.runtime.pose_feed import PoseFeed
+from share.runtime.source import open_source
 from share.types import AgentKind
 from share.wire.messages import Hello
 

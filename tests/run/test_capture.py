@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from capture_bench import PICTURE, WANTED, WRAP_US, Bench, Fake, quick
 
-from share.core.intake import Sample
-from share.core.measurement import Measurement
+from share.cameras.feed import Feed
+from share.cameras.handover import Handover
 from share.errors import ShareError, UsageError
-from share.io.calibration import Calibration
-from share.io.feed import Feed
-from share.io.handover import Handover
-from share.io.imu_table import read_imu
-from share.io.mcap.recorder import Recorder
-from share.io.profile import profile
-from share.io.source import open_source
-from share.run.capture import Capture
+from share.lab.calibrate.imu_table import read_imu
+from share.recordings.calibration import Calibration
+from share.recordings.mcap.recorder import Recorder
+from share.runtime.capture import Capture
+from share.runtime.source import open_source
+from share.sensors.intake import Sample
+from share.sensors.measurement import Measurement
+from share.sensors.profile import profile
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 

@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from share.io.mcap.recover import recover
-from share.io.source import open_source
+from share.recordings.mcap.recover import recover
+from share.runtime.source import open_source
 
 pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 

@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 from capture_bench import PICTURE, WANTED, Bench, Fake, quick
 
+from share.cameras.realsense.streams import Wanted
 from share.config import Config
-from share.core.sequencer import SequencerCounters
-from share.core.watchdog import Health
-from share.io.imu_table import read_imu
-from share.io.mcap.recover import recover
-from share.io.realsense.streams import Wanted
-from share.io.source import open_source
-from share.run.pipeline import frames_of
+from share.lab.calibrate.imu_table import read_imu
+from share.recordings.mcap.recover import recover
+from share.runtime.pipeline import frames_of
+from share.runtime.source import open_source
+from share.sensors.sequencer import SequencerCounters
+from share.sensors.watchdog import Health
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 

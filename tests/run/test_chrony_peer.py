@@ -13,12 +13,11 @@ import pytest
 from shell import Done
 from time_servers import CHRONYC, chronyd, free_port, needs_chrony, running_chronyd, shifted, udp, wait_for
 
-from share.core.time_server import TimeServer
-from share.io.chrony import follow, tracking
-from share.io.udp import Host, StampedSocket
-from share.run import time_check
-from share.run.time_check import check
-from share.run.time_server import TimeServerRun
+from share.devices import time_client
+from share.devices.chrony import follow, tracking
+from share.devices.time_client import check
+from share.devices.time_server import TimeServer, TimeServerRun
+from share.net.udp import Host, StampedSocket
 
 pytestmark = needs_chrony
 QUICK = "iburst minpoll -2 maxpoll -2"  # four questions in a second
@@ -28,7 +27,7 @@ CLOSE_MS = 2.0  # on a machine as busy as one that runs tests; tools/measure_syn
 
 @pytest.fixture(autouse=True)
 def _brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(time_check, "PAUSE_S", 0.02)
+    monkeypatch.setattr(time_client, "PAUSE_S", 0.02)
 
 
 @contextmanager
@@ -108,7 +107,7 @@ def test_our_client_asks_a_chronyd(tmp_path: Path) -> None:
 def test_a_chronyd_that_does_not_know_the_time_is_not_believed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(time_check, "PATIENCE_S", 0.3)
+    monkeypatch.setattr(time_client, "PATIENCE_S", 0.3)
     port = free_port()
     with running_chronyd(tmp_path / "run", f"port {port}", "allow 127.0.0.1"):
         (found,) = check([Host("127.0.0.1", port)], 4)

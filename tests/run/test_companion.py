@@ -11,12 +11,12 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from share.run.companion import END, Companion, Inbox
+from share.runtime.worker import END, Companion, Inbox
 
 LINES = """
 import sys, time
 from test_companion import doubles
-from share.run.companion import Companion
+from share.runtime.worker import Companion
 if __name__ == "__main__":
     c = Companion("doubles", doubles, (), lambda m: None, lambda how: None)
     print(c.pid, flush=True)
@@ -26,7 +26,7 @@ if __name__ == "__main__":
 
 INTERRUPTED = """
 from test_companion import doubles
-from share.run import companion
+from share.runtime import worker as companion
 start = companion.SPAWN.Process.start
 def interrupted(process):
     start(process)

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from share.core.world import Cost, Costs
 from share.errors import DataError, ShareError, UsageError
-from share.run.costs import costs_of
+from share.lab.evaluate.virtual import costs_of
+from share.lab.evaluate.world import Cost, Costs
 
 
 def spread(p50: float, p95: float, n: int = 10) -> dict[str, float | None]:

@@ -13,14 +13,14 @@ import pytest
 from children import SHARE
 
 from share.config import Config
-from share.core.measurement import CAM0, IMU
-from share.emulate.demo import SCENE, recipe
-from share.emulate.session import cached_session
-from share.estimator.gravity import LEAST
 from share.geometry import se3
-from share.io.source import open_source
-from share.metrics.association import associate
-from share.run.track import track
+from share.geometry.interpolation import associate
+from share.lab.emulate.demo import SCENE, recipe
+from share.lab.emulate.session import cached_session
+from share.odometry.initialisation import LEAST
+from share.runtime.source import open_source
+from share.runtime.track import track
+from share.sensors.measurement import CAM0, IMU
 
 FRAMES = 90  # 6 s at 15 Hz
 

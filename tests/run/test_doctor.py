@@ -14,9 +14,9 @@ import pytest
 from children import Child, start_edge
 from shell import Done
 
-from share.io.host import governors, pi_throttled, resets_governor, throttles, usb_memory_mb
-from share.io.realsense import asked
-from share.run import doctor, edge_probe
+from share.cameras.realsense import asked
+from share.devices.host import governors, pi_throttled, resets_governor, throttles, usb_memory_mb
+from share.runtime import doctor
 
 Share = Callable[..., Done]
 LAPTOP = ("--profile", "laptop-edge")
@@ -85,7 +85,7 @@ def test_an_edge_that_is_there_answers_soon(share: Share, edge: str, tmp_path: P
 def test_an_edge_that_is_not_there_fails_in_one_line(
     share: Share, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(edge_probe.probe, "__defaults__", (0.3,))
+    monkeypatch.setattr(doctor.probe, "__defaults__", (0.3,))
     done = share("doctor", *LAPTOP, "--edge", "tcp://127.0.0.1:1", "--keys", tmp_path / "none")
     assert done.code == 1
     assert done.err == "share: doctor: 1 FAIL: edge\n"

@@ -15,9 +15,9 @@ from children import Child
 from crowd import crowd
 from map_changes import small_map
 
-from share.io.map_store import MapStore
-from share.io.map_store.rows import insert
-from share.io.map_store.schema import SCHEMA
+from share.store.map_store import MapStore
+from share.store.rows import insert
+from share.store.schema import SCHEMA
 
 
 def edge(folder: Path, name: str = "edge", bind: str = "tcp://127.0.0.1:0") -> Child:

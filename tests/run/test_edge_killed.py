@@ -18,8 +18,8 @@ import pytest
 from children import Child
 from crowd import EVERY, FRAME_S, Walker, crowd
 
-from share.core.keeping import placed
-from share.io.map_store import MapStore
+from share.mapping.changes import placed
+from share.store.map_store import MapStore
 
 NAMES = ("ann", "bob", "cy")
 # None is taken out for want of room, or withheld by an agent that is late and has a rate: neither is a loss.

@@ -10,8 +10,8 @@ import pytest
 from children import Child
 
 from share.config import Config
-from share.io.transport import bind
-from share.run.edge import EdgeRun
+from share.net.transport import bind
+from share.runtime.edge import EdgeRun
 
 
 def test_a_busy_status_port_ends_it_with_one_line(tmp_path):

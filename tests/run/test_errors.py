@@ -8,8 +8,8 @@ import time
 import numpy as np
 import pytest
 
-from share.estimator.result import TrackResult
-from share.run.errors import AtOnce, ByModel
+from share.odometry.result import TrackResult
+from share.runtime.error_model import AtOnce, ByModel
 from share.types import Candidate, Footing, Frame, TrackState, View
 
 NOTHING = View(np.zeros((0, 2), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 32), np.uint8))
@@ -77,7 +77,7 @@ def test_what_was_said_last_holds():
 
 
 def test_times_are_remembered_of_the_newest_estimates_only(monkeypatch):
-    monkeypatch.setattr("share.run.errors._TIMES", 3)
+    monkeypatch.setattr("share.runtime.error_model._TIMES", 3)
     network = Network()
     network.may.set()
     errors = ByModel(network, print)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from share.errors import UsageError
-from share.run.guard import Guard
+from share.runtime.guarded_tracker import Guard
 
 
 def test_a_failure_is_counted_and_said_once_with_its_place() -> None:

@@ -11,13 +11,12 @@ import rig_fuzzer
 from plain_walk import RIG
 
 from share.config import Config, InertialConfig, TrackerConfig
-from share.estimator.inertial import ekf
-from share.estimator.inertial.tracker import InertialTracker
-from share.estimator.result import TrackResult
-from share.geometry import se3, trackable
+from share.geometry import rig_check, se3
 from share.geometry.camera import ImuBias, Rig
-from share.run.guard import Guard
-from share.run.guarded_tracker import GuardedTracker
+from share.odometry import filter
+from share.odometry.result import TrackResult
+from share.odometry.tracker import InertialTracker
+from share.runtime.guarded_tracker import Guard, GuardedTracker
 from share.types import TrackState
 from share.vision import corners
 
@@ -32,7 +31,7 @@ def played(walk: rig_fuzzer.Walk, tracker: GuardedTracker, fails: dict[int, pyte
     for frame in walk.frames:
         if (broken := fails.get(frame.index)) is not None:
             with broken.context() as patch:
-                patch.setattr(ekf, "_gain", _no_gain)
+                patch.setattr(filter, "_gain", _no_gain)
                 patch.setattr(corners, "count", _no_gain)
                 results.append(tracker.track(frame))
             continue
@@ -111,7 +110,7 @@ def test_a_keyframe_that_fails_is_none(walk: rig_fuzzer.Walk, monkeypatch: pytes
     guard = Guard(lambda text: None)
     tracker = GuardedTracker(RIG, Config(), guard)
     assert tracker.track(walk.frames[0]).keyframe
-    monkeypatch.setattr("share.estimator.inertial.keyframes.ViewInSteps.finish", _no_gain)
+    monkeypatch.setattr("share.odometry.keyframes.ViewInSteps.finish", _no_gain)
     kept = tracker.attempt("a keyframe", walk.frames[0], lambda: tracker.keyframe(walk.frames[0]))
     assert kept is None and guard.failed == 1
     assert tracker.track(walk.frames[1]).state is TrackState.LOST
@@ -164,7 +163,7 @@ def test_the_rig_of_the_walk_is_tracked_without_a_failure(walk: rig_fuzzer.Walk)
 
 
 def test_the_fuzzer_makes_rigs_that_are_refused_for_many_reasons_and_such_that_are_not() -> None:
-    told = [trackable.objection(rig) for _, rig in rig_fuzzer.rigs(200, seed=1)]
+    told = [rig_check.objection(rig) for _, rig in rig_fuzzer.rigs(200, seed=1)]
     count = sum(why is not None for why in told)
     assert 60 < count < 190
     assert len({str(why)[:25] for why in told}) > 10

@@ -9,11 +9,11 @@ import pytest
 from recordings import make_euroc
 
 from share.config import Config
-from share.core.measurement import IMU, Measurement
-from share.core.sequencer import SequencerCounters
-from share.io.source import Source, open_source
-from share.run.pipeline import frames_of
-from share.run.track import track
+from share.runtime.pipeline import frames_of
+from share.runtime.source import Source, open_source
+from share.runtime.track import track
+from share.sensors.measurement import IMU, Measurement
+from share.sensors.sequencer import SequencerCounters
 
 FRAMES = 60  # at 20 Hz
 

@@ -7,12 +7,12 @@ from collections import deque
 import numpy as np
 import pytest
 
-from share.core.edge_events import Keep, Kept
-from share.core.keeping import DropLoop, KeepPoses
 from share.errors import StoreError
-from share.merge.join import Key
-from share.run import keeper as keeper_module
-from share.run.keeper import Keeper, newest_poses_only
+from share.mapping.changes import DropLoop, KeepPoses
+from share.mapping.loops import Key
+from share.protocol.edge_events import Keep, Kept
+from share.runtime import keeper as keeper_module
+from share.runtime.keeper import Keeper, newest_poses_only
 
 FULL = "/room.sqlite: the map cannot be written: No space left on device"
 

@@ -13,9 +13,9 @@ import pytest
 from hellos import hello_of
 
 from share.config import Config
-from share.estimator.result import TrackResult
-from share.run.agent import AgentRun
-from share.run.errors import Unknown
+from share.odometry.result import TrackResult
+from share.runtime.agent import AgentRun
+from share.runtime.error_model import Unknown
 from share.types import Candidate, Frame, ImuBatch, TrackState, View
 
 FRAME = Frame(10**9, 0, np.zeros((480, 640), np.uint8), None, None, ImuBatch.empty())

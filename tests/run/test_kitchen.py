@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from children import Child, start_agent, start_edge
 
-from share.io.trajectory import read_tum
 from share.metrics.ate import ate, joint_ate
+from share.recordings.trajectory import read_tum
 
 PARTS = {"ann": "0:250", "bob": "200:500"}  # that overlap: their maps join whichever keyframe comes first
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from share.run.late import Late
+from share.runtime.arrivals import Late
 from share.types import Frame, ImuBatch
 
 MS = 1_000_000

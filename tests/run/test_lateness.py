@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from share.run.lateness import Lateness
+from share.runtime.arrivals import Lateness
 
 
 def test_poses_in_time_are_not_spoken_of() -> None:

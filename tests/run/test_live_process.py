@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from share.geometry.camera import ImuBias
-from share.io.imu_memory import Remembered, remember
-from share.io.trajectory import read_tum
+from share.recordings.trajectory import read_tum
+from share.sensors.imu_memory import Remembered, remember
 
 pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 

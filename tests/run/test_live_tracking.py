@@ -15,18 +15,18 @@ import pytest
 from capture_bench import quick
 from room_camera import BEGIN_US, HZ, RGBD, STEREO, RoomCamera
 
+from share.cameras.handover import Handover, KeepNewest
+from share.cameras.live import WAITING, LiveSource
 from share.cli import live
 from share.config import Config
-from share.estimator.inertial import tracker
-from share.estimator.result import TrackResult
 from share.geometry.camera import ImuBias
-from share.io.calibration import Calibration
-from share.io.handover import Handover, KeepNewest
-from share.io.imu_memory import Remembered, recall, remember
-from share.io.live import WAITING, LiveSource
-from share.io.source import Source, open_source
-from share.run.capture import Capture
-from share.run.track import TrackRun, track
+from share.odometry import tracker
+from share.odometry.result import TrackResult
+from share.recordings.calibration import Calibration
+from share.runtime.capture import Capture
+from share.runtime.source import Source, open_source
+from share.runtime.track import TrackRun, track
+from share.sensors.imu_memory import Remembered, recall, remember
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 

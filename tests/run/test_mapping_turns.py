@@ -10,9 +10,9 @@ import pytest
 from hellos import hello_of
 
 from share.config import Config
-from share.core.edge_events import Add, Found, Join
-from share.run import mapping
-from share.run.companion import END
+from share.protocol.edge_events import Add, Found, Join
+from share.runtime import mapper
+from share.runtime.worker import END
 from share.types import Keyframe, View
 
 EMPTY = View(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
@@ -31,7 +31,7 @@ def add(run: str, id: int) -> Add:
 @pytest.mark.parametrize("ends", [False, True])
 def test_whoever_sends_many_waits_for_itself(monkeypatch: pytest.MonkeyPatch, ends: bool) -> None:
     """eve by two runs, ann after all of them."""
-    monkeypatch.setattr(mapping._Mapping, "_new_solver", lambda self, after_s: NoSolver())
+    monkeypatch.setattr(mapper._Mapping, "_new_solver", lambda self, after_s: NoSolver())
     order: list[str] = []
     inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
     for name, run in (("eve", "eve-1"), ("eve", "eve-2"), ("ann", "ann-1")):
@@ -39,7 +39,7 @@ def test_whoever_sends_many_waits_for_itself(monkeypatch: pytest.MonkeyPatch, en
     for run, count in (("eve-1", 40), ("eve-2", 40), ("ann-1", 3)):
         for k in range(count):
             inbox.put(add(run, k))
-    work = mapping._Mapping(inbox, lambda answer: None, Config())
+    work = mapper._Mapping(inbox, lambda answer: None, Config())
     taken = work._mapper.add
     monkeypatch.setattr(work._mapper, "add", lambda run, *more: order.append(run) or taken(run, *more))
     if ends:
@@ -55,12 +55,12 @@ def test_whoever_sends_many_waits_for_itself(monkeypatch: pytest.MonkeyPatch, en
 
 
 def test_a_keyframe_that_fails_costs_itself_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mapping._Mapping, "_new_solver", lambda self, after_s: NoSolver())
+    monkeypatch.setattr(mapper._Mapping, "_new_solver", lambda self, after_s: NoSolver())
     inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
     answers: list[Any] = []
     for message in (Join("ann-1", hello_of("ann", 1)), add("who-1", 0), add("ann-1", 0), END):
         inbox.put(message)
-    mapping._Mapping(inbox, answers.append, Config()).go()
+    mapper._Mapping(inbox, answers.append, Config()).go()
     said = [one.what for found in answers if isinstance(found, Found) for one in found.findings]
     assert "job failed" in said
     assert len(said) == 2

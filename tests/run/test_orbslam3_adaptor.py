@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from recordings import make_euroc
 
-from share.io.source import open_source
-from share.peers import PEERS
-from share.run.peers import calibration, moments
+from share.lab.evaluate.peers import calibration, moments
+from share.lab.peers import PEERS
+from share.runtime.source import open_source
 
 SCRIPT = f"""
 import json, sys, types
@@ -42,7 +42,7 @@ def told(source, tmp_path):
 
 
 def answered(tmp_path, rig, what):
-    from share.peers.peer_wire import write_line, write_moment
+    from share.lab.peers.peer_wire import write_line, write_moment
 
     with (tmp_path / "moments").open("wb") as file:
         write_line(file, rig)

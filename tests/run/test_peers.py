@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from recordings import make_euroc
 
-from share import peers
 from share.config import Config
-from share.core.sequencer import SequencerCounters
 from share.errors import DataError, UsageError
-from share.io.source import open_source
-from share.io.trajectory import Trajectory
-from share.peers import PEERS
-from share.run.peers import calibration, moments, ours, theirs, version_of
-from share.run.pipeline import frames_of
-from share.run.versus import figures
+from share.lab import peers
+from share.lab.evaluate.peer_comparison import figures
+from share.lab.evaluate.peers import calibration, moments, ours, theirs, version_of
+from share.lab.peers import PEERS
+from share.recordings.trajectory import Trajectory
+from share.runtime.pipeline import frames_of
+from share.runtime.source import open_source
+from share.sensors.sequencer import SequencerCounters
 
 PEER = f"""
 import sys
@@ -132,7 +132,7 @@ def test_what_else_a_peer_says_is_kept(source, tmp_path):
 
 
 def test_ours_is_what_track_tells(source):
-    from share.run.track import track
+    from share.runtime.track import track
 
     run, told = ours(source, Config()), track(source, Config(), lambda done: None)
     assert run.trajectory.stamps_ns.tolist() == told.trajectory.stamps_ns.tolist()

@@ -16,8 +16,9 @@ from children import Child, start_agent
 from recorded_traffic import map_file
 from test_edge_killed import _workers, until
 
-from share.io.map_store import MapStore, rows
-from share.merge.join import Key
+from share.mapping.loops import Key
+from share.store import rows
+from share.store.map_store import MapStore
 
 pytestmark = pytest.mark.slow
 POISONED = Key("ann-0fb6", 3)

@@ -3,7 +3,7 @@
 import subprocess
 
 from share import __version__
-from share.run.processes import command
+from share.runtime.commands import command
 
 
 def test_a_folder_called_share_where_one_stands_is_not_taken_for_the_program(tmp_path):

@@ -11,14 +11,14 @@ import pytest
 from map_changes import ANN, BOB, small_map
 
 from share.config import Config, EdgeConfig
-from share.core.edge_events import Lost
 from share.errors import StoreError
-from share.io.map_store import MapStore
-from share.run import edge as edge_module
-from share.run.companion import END
-from share.run.edge import EdgeRun
-from share.run.mapping import Mapped, Restore, Restored
-from share.run.restarts import Restarts
+from share.protocol.edge_events import Lost
+from share.runtime import edge as edge_module
+from share.runtime.edge import EdgeRun
+from share.runtime.mapper import Mapped, Restore, Restored
+from share.runtime.restarts import Restarts
+from share.runtime.worker import END
+from share.store.map_store import MapStore
 
 
 class Link:

@@ -8,8 +8,8 @@ import time
 import pytest
 
 from share.errors import ShareError
-from share.run import scribe as scribe_module
-from share.run.scribe import Scribe
+from share.runtime import scribe as scribe_module
+from share.runtime.scribe import Scribe
 
 
 class Disk:

@@ -14,14 +14,14 @@ from room_camera import RoomCamera
 from shell import Done
 from software_camera import BASELINE, SoftwareCamera
 
+from share.cameras.realsense.camera import RealSense
+from share.cameras.realsense.streams import Wanted
 from share.config import Config
 from share.geometry import se3
-from share.io.imu_table import read_imu
-from share.io.profile import profile
-from share.io.realsense.camera import RealSense
-from share.io.realsense.streams import Wanted
-from share.io.source import open_source
-from share.run.track import track
+from share.lab.calibrate.imu_table import read_imu
+from share.runtime.source import open_source
+from share.runtime.track import track
+from share.sensors.profile import profile
 
 rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed", exc_type=ImportError)
 

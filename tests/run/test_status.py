@@ -20,13 +20,13 @@ from hellos import hello_of
 from prometheus_client.parser import text_string_to_metric_families
 
 from share.config import Config
-from share.core.edge import Edge
-from share.core.edge_events import Join, Received
-from share.core.mapper import Mapper
 from share.errors import TransportError, UsageError
-from share.merge.agreement import Standing
-from share.run import status_metrics, web
-from share.run.status import KEPT_S, StatusServer
+from share.mapping.agents.agreement import Standing
+from share.mapping.mapper import Mapper
+from share.protocol.edge import Edge
+from share.protocol.edge_events import Join, Received
+from share.runtime import status_metrics, web
+from share.runtime.status import KEPT_S, StatusServer
 from share.wire.codec import encode
 from share.wire.messages import peer_id
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from share.run.stop import on_stop
+from share.runtime.stop import on_stop
 
 
 @pytest.fixture(autouse=True)

@@ -13,9 +13,9 @@ import pytest
 from children import SHARE, Child, start_agent
 
 from share.config import Config
-from share.io.source import open_source
-from share.io.trajectory import format_tum
-from share.run.track import track
+from share.recordings.trajectory import format_tum
+from share.runtime.source import open_source
+from share.runtime.track import track
 
 FRAMES = 45
 ROOMY = "stream: {window: 60}\n"  # nothing is dropped, however busy this machine is

@@ -11,10 +11,10 @@ import pytest
 
 from share.config import Config
 from share.errors import ConfigError, UsageError
-from share.io.session import Session
-from share.metrics.comparison import MEASURES
-from share.run.play import Terms
-from share.run.sweep import Axis, at, drawn, grid, heat, planned
+from share.lab.evaluate.play import Terms
+from share.lab.evaluate.statistics import MEASURES
+from share.lab.evaluate.sweep import Axis, at, drawn, grid, heat, planned
+from share.recordings.session import Session
 
 KP, KI = Axis.parse("control.kp=0.2,0.8"), Axis.parse("control.ki=0,0.1,1e-3")
 

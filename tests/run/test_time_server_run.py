@@ -6,10 +6,9 @@ import threading
 import time
 from typing import Any
 
-from share.core.time_server import TimeServer
-from share.io.udp import Datagram
-from share.run.time_server import TimeServerRun
-from share.wire.ntp import Mode, Packet, from_stamp
+from share.devices.time_server import TimeServer, TimeServerRun
+from share.net.ntp import Mode, Packet, from_stamp
+from share.net.udp import Datagram
 
 NOW = 1_795_446_605 * 10**9
 QUESTION = Packet(Mode.CLIENT, transmit=5).encode()

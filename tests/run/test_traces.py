@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from share.io.trajectory import Trajectory, format_tum, read_tum
-from share.run.traces import merges, traces
+from share.lab.evaluate.scoring import merges, traces
+from share.recordings.trajectory import Trajectory, format_tum, read_tum
 
 S = 1_000_000_000
 

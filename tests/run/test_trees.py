@@ -20,14 +20,14 @@ IN_ORDER_S = 20.0  # to write files, and for agents to say bye
 OF_A_PARENT = """
 import sys, time
 from pathlib import Path
-from share.run.processes import child
+from share.runtime.commands import child
 with child(Path(sys.argv[1]) / "edge.log", "edge", "--bind", "tcp://127.0.0.1:0", "--out", sys.argv[1]):
     time.sleep(600)
 """
 OF_A_THREAD = """
 import sys, threading, time
 from pathlib import Path
-from share.run.processes import child
+from share.runtime.commands import child
 def start():
     held.append(child(Path(sys.argv[1]) / "edge.log", "edge", "--bind", "tcp://127.0.0.1:0"))
     held[0].__enter__()

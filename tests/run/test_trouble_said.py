@@ -3,8 +3,8 @@
 from itertools import cycle
 from types import SimpleNamespace
 
-from share.core.lines import Lasting
-from share.run.agent import AgentRun
+from share.protocol.edge_trust import Lasting
+from share.runtime.agent import AgentRun
 
 
 def test_an_edge_that_changes_its_mind_is_complained_of_once():

@@ -19,10 +19,10 @@ from fake_device import TOOLS, FakeDevice, make_device
 from ssh_server import HOST, ssh_server
 
 from share.cli.main import cli
-from share.core.checkup import boot
-from share.core.checkup.camera import RULES
+from share.devices import checks
+from share.devices.camera_check import RULES
 from share.errors import ShareError, UsageError
-from share.io.profile import host_profile, shipped
+from share.sensors.profile import host_profile, shipped
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_a_newer_program_alone_takes_the_services_with_it_or_comes_not(device):
 
 
 def test_the_rule_that_is_installed_is_one_that_the_doctor_finds(device):
-    from share.io.host import camera_rules
+    from share.devices.host import camera_rules
 
     assert device.agent(device.program("1.0")).code == 0
     assert camera_rules(device.root) == ["/etc/udev/rules.d/99-share-realsense.rules"]
@@ -222,7 +222,7 @@ def test_the_doctor_looks_for_what_that_kind_of_computer_needs(device, kind, pro
     assert profile in shipped()
     wanted = host_profile(profile).host
     _head, *lines = (device.root / "etc/tmpfiles.d/share.conf").read_text().splitlines()
-    assert lines == list(boot.lines(wanted.cpu_governor, wanted.usbfs_mb))
+    assert lines == list(checks.lines(wanted.cpu_governor, wanted.usbfs_mb))
     assert f"systemd-tmpfiles --create {device.root}/etc/tmpfiles.d/share.conf" in device.asked()
 
 
@@ -272,7 +272,7 @@ def test_the_edge_and_the_time_server(device):
 
 
 def test_the_key_of_the_edge_is_put_where_the_service_looks(device):
-    from share.io.keys import public_key
+    from share.net.keys import public_key
 
     key = "rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7"  # RFC 32's test vector is this long
     done = device.agent(device.program("1.0"), "--server-key", key)

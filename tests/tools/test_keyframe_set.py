@@ -10,14 +10,14 @@ import pytest
 from small_session import small_profile, small_recipe
 
 from share.config import Config
-from share.core.sequencer import SequencerCounters
-from share.emulate.session import make_session
 from share.errors import DataError, UsageError
 from share.geometry import se3
-from share.io.source import open_source
-from share.run.pipeline import frames_of
+from share.lab.emulate.session import make_session
+from share.runtime.pipeline import frames_of
+from share.runtime.source import open_source
+from share.sensors.sequencer import SequencerCounters
 from share.types import AgentKind
-from share.vision.view import make_view
+from share.vision.orb import make_view
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
 NAMES = {"ann": AgentKind.AR, "rob": AgentKind.ROBOT}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from share.emulate.motion.spec import parse
+from share.lab.emulate.motion.spec import parse
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
 

@@ -10,9 +10,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from share.io.trajectory import Trajectory
+from share.lab.evaluate.play import AgentScore, SessionScore
 from share.metrics.ate import Ate, JointAte
-from share.run.score import AgentScore, SessionScore
+from share.recordings.trajectory import Trajectory
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
 S = 1_000_000_000

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from share.errors import DataError, ShareError, UsageError
-from share.metrics.figures import Conditions, RunFigures
+from share.lab.evaluate.figures import Conditions, RunFigures
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
 

@@ -20,16 +20,16 @@ from typing import Any, TextIO
 TESTS = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(TESTS), str(TESTS / "run"), str(Path(__file__).parent)]
 
-from share import process  # noqa: E402
+from share import startup  # noqa: E402
 
-process.prepare()
+startup.prepare()
 
 import crowd  # noqa: E402
 import numpy as np  # noqa: E402
 from edge_sim import Person, walls  # noqa: E402
 from raw_wire import unpack  # noqa: E402
 
-from share.io.transport import AgentLink, connect  # noqa: E402
+from share.net.transport import AgentLink, connect  # noqa: E402
 
 NAMES = ("hope", "faith")
 CHUNK = 300  # frames made ahead
@@ -129,7 +129,7 @@ def main() -> None:
     address, frames = sys.argv[1], int(sys.argv[2])
     keys = None
     if len(sys.argv) > 4:
-        from share.io.keys import agent_keys
+        from share.net.keys import agent_keys
 
         keys = agent_keys(Path(sys.argv[4]), sys.argv[5])
     acks = open(sys.argv[3], "a", buffering=1)  # noqa: SIM115 (as long as the process)

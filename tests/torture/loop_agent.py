@@ -17,21 +17,21 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 
 from share.config import Config  # noqa: E402
-from share.core.measurement import Measurement  # noqa: E402
-from share.io.network import error_model  # noqa: E402
-from share.io.recording import Source  # noqa: E402
-from share.io.source import open_source  # noqa: E402
-from share.io.trajectory import Trajectory  # noqa: E402
-from share.io.transport import connect  # noqa: E402
-from share.run.agent import AgentRun  # noqa: E402
-from share.run.errors import ByModel  # noqa: E402
-from share.run.stop import on_stop  # noqa: E402
+from share.net.transport import connect  # noqa: E402
+from share.odometry.error_model.network import error_model  # noqa: E402
+from share.recordings.recording import Source  # noqa: E402
+from share.recordings.trajectory import Trajectory  # noqa: E402
+from share.runtime.agent import AgentRun  # noqa: E402
+from share.runtime.error_model import ByModel  # noqa: E402
+from share.runtime.source import open_source  # noqa: E402
+from share.runtime.stop import on_stop  # noqa: E402
+from share.sensors.measurement import Measurement  # noqa: E402
 from share.types import AgentKind  # noqa: E402
 from share.wire.messages import Hello  # noqa: E402
 

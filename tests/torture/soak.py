@@ -35,7 +35,7 @@ import numpy as np
 from harness import EdgeProgram, Program, Setup, say
 
 from share.geometry.se3 import compose
-from share.io.trajectory import Trajectory, format_tum
+from share.recordings.trajectory import Trajectory, format_tum
 
 EVERY_S, BLOCKS = 5.0, 300
 ROUND_S = 40.0  # of a recording, which is played again and again

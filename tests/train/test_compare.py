@@ -10,11 +10,11 @@ import pytest
 pytest.importorskip("torch", reason="make train-test brings it")
 pytest.importorskip("sklearn", reason="make train-test brings it")
 
-from share.evaluator.features import SHAPES, kind_of
-from share.train.compare import of_network, scored
-from share.train.rivals import Rows, _contrast, _numbers
-from share.train.score import table
-from share.train.table import Table
+from share.lab.train.compare import of_network, scored
+from share.lab.train.rivals import Rows, _contrast, _numbers
+from share.lab.train.score import table
+from share.lab.train.table import Table
+from share.odometry.error_model.features import SHAPES, kind_of
 
 ERROR_CM = np.array([0.1, 0.2, 0.4, 0.8], np.float32)
 

@@ -15,12 +15,12 @@ pytest.importorskip("sklearn", reason="make train-test brings it")
 from made_features import made_features  # noqa: E402
 from tiny_backbone import tiny_backbone  # noqa: E402
 
-from share.evaluator.features import SHAPES  # noqa: E402
-from share.io.network import deep_of, open_network  # noqa: E402
-from share.train.fit import FitOptions, fit  # noqa: E402
-from share.train.label_file import Labels, write_labels  # noqa: E402
-from share.train.table import collect  # noqa: E402
-from share.train.teach import _Scale  # noqa: E402
+from share.lab.train.fit import FitOptions, fit  # noqa: E402
+from share.lab.train.labels import Labels, write_labels  # noqa: E402
+from share.lab.train.table import collect  # noqa: E402
+from share.lab.train.teach import _Scale  # noqa: E402
+from share.odometry.error_model.features import SHAPES  # noqa: E402
+from share.odometry.error_model.network import deep_of, open_network  # noqa: E402
 
 ROOMS, EACH = 8, 300
 NOTHING = np.zeros(SHAPES["recent"], np.float32)

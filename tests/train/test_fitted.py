@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from share.errors import DataError
-from share.train.fitted import Fitted, folded, known, margin, read_fitted, write_fitted
+from share.lab.train.fitted import Fitted, folded, known, margin, read_fitted, write_fitted
 
 
 def test_a_scale_is_folded_into_the_layer_that_follows(rng):

@@ -13,12 +13,12 @@ onnx = pytest.importorskip("onnx", reason="make train-test brings it")
 from made_features import made_features  # noqa: E402
 from tiny_backbone import tiny_backbone  # noqa: E402
 
-from share.evaluator.features import Features  # noqa: E402
-from share.evaluator.model import estimate  # noqa: E402
-from share.io.network import deep_of, open_network  # noqa: E402
-from share.train.fitted import Fitted  # noqa: E402
-from share.train.graph import backbone_id, with_heads  # noqa: E402
-from share.train.network import Heads, loss  # noqa: E402
+from share.lab.train.fitted import Fitted  # noqa: E402
+from share.lab.train.graph import backbone_id, with_heads  # noqa: E402
+from share.lab.train.network import Heads, loss  # noqa: E402
+from share.odometry.error_model.features import Features  # noqa: E402
+from share.odometry.error_model.model import estimate  # noqa: E402
+from share.odometry.error_model.network import deep_of, open_network  # noqa: E402
 
 
 @pytest.fixture

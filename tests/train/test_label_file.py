@@ -7,8 +7,8 @@ import pytest
 from made_features import made_features
 
 from share.errors import DataError
-from share.evaluator.features import SHAPES
-from share.train.label_file import Labels, read_labels, write_labels
+from share.lab.train.labels import Labels, read_labels, write_labels
+from share.odometry.error_model.features import SHAPES
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.train.split import PARTS, groups, split
+from share.lab.train.split import PARTS, groups, split
 
 
 def about(scene="warehouse", seed=1, motions=("ar=walk:speed=0.6",), session="s"):

@@ -10,7 +10,7 @@ import pytest
 
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
-from share.train.spoil import KINDS, Spell, draw, spoiled
+from share.lab.train.spoil import KINDS, Spell, draw, spoiled
 from share.types import Frame, ImuBatch
 
 S = 1_000_000_000

@@ -18,10 +18,10 @@ from software_camera import SoftwareCamera
 from software_share import share
 
 from share.cli import main as command_line
-from share.core.intake import GYRO
-from share.core.measurement import Measurement
-from share.io.images import ArrayImage
-from share.io.source import Source
+from share.recordings.images import ArrayImage
+from share.runtime.source import Source
+from share.sensors.intake import GYRO
+from share.sensors.measurement import Measurement
 from share.types import I64
 
 PATIENCE_S = 1.0  # of the person who ends what runs until Ctrl-C

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 from field_sim import Watched, export, paths, seen
 
-from share.core.intake import ACCEL, GYRO
-from share.emulate.progress import Progress, silent
-from share.emulate.recipe import Recipe
-from share.emulate.sensor.effects import Effects
-from share.emulate.sensor.imu import measured
-from share.emulate.session import cached_session
 from share.geometry import se3
-from share.io.profile import profile
-from share.io.source import Source, open_source
+from share.lab.emulate.progress import Progress, silent
+from share.lab.emulate.recipe import Recipe
+from share.lab.emulate.sensor.effects import Effects
+from share.lab.emulate.sensor.imu import measured
+from share.lab.emulate.session import cached_session
+from share.runtime.source import Source, open_source
+from share.sensors.intake import ACCEL, GYRO
+from share.sensors.profile import profile
 
 MODE = "d435i:640x480@15"
 LATE = Effects(time_offset_ms=3.0)  # the pictures of these devices

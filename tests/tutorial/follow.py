@@ -12,9 +12,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-from share import process
+from share import startup
 
-process.prepare()  # before numpy: walkers are planned as `share emulate` would, to the last digit
+startup.prepare()  # before numpy: walkers are planned as `share emulate` would, to the last digit
 
 import click  # noqa: E402
 import field_trip  # noqa: E402

@@ -7,8 +7,8 @@ from share.geometry import se3
 from share.geometry.camera import Camera, Rig, rays
 from share.vision import corners
 from share.vision.depth import disparity_px
-from share.vision.field import within
-from share.vision.view import orb
+from share.vision.mask import within
+from share.vision.orb import orb
 
 FISHEYE = Camera(256, 256, 95.0, 95.0, 127.0, 128.0, (0.0035, 0.0007, -0.002, 0.0002), "equidistant")
 PLAIN = Camera(256, 256, 95.0, 95.0, 127.0, 128.0)

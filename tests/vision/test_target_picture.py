@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from share.geometry.camera import Camera
-from share.geometry.target import AprilGrid, CharucoBoard, Target
-from share.vision.target_picture import darkness, ink
+from share.lab.calibrate.target import AprilGrid, CharucoBoard, Target
+from share.lab.calibrate.target_sheet import darkness, ink
 
 TARGETS = [AprilGrid(), AprilGrid(3, 5, 0.055, 0.28), CharucoBoard(), CharucoBoard(8, 6, 0.05, 0.035)]
 EUROC = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019359, 1.76e-05))

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from plain_walk import CAMERA, T_CAM1_CAM0
 
-from share.emulate.motion import walk
-from share.emulate.plain.render import Renderer
-from share.emulate.plain.room import make_room
 from share.geometry import se3
 from share.geometry.camera import Camera, Rig
+from share.lab.emulate.motion import walk
+from share.lab.emulate.plain.render import Renderer
+from share.lab.emulate.plain.room import make_room
 from share.types import Frame
-from share.vision import corners, depth, epipolar, klt
-from share.vision.view import make_view, orb
+from share.vision import corners, depth, epipolar, optical_flow
+from share.vision.orb import make_view, orb
 
 
 @pytest.fixture(scope="module")
@@ -65,13 +65,13 @@ def test_following_is_subpixel_exact(scene):
     z = exact[np.rint(px[:, 1]).astype(int), np.rint(px[:, 0]).astype(int)]
     points = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) * z[:, None]
     want = CAMERA.project(se3.transform(T_other_left, points))
-    found_px, found = klt.follow(left, other, px, px)
+    found_px, found = optical_flow.follow(left, other, px, px)
     error = np.linalg.norm(found_px - want, axis=1)[found]
     assert found.mean() > 0.7
     assert np.median(error) < 0.15
-    alike = klt.resemblance(left, other, px, found_px)
+    alike = optical_flow.resemblance(left, other, px, found_px)
     assert np.median(alike[found]) > 0.9
-    assert np.median(klt.resemblance(left, other, px, px[::-1].copy())) < 0.5
+    assert np.median(optical_flow.resemblance(left, other, px, px[::-1].copy())) < 0.5
 
 
 def stereo_by(method, scene):
@@ -154,7 +154,7 @@ def test_nothing_to_see_is_no_error():
     stereo = Rig(CAMERA, np.eye(4), cam1=CAMERA, T_cam1_cam0=T_CAM1_CAM0)
     assert depth.from_depth_camera(far, rgbd, none).shape == (0,)
     assert depth.from_stereo(image, image, stereo, px, none).shape == (0,)
-    assert klt.follow(image, image, px, px)[0].shape == (0, 2)
+    assert optical_flow.follow(image, image, px, px)[0].shape == (0, 2)
     for frame, rig in ((Frame(0, 0, image, depth=far), rgbd), (Frame(0, 0, image, image), stereo)):
         assert len(make_view(frame, rig)) == 0
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from share.wire.ntp import Mode, Packet, from_stamp, log2_ns, sent_at, short_ns, to_stamp
+from share.net.ntp import Mode, Packet, from_stamp, log2_ns, sent_at, short_ns, to_stamp
 
 S = 1_000_000_000
 YEAR = 31_556_952 * S

@@ -7,11 +7,11 @@ from scipy.integrate import cumulative_simpson
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import distance_transform_edt
 
-from share.emulate.motion import robot, walk
-from share.emulate.motion.floor import Floor
-from share.emulate.motion.together import Ground, Wish, move
-from share.emulate.types import GRAVITY, START_NS
 from share.geometry import se3
+from share.lab.emulate.motion import robot, walk
+from share.lab.emulate.motion.floor import Floor
+from share.lab.emulate.motion.together import Ground, Wish, move
+from share.lab.emulate.types import GRAVITY, START_NS
 
 BLOCKS = ((0, 0, 9, 0.6), (0, 5.4, 9, 6), (0, 2, 0.5, 4), (4, 2.6, 5.2, 3.4), (7, 3, 7.5, 3.5))
 SECONDS = 30.0

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from share.emulate.motion.board import STILL_S, exercise
-from share.emulate.motion.plan import plan
-from share.emulate.motion.spec import BoardSpec, parse
-from share.emulate.world.scenes import layout
 from share.errors import UsageError
 from share.geometry import se3
-from share.io.profile import profile
+from share.lab.emulate.motion.board import STILL_S, exercise
+from share.lab.emulate.motion.plan import plan
+from share.lab.emulate.motion.spec import BoardSpec, parse
+from share.lab.emulate.world.scenes import layout
+from share.sensors.profile import profile
 from share.types import AgentKind
 
 SECONDS = 40.0

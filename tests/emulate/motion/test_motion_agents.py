@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from motion_sim import driver, every, floor, person, track
 
-from share.emulate.motion import walk
-from share.emulate.motion.crowd import length_of
-from share.emulate.motion.gait import steps_of
-from share.emulate.motion.track import KNOT_S
+from share.lab.emulate.motion import walk
+from share.lab.emulate.motion.crowd import length_of
+from share.lab.emulate.motion.gait import steps_of
+from share.lab.emulate.motion.track import KNOT_S
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -87,8 +87,8 @@ def test_a_seed_is_a_motion():
 
 
 def test_looks_at_others():
-    from share.emulate.motion.gaze import Seen
-    from share.emulate.types import START_NS
+    from share.lab.emulate.motion.gaze import Seen
+    from share.lab.emulate.types import START_NS
 
     own = track("person", 1)
     other = Seen(own.xy + 2.0 * np.stack([np.cos(own.heading + 0.6), np.sin(own.heading + 0.6)], axis=1), 1.6)

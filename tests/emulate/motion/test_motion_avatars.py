@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from motion_sim import driver, every, person
 
-from share.emulate.motion.avatars import Avatar, shapes, stature
-from share.emulate.motion.spline import through
 from share.geometry import se3
+from share.lab.emulate.motion.avatars import Avatar, shapes, stature
+from share.lab.emulate.motion.spline import through
 
 MOTIONS = {"person": person, "robot": driver, "drone": driver}
 

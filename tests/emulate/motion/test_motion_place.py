@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from motion_sim import every
 
-from share.emulate.motion.place import Guest, place
-from share.emulate.motion.spline import through
-from share.emulate.world.layout import Layout, Piece
-from share.emulate.world.materials import Material
-from share.emulate.world.mesh import box
-from share.emulate.world.occupancy import Occupancy
 from share.errors import UsageError
+from share.lab.emulate.motion.place import Guest, place
+from share.lab.emulate.motion.spline import through
+from share.lab.emulate.world.layout import Layout, Piece
+from share.lab.emulate.world.materials import Material
+from share.lab.emulate.world.mesh import box
+from share.lab.emulate.world.occupancy import Occupancy
 
 STEEL = Material("steel")
 

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 from motion_sim import every, person
 
-from share.emulate.motion.plan import plan
-from share.emulate.world.occupancy import Occupancy
-from share.emulate.world.scenes.table import layout
 from share.errors import UsageError
-from share.io.trajectory import Trajectory, format_tum
+from share.lab.emulate.motion.plan import plan
+from share.lab.emulate.world.occupancy import Occupancy
+from share.lab.emulate.world.scenes.table import layout
+from share.recordings.trajectory import Trajectory, format_tum
 from share.types import AgentKind
 
 

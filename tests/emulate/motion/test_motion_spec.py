@@ -1,7 +1,7 @@
 import pytest
 
-from share.emulate.motion.spec import EurocSpec, PaperSpec, RobotSpec, TumSpec, WalkSpec, parse
 from share.errors import UsageError
+from share.lab.emulate.motion.spec import EurocSpec, PaperSpec, RobotSpec, TumSpec, WalkSpec, parse
 
 
 @pytest.mark.parametrize(

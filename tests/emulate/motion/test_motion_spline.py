@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from motion_sim import driver, every, integrated, person
 
-from share.emulate.motion.spline import continuous, through
-from share.emulate.types import GRAVITY
 from share.geometry import se3
+from share.lab.emulate.motion.spline import continuous, through
+from share.lab.emulate.types import GRAVITY
 
 
 @pytest.fixture

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from motion_sim import SECONDS, every, floor
 
-from share.emulate.motion import crowd as crowds
-from share.emulate.motion import paper, walk
-from share.emulate.motion.crowd import Member, Present, crowd, length_of, present_of
-from share.emulate.motion.route import SPACING, Network, arc_length, smooth
-from share.emulate.motion.schedule import STEP_S, Limits, Other, schedule, smoothed, speed_limit
-from share.emulate.motion.together import Ground, Wish
 from share.errors import UsageError
+from share.lab.emulate.motion import crowd as crowds
+from share.lab.emulate.motion import paper, walk
+from share.lab.emulate.motion.crowd import Member, Present, crowd, length_of, present_of
+from share.lab.emulate.motion.route import SPACING, Network, arc_length, smooth
+from share.lab.emulate.motion.schedule import STEP_S, Limits, Other, schedule, smoothed, speed_limit
+from share.lab.emulate.motion.together import Ground, Wish
 
 
 def straight(length=10.0):

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from motion_sim import every, person
 
-from share.emulate.motion.tum import fitted, read_path
 from share.errors import DataError
 from share.geometry import se3
-from share.io.trajectory import Trajectory, format_tum
+from share.lab.emulate.motion.tum import fitted, read_path
+from share.recordings.trajectory import Trajectory, format_tum
 
 
 def write(tmp_path, stamps, T):

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from share.emulate.motion import sources
-from share.emulate.motion.recorded import RecordedPath
-from share.emulate.motion.sources import EUROC, TUMVI, Recording, open_recording
-from share.emulate.types import GRAVITY
 from share.errors import DataError, ShareError, UsageError
 from share.geometry import se3
+from share.lab.emulate.motion import sources
+from share.lab.emulate.motion.recorded import RecordedPath
+from share.lab.emulate.motion.sources import EUROC, TUMVI, Recording, open_recording
+from share.lab.emulate.types import GRAVITY
 
 
 @pytest.fixture(scope="module")

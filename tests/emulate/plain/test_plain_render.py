@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from plain_walk import CAMERA, MOTIONS, gray, poses
 
-from share.emulate.plain.render import Renderer
-from share.emulate.plain.room import make_room
 from share.geometry.camera import Camera
 from share.geometry.se3 import compose, inverse, transform
+from share.lab.emulate.plain.render import Renderer
+from share.lab.emulate.plain.room import make_room
 
 SECONDS = np.arange(0, 20, 0.05)
 

@@ -1,6 +1,6 @@
 import numpy as np
 
-from share.emulate.plain.room import make_room
+from share.lab.emulate.plain.room import make_room
 
 
 def test_a_seed_is_a_room():

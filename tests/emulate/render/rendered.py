@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from share.emulate.render.context import missing
-from share.emulate.types import Mesh, Room
 from share.geometry.camera import Camera
+from share.lab.emulate.render.context import missing
+from share.lab.emulate.types import Mesh, Room
 
 WHY_NOT = missing()
 needs_opengl = pytest.mark.skipif(WHY_NOT is not None, reason=f"cannot draw here: {WHY_NOT}")

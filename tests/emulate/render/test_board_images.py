@@ -6,15 +6,15 @@ import pytest
 from rendered import needs_opengl
 from scipy.spatial.distance import pdist
 
-from share.emulate.motion.board import exercise
-from share.emulate.motion.spec import BoardSpec
-from share.emulate.render.gl import GlRenderer
-from share.emulate.types import Moment
-from share.emulate.world.build import build
-from share.emulate.world.scenes import layout
 from share.geometry import se3
-from share.geometry.target import AprilGrid
-from share.io.profile import profile
+from share.lab.calibrate.target import AprilGrid
+from share.lab.emulate.motion.board import exercise
+from share.lab.emulate.motion.spec import BoardSpec
+from share.lab.emulate.render.gl import GlRenderer
+from share.lab.emulate.types import Moment
+from share.lab.emulate.world.build import build
+from share.lab.emulate.world.scenes import layout
+from share.sensors.profile import profile
 
 pytestmark = needs_opengl
 FRAMES = 10

@@ -5,12 +5,12 @@ from rendered import checker as checkered
 from rendered import furnished, looking, needs_opengl, plain
 from test_gl_place import corners_of_walls, saddles
 
-from share.emulate.render.fisheye import faces
-from share.emulate.render.gl import GlRenderer
-from share.emulate.sensor.photometry import vignette
-from share.emulate.types import Moment
 from share.geometry.camera import Camera
 from share.geometry.se3 import inverse, transform
+from share.lab.emulate.render.fisheye import faces
+from share.lab.emulate.render.gl import GlRenderer
+from share.lab.emulate.sensor.photometry import vignette
+from share.lab.emulate.types import Moment
 
 pytestmark = needs_opengl
 LENS = (0.00348, 0.000715, -0.00205, 0.000203)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from rendered import D435I, EUROC, SIZE, box, checker, furnished, looking, needs_opengl, plain
 
-from share.emulate.render.gl import GlRenderer
-from share.emulate.types import Moment, Room
 from share.geometry.camera import Camera
+from share.lab.emulate.render.gl import GlRenderer
+from share.lab.emulate.types import Moment, Room
 
 pytestmark = needs_opengl
 

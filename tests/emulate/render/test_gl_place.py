@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from rendered import D435I, EUROC, OFF_CENTRE, SIZE, box, checker, furnished, looking, needs_opengl, plain
 
-from share.emulate.render.gl import GlRenderer
-from share.emulate.types import Moment
 from share.geometry.camera import rays
 from share.geometry.se3 import inverse, transform
+from share.lab.emulate.render.gl import GlRenderer
+from share.lab.emulate.types import Moment
 
 pytestmark = needs_opengl
 CAMERAS = pytest.mark.parametrize("camera", [D435I, OFF_CENTRE, EUROC], ids=["d435i", "off-centre", "euroc"])

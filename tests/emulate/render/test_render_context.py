@@ -7,8 +7,8 @@ import sys
 import pytest
 from rendered import needs_opengl
 
-ASK = "from share.emulate.render.context import missing; print(missing())"
-DRAW = "from share.emulate.render.context import create; print(create().info['GL_RENDERER'])"
+ASK = "from share.lab.emulate.render.context import missing; print(missing())"
+DRAW = "from share.lab.emulate.render.context import create; print(create().info['GL_RENDERER'])"
 
 
 def answer(code, **environment):
@@ -33,7 +33,7 @@ def test_a_missing_library_names_its_package(tmp_path, library, package):
     said, stderr = answer(ASK, LD_LIBRARY_PATH=str(tmp_path))
     assert said.endswith(f"apt install {package}") and "\n" not in said and not stderr
     _, stderr = answer(DRAW, LD_LIBRARY_PATH=str(tmp_path))
-    assert stderr.splitlines()[-1].startswith("share.emulate.render.errors.RenderError: ")
+    assert stderr.splitlines()[-1].startswith("share.lab.emulate.render.errors.RenderError: ")
 
 
 @needs_opengl

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from share.core.stamps import WRAP_NS
-from share.emulate.sensor.device import Device
-from share.emulate.sensor.effects import NONE, Effects, parse
-from share.emulate.types import GRAVITY
 from share.geometry import se3
-from share.io.profile import profile
+from share.lab.emulate.sensor.device import Device
+from share.lab.emulate.sensor.effects import NONE, Effects, parse
+from share.lab.emulate.types import GRAVITY
+from share.sensors.profile import profile
+from share.sensors.stamps import WRAP_NS
 from share.types import ImuBatch
 
 START = 1_750_000_000 * 10**9

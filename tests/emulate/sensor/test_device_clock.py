@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from share.emulate.sensor.clock import DeviceClock, Stream, dropped, jitter, unwrapped
+from share.lab.emulate.sensor.clock import DeviceClock, Stream, dropped, jitter, unwrapped
 
 
 def test_a_stream_keeps_its_rate_and_is_the_same_in_every_span():

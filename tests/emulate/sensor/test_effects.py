@@ -2,8 +2,8 @@ import dataclasses
 
 import pytest
 
-from share.emulate.sensor.effects import NONE, Effects, parse
 from share.errors import UsageError
+from share.lab.emulate.sensor.effects import NONE, Effects, parse
 
 
 def test_words_change_single_effects():

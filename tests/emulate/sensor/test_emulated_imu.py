@@ -3,11 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from share.calibration.allan import allan_deviation
-from share.calibration.noise import fit, together
-from share.emulate.sensor.imu import ImuStreams, bias_of, measured
-from share.io.profile import profile
-from share.io.profile_types import Inertial
+from share.lab.calibrate.allan import allan_deviation
+from share.lab.calibrate.imu_noise import fit, together
+from share.lab.emulate.sensor.imu import ImuStreams, bias_of, measured
+from share.sensors.profile import profile
+from share.sensors.profile_types import Inertial
 
 D435I = profile("d435i", gyro_hz=200).device.imu
 EUROC = profile("euroc").device.imu

@@ -3,9 +3,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from share.emulate.sensor.exposure import Shot
-from share.emulate.sensor.photometry import Imager, vignette
-from share.io.profile import profile
+from share.lab.emulate.sensor.exposure import Shot
+from share.lab.emulate.sensor.photometry import Imager, vignette
+from share.sensors.profile import profile
 
 PROFILE = profile("d435i")
 CAMERA = PROFILE.mode.cameras()[0]

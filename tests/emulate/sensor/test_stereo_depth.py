@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from share.emulate.sensor.device import Device
-from share.emulate.sensor.effects import parse
-from share.emulate.sensor.exposure import Shot
 from share.errors import ConfigError
-from share.io.profile import profile
+from share.lab.emulate.sensor.device import Device
+from share.lab.emulate.sensor.effects import parse
+from share.lab.emulate.sensor.exposure import Shot
+from share.sensors.profile import profile
 
 PROFILE = profile("d435i")
 FOCAL_BASELINE = 385.0 * 0.05  # px m

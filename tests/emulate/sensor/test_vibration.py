@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.emulate.sensor.vibration import knocks, vibration
+from share.lab.emulate.sensor.vibration import knocks, vibration
 
 FAST = np.arange(0.0, 20.0, 1e-4)
 

@@ -3,9 +3,9 @@
 import pytest
 from smallroom import small_room
 
-from share.emulate.types import Room
-from share.emulate.world.build import build
-from share.emulate.world.layout import Layout
+from share.lab.emulate.types import Room
+from share.lab.emulate.world.build import build
+from share.lab.emulate.world.layout import Layout
 
 
 @pytest.fixture(scope="session")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from share.emulate.world.layout import Layout, Light, Piece
-from share.emulate.world.materials import Material
-from share.emulate.world.mesh import Shape, box, concat, cylinder, decal, panels
+from share.lab.emulate.world.layout import Layout, Light, Piece
+from share.lab.emulate.world.materials import Material
+from share.lab.emulate.world.mesh import Shape, box, concat, cylinder, decal, panels
 
 SIZE = (5.0, 4.0, 3.0)
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from share.emulate.world.furniture.board import BLACK, WHITE, sheet
-from share.emulate.world.scenes import layout
 from share.geometry import se3
-from share.geometry.target import AprilGrid, CharucoBoard
+from share.lab.calibrate.target import AprilGrid, CharucoBoard
+from share.lab.emulate.world.furniture.board import BLACK, WHITE, sheet
+from share.lab.emulate.world.scenes import layout
 
 TARGETS = [AprilGrid(), AprilGrid(5, 7, 0.08, 0.28), CharucoBoard()]
 

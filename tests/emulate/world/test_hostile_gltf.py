@@ -15,9 +15,9 @@ import pytest
 from made_gltf import DATA, tree, write
 from special_files import KINDS, special
 
-from share.emulate.world.gltf import load_gltf
-from share.emulate.world.gltf_file import read_gltf
 from share.errors import DataError, ShareError
+from share.lab.emulate.world.gltf import load_gltf
+from share.lab.emulate.world.gltf_file import read_gltf
 
 pytest.importorskip("trimesh")
 

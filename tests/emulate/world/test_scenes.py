@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import label
 
-from share.emulate.world.layout import Layout, Piece
-from share.emulate.world.occupancy import Occupancy
-from share.emulate.world.scenes import SCENES, corridor, layout
 from share.errors import UsageError
+from share.lab.emulate.world.layout import Layout, Piece
+from share.lab.emulate.world.occupancy import Occupancy
+from share.lab.emulate.world.scenes import SCENES, corridor, layout
 from share.types import F64
 
 CLEARANCE = 0.45  # m

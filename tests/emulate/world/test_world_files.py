@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from share.emulate.types import Room
-from share.emulate.world.build import build
-from share.emulate.world.files import load_room, save_room
-from share.emulate.world.layout import Layout
-from share.emulate.world.materials import Material
-from share.emulate.world.mesh import box
 from share.errors import DataError, UsageError
+from share.lab.emulate.types import Room
+from share.lab.emulate.world.build import build
+from share.lab.emulate.world.files import load_room, save_room
+from share.lab.emulate.world.layout import Layout
+from share.lab.emulate.world.materials import Material
+from share.lab.emulate.world.mesh import box
 
 
 @pytest.fixture(scope="module")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.emulate.world.materials import Material
-from share.emulate.world.mesh import box
-from share.emulate.world.scenes.floor import clear, walkable
-from share.emulate.world.scenes.plan import Plan
+from share.lab.emulate.world.materials import Material
+from share.lab.emulate.world.mesh import box
+from share.lab.emulate.world.scenes.floor import clear, walkable
+from share.lab.emulate.world.scenes.plan import Plan
 
 PAINT = Material("paint")
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from share.emulate.world.build import build
-from share.emulate.world.gltf import load_gltf
-from share.emulate.world.layout import Layout
-from share.emulate.world.occupancy import Occupancy
-from share.emulate.world.pictures import draw_all
 from share.errors import DataError, UsageError
+from share.lab.emulate.world.build import build
+from share.lab.emulate.world.gltf import load_gltf
+from share.lab.emulate.world.layout import Layout
+from share.lab.emulate.world.occupancy import Occupancy
+from share.lab.emulate.world.pictures import draw_all
 
 trimesh: Any = pytest.importorskip("trimesh")
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from share.emulate.world.layout import Layout, Piece
-from share.emulate.world.materials import Material
-from share.emulate.world.mesh import box
-from share.emulate.world.proximity import distances, winding
+from share.lab.emulate.world.layout import Layout, Piece
+from share.lab.emulate.world.materials import Material
+from share.lab.emulate.world.mesh import box
+from share.lab.emulate.world.proximity import distances, winding
 
 
 def test_pieces_in_the_way_go_whole_and_are_named(small_layout: Layout) -> None:

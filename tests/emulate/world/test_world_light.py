@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from smallroom import SIZE, small_room
 
-from share.emulate.types import Mesh, Room
-from share.emulate.world.build import build
-from share.emulate.world.layout import Layout, Light
-from share.emulate.world.light import bake
-from share.emulate.world.materials import Material
-from share.emulate.world.mesh import box, concat, joined, panels, quad
-from share.emulate.world.patches import unfold
 from share.errors import UsageError
+from share.lab.emulate.types import Mesh, Room
+from share.lab.emulate.world.build import build
+from share.lab.emulate.world.layout import Layout, Light
+from share.lab.emulate.world.light import bake
+from share.lab.emulate.world.materials import Material
+from share.lab.emulate.world.mesh import box, concat, joined, panels, quad
+from share.lab.emulate.world.patches import unfold
 from share.types import F64
 
 BLACK = np.zeros(1, np.float32)

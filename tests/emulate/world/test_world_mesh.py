@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.emulate.world.materials import KINDS, Material
-from share.emulate.world.mesh import (
+from share.lab.emulate.world.materials import KINDS, Material
+from share.lab.emulate.world.mesh import (
     PROUD,
     Shape,
     box,
@@ -19,7 +19,7 @@ from share.emulate.world.mesh import (
     quad,
     tube,
 )
-from share.emulate.world.proximity import winding
+from share.lab.emulate.world.proximity import winding
 
 WOOD = Material("wood")  # one picture a metre
 BEND = [(np.sin(a), np.cos(a), 0.1 * a) for a in np.linspace(0, 3, 30)]  # a hose is bent softly

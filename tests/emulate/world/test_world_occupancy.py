@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.emulate.world.layout import Layout
-from share.emulate.world.mesh import concat
-from share.emulate.world.occupancy import STEP, Occupancy
-from share.emulate.world.proximity import distances, winding
+from share.lab.emulate.world.layout import Layout
+from share.lab.emulate.world.mesh import concat
+from share.lab.emulate.world.occupancy import STEP, Occupancy
+from share.lab.emulate.world.proximity import distances, winding
 
 
 @pytest.fixture(scope="module")

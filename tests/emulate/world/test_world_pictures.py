@@ -7,11 +7,11 @@ import zlib
 import numpy as np
 import pytest
 
-from share.emulate.world.materials import KINDS, Material
-from share.emulate.world.noise import P, cloud
-from share.emulate.world.pictures import BRIGHTEST, DARKEST, draw, mean_albedo
-from share.emulate.world.prints import PRINTS
-from share.emulate.world.surfaces import SURFACES
+from share.lab.emulate.world.materials import KINDS, Material
+from share.lab.emulate.world.noise import P, cloud
+from share.lab.emulate.world.pictures import BRIGHTEST, DARKEST, draw, mean_albedo
+from share.lab.emulate.world.prints import PRINTS
+from share.lab.emulate.world.surfaces import SURFACES
 
 ALL = [Material(kind) for kind in KINDS]
 

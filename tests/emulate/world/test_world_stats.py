@@ -6,8 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from share.emulate.world.noise import cloud
-from share.emulate.world.stats import HEIGHT, WIDTH, comparable, mean_statistics, spectrum_slope, statistics
+from share.lab.emulate.world.noise import cloud
+from share.lab.emulate.world.stats import (
+    HEIGHT,
+    WIDTH,
+    comparable,
+    mean_statistics,
+    spectrum_slope,
+    statistics,
+)
 
 
 def squares(count: int) -> np.ndarray:

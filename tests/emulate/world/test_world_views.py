@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from share.emulate.world.layout import Layout
-from share.emulate.world.occupancy import Occupancy
-from share.emulate.world.views import looking, standing_views
+from share.lab.emulate.world.layout import Layout
+from share.lab.emulate.world.occupancy import Occupancy
+from share.lab.emulate.world.views import looking, standing_views
 
 
 def test_views_are_upright_in_the_open_and_seeded(small_layout: Layout) -> None:

@@ -1,0 +1,304 @@
+"""A live camera's measurements for as long as they are wanted, whatever happens to the camera.
+
+the device's threads -> bounded queue -> who reads: repair, join; watchdog, reconnection
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from share.cameras.handover import Handover
+from share.errors import NotAttachedError, ShareError
+from share.geometry.camera import Rig
+from share.rates import Every
+from share.sensors.intake import Intake, Sample
+from share.sensors.measurement import CAM0, Measurement
+from share.sensors.watchdog import Action, Health, Watchdog
+
+_TICK_S = 0.1
+_REMEMBERED = 1000  # images whose arrival can be asked for
+_MANY = 30  # stamps of the host's clock in one stream; fewer are exceptions
+_SAID = {
+    Action.RESET: "{silent}: silent; the camera is reset once",
+    Action.GO_WITHOUT: "{silent}: still silent; {health}: goes on without",
+    Action.HEARD_AGAIN: "{silent}: heard again",
+}
+_IN_VAIN = (
+    "camera {serial}: {silent}: no sample came, nor after a hardware reset; unplug it and plug it in again, "
+    "with another cable or port if need be"
+)
+
+
+class Device(Protocol):
+    """A camera that is connected, such as `share.cameras.realsense.camera.RealSense`."""
+
+    @property
+    def rig(self) -> Rig: ...
+
+    @property
+    def serial(self) -> str: ...
+
+    @property
+    def rates_hz(self) -> Mapping[str, float]: ...
+
+    def start(self, sink: Callable[[Sample], None]) -> None: ...
+
+    def stop(self) -> None: ...
+
+    def reset(self) -> None: ...
+
+
+Connect = Callable[[str | None, int], Device]  # serial number (None: any), how often it was tried before
+MakeWatchdog = Callable[[int, Collection[str]], Watchdog]
+
+
+class Feed:
+    """`open` it, read `measurements` in one thread, `stop` it from any; the reader lets the camera go.
+
+    `say` is told what happens to the camera, a line each.
+    """
+
+    def __init__(
+        self,
+        connect: Connect,
+        serial: str | None,
+        rates_hz: Mapping[str, float],
+        max_jump_s: float,
+        say: Callable[[str], None],
+        queue: Handover,
+        watchdog: MakeWatchdog = Watchdog,
+    ) -> None:
+        """rates_hz: of every stream that is expected, until the device says its own."""
+        self._connect, self._say, self.queue = connect, say, queue
+        self.serial, self.intake = serial, Intake(rates_hz, max_jump_s)
+        self._max_jump_s = max_jump_s
+        self._watchdog = watchdog(time.monotonic_ns(), rates_hz)
+        self.in_vain = False  # what is needed has never come
+        self._tick = Every(_TICK_S)
+        self._stop = threading.Event()
+        self._device: Device | None = None
+        self._heard: dict[str, int] = {}
+        self._attempts = self._restarts = 0
+        self._reasons: set[str] = set()  # said: why the camera could not be opened again
+        self._mixed = False  # said: some streams are of the host's clock
+        self._arrivals: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
+        self._rates = Rates()
+
+    def open(self) -> Rig:
+        """Connect; samples come from now on, and wait. Raises UsageError, ShareError, DataError."""
+        device = self._connect(self.serial, 0)
+        rig, self.serial = device.rig, device.serial
+        self.intake = Intake(device.rates_hz, self._max_jump_s)
+        device.start(self._take)
+        self._device = device
+        self._watchdog.connected(time.monotonic_ns())
+        return rig
+
+    def measurements(self) -> Iterator[Measurement]:
+        """Until it is stopped; what has come by then is still given. Raises ShareError where a stream that is
+        needed never comes (`in_vain`)."""
+        try:
+            while not self.queue.done:
+                self._guard()
+                sample = self.queue.get(_TICK_S)
+                if sample is not None:
+                    yield from self._used(sample)
+            yield from self.intake.end()
+        finally:
+            self.close()
+
+    def stop(self) -> None:
+        """Ask for the end, from any thread or signal handler."""
+        self._stop.set()
+
+    def close(self) -> None:
+        """Let the camera go; what it sent can still be read. Only for who reads, or before anyone does."""
+        if self._device is not None:
+            self._device.stop()
+        self._device = None
+        self.queue.close()
+
+    def arrived_ns(self, stamp_ns: int) -> int:
+        """When cam0's image of that stamp came, on the host's monotonic clock; now, if that is not known."""
+        known = (arrived for stamp, arrived in reversed(self._arrivals) if stamp == stamp_ns)
+        return next(known, time.monotonic_ns())
+
+    @property
+    def health(self) -> Health:
+        return self._watchdog.health
+
+    @property
+    def image_ns(self) -> int | None:
+        """When cam0's newest image came, read or not, on the host's monotonic clock; None before any."""
+        return self._heard.get(CAM0)
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the camera now, for a person; empty: nothing."""
+        health = self.health
+        if health is Health.AWAY:
+            return "the camera is away"
+        return "" if health is Health.OK else f"the camera goes without {', '.join(self._watchdog.without)}"
+
+    def status(self) -> FeedStatus:
+        """For a live line."""
+        streams = self.intake.streams
+        return FeedStatus(
+            health=self.health,
+            rates_hz=self._rates.of({name: gaps.samples for name, gaps in streams.items()}, time.monotonic()),
+            missing=sum(gaps.missing for gaps in streams.values()),
+            dropped=sum(self.queue.dropped.values()),
+            queue=len(self.queue),
+        )
+
+    def report(self) -> dict[str, Any]:
+        """What came, was repaired and lost."""
+        return feed_report(self.intake, self.queue.dropped, self._watchdog)
+
+    def _take(self, sample: Sample) -> None:
+        """In the device's threads."""
+        self._heard[sample.stream] = time.monotonic_ns()
+        self.queue.put(sample)
+
+    def _used(self, sample: Sample) -> Iterator[Measurement]:
+        for measurement in self.intake.feed(sample):
+            if measurement.stream == CAM0:
+                self._arrivals.append((measurement.stamp_ns, sample.arrived_ns))
+            yield measurement
+        if self.intake.restarts > self._restarts:
+            self._restarts = self.intake.restarts
+            self._say("the camera's clock began anew; so does a new stretch")
+        if not self._mixed and max(self.intake.placed.values()) >= _MANY:
+            self._mixed = True
+            self._say(_clocks(self.intake.placed))
+
+    def _guard(self) -> None:
+        """Feed the watchdog, and do what it asks for."""
+        if self._stop.is_set():
+            self.close()
+        if self.queue.closed or not self._tick.due(time.monotonic_ns()):
+            return
+        if self._device is not None:
+            for stream, now_ns in list(self._heard.items()):
+                self._watchdog.heard(stream, now_ns)
+        self._do(self._watchdog.tick(time.monotonic_ns()))
+
+    def _do(self, action: Action) -> None:
+        if action is Action.NOTHING:  # ten times a second
+            return
+        told = {
+            "silent": ", ".join(self._watchdog.silent),
+            "health": self.health.value,
+            "serial": self.serial,
+        }
+        if action in _SAID:
+            self._say(_SAID[action].format(**told))
+        if action is Action.RESET and self._device is not None:
+            self._device.reset()
+            self._device = None
+        if action is Action.RECONNECT:
+            self._reconnect()
+        if action is Action.GIVE_UP:
+            self.in_vain = True
+            raise ShareError(_IN_VAIN.format(**told))
+
+    def _reconnect(self) -> None:
+        if self._device is not None:
+            silent = ", ".join(self._watchdog.silent)
+            self._say(f"{silent}: no more samples come; looks for camera {self.serial} until it is back")
+            self._device.stop()
+            self._device = None
+        self._attempts += 1
+        try:
+            device = self._connect(self.serial, self._attempts)
+            device.start(self._take)
+        except ShareError as error:
+            self._explain(error)
+            self._watchdog.lost(time.monotonic_ns())
+            return
+        self._device = device
+        self._reasons.clear()
+        self._watchdog.connected(time.monotonic_ns())
+        self._say(f"camera {self.serial} is connected again; a new stretch begins")
+
+    def _explain(self, error: ShareError) -> None:
+        """Why a camera that may well be plugged in is still away; each reason once."""
+        if not isinstance(error, NotAttachedError) and str(error) not in self._reasons:
+            self._reasons.add(str(error))
+            self._say(str(error))
+
+
+def _clocks(placed: Mapping[str, int]) -> str:
+    """Which streams are of the host's clock, in words. placed: samples of it among those of the camera's."""
+    theirs, ours = (
+        ", ".join(n for n, count in placed.items() if bool(count) is host) for host in (True, False)
+    )
+    return f"{theirs} carry the host's clock, {ours} the camera's: kernel patch missing, see docs/capture.md"
+
+
+# ---- How a live camera does: for a live line, and for a report.
+
+_OVER_S = 1.0
+
+
+@dataclass(frozen=True)
+class FeedStatus:
+    """rates_hz: samples of every stream in the last second; missing, dropped: so far; queue: that wait."""
+
+    health: Health
+    rates_hz: dict[str, float]
+    missing: int
+    dropped: int
+    queue: int
+
+    def __str__(self) -> str:
+        rates = " ".join(f"{name} {hz:.0f}" for name, hz in self.rates_hz.items())
+        counts = f"missing {self.missing}  dropped {self.dropped}  queue {self.queue}"
+        return f"{self.health.value}  {rates} Hz  {counts}"
+
+
+class Rates:
+    """Counts to rates over about a second."""
+
+    def __init__(self) -> None:
+        self._then: tuple[float, Mapping[str, int]] | None = None
+        self._rates: dict[str, float] = {}
+
+    def of(self, counts: Mapping[str, int], now_s: float) -> dict[str, float]:
+        """Hz by name; before the first second is over, 0."""
+        if self._then is None:
+            self._then, self._rates = (now_s, counts), dict.fromkeys(counts, 0.0)
+        since_s, before = now_s - self._then[0], self._then[1]
+        if since_s >= _OVER_S:
+            self._rates = {name: (count - before.get(name, 0)) / since_s for name, count in counts.items()}
+            self._then = (now_s, counts)
+        return self._rates
+
+
+def feed_report(intake: Intake, dropped: Mapping[str, int], watchdog: Watchdog) -> dict[str, Any]:
+    """What came, was repaired and lost, as plain data (docs/capture.md)."""
+    streams = {
+        name: {
+            "samples": gaps.samples,
+            "seconds": round(gaps.seconds, 3),
+            "gaps": gaps.gaps,
+            "missing": gaps.missing,
+            "backward": gaps.backward,
+            "dropped": dropped.get(name, 0),
+        }
+        for name, gaps in intake.streams.items()
+    }
+    return {
+        "streams": streams,
+        "imu": intake.join.joined,
+        "stretches": intake.stretches,
+        "reconnections": watchdog.reconnections,
+        "resets": watchdog.resets,
+        "health": watchdog.health.value,
+        **intake.counts(),
+    }

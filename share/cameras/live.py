@@ -1,0 +1,107 @@
+"""A live camera as a SOURCE: frames as they come, until somebody stops it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Any
+
+from share.cameras.feed import Feed
+from share.errors import UsageError
+from share.geometry.camera import Rig
+from share.recordings.calibration import Calibration
+from share.recordings.recording import Source
+from share.recordings.trajectory import Trajectory
+from share.recordings.unit import as_read, of_another, unused
+from share.sensors.imu_check import ImuRange
+from share.sensors.measurement import CAM0, Measurement
+from share.types import I64
+
+WAITING = 2  # frames that may wait for the tracker
+
+
+def given_rig(given: Calibration | None, factory: Rig, serial: str | None) -> tuple[Rig, tuple[str, ...]]:
+    """What is to be believed of a camera, and what a person should know of that. Raises UsageError where the
+    calibration that was given cannot be of it as it is read."""
+    if given is None:
+        return factory, ()
+    try:
+        rig = as_read(given.rig, factory)
+    except ValueError as error:
+        raise UsageError(f"{given.where}: {error}") from None
+    doubt = of_another(given.serials, serial)
+    return rig, (*unused(rig, factory), *([] if doubt is None else [doubt]))
+
+
+class LiveSource(Source):
+    """The camera is opened here, and let go at the end of `measurements`.
+
+    Raises UsageError, ShareError or DataError where it cannot be opened, or not with that calibration.
+    """
+
+    tells_silence = True
+
+    def __init__(
+        self,
+        feed: Feed,
+        rate_hz: float,
+        calibration: Calibration | None = None,
+        imu_range: ImuRange | None = None,
+    ) -> None:
+        """rate_hz: of cam0; calibration: in place of the factory's; imu_range: None: unknown."""
+        self.imu_range = imu_range or Source.imu_range
+        factory = feed.open()
+        self.feed, self._rate_hz = feed, rate_hz
+        self.name, self.serial = f"realsense:{feed.serial}", feed.serial
+        try:
+            self.rig, self.notes = given_rig(calibration, factory, feed.serial)
+        except BaseException:
+            feed.close()
+            raise
+
+    def stamps(self) -> dict[str, I64]:
+        raise UsageError(f"{self.name}: nobody knows yet what a live camera will see; record it first")
+
+    def measurements(self) -> Iterator[Measurement]:
+        """Once only."""
+        return self.feed.measurements()
+
+    def truth(self) -> Trajectory | None:
+        return None
+
+    def stop(self) -> None:
+        self.feed.stop()
+
+    def close(self) -> None:
+        """Let the camera go, whether it was read or not."""
+        self.feed.close()
+
+    def arrived_ns(self, stamp_ns: int) -> int:
+        """When cam0's image of that stamp came, on the host's monotonic clock."""
+        return self.feed.arrived_ns(stamp_ns)
+
+    @property
+    def image_ns(self) -> int | None:
+        """When cam0's newest image came, tracked or not, on the same clock."""
+        return self.feed.image_ns
+
+    @property
+    def images_dropped(self) -> int:
+        """Of cam0, for newer ones, as the tracker was slower."""
+        return self.feed.queue.dropped.get(CAM0, 0)
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the camera now, for a person; empty: nothing."""
+        return self.feed.trouble
+
+    def report(self) -> dict[str, Any]:
+        return {"camera": self.feed.report()}
+
+    @property
+    def images_count(self) -> int:
+        return self.feed.intake.streams[CAM0].samples
+
+    @cached_property
+    def rate_hz(self) -> float:
+        return self._rate_hz

@@ -1,0 +1,72 @@
+"""What the chronyd of this machine thinks of its clock, and how one is told to follow a server."""
+
+from __future__ import annotations
+
+import subprocess
+from dataclasses import dataclass
+
+from share.errors import DataError
+from share.net.udp import Host
+
+_NOBODY = "7F7F0101"  # reference id of a chronyd that follows its own clock
+_FIELDS = 14  # of `chronyc -c tracking`, chrony 2.2 and later
+_PATIENCE_S = 10.0
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """offset_s: the clock that it follows minus this one. rms_s: of that over the last updates. delay_s
+    and dispersion_s: from here to where the time comes from. source: whom it follows, may be empty.
+    synchronised: it follows somebody. local: that is its own clock."""
+
+    source: str
+    synchronised: bool
+    local: bool
+    stratum: int
+    offset_s: float
+    rms_s: float
+    delay_s: float
+    dispersion_s: float
+
+    @property
+    def uncertainty_s(self) -> float:
+        """Most that the offset can be wrong by: half the root delay and the root dispersion, as chrony's
+        own manual has it (chronyc(1), tracking)."""
+        return self.delay_s / 2 + self.dispersion_s
+
+
+def tracking() -> Tracking | None:
+    """None where no chronyd runs. Raises DataError where it answers what is not understood."""
+    try:
+        done = subprocess.run(
+            ["chronyc", "-c", "tracking"], capture_output=True, text=True, timeout=_PATIENCE_S, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return parse(done.stdout) if done.returncode == 0 else None
+
+
+def parse(text: str) -> Tracking:
+    """Of the line that `chronyc -c tracking` prints. Raises DataError."""
+    row = text.strip().split(",")
+    try:
+        if len(row) < _FIELDS:
+            raise ValueError(f"{len(row)} fields, expected {_FIELDS}")
+        offset_s, _last, rms_s = (float(cell) for cell in row[4:7])
+        delay_s, dispersion_s = float(row[10]), float(row[11])
+        stratum = int(row[2])
+    except ValueError as error:
+        raise DataError(f"chronyc -c tracking: not understood ({error}): {text.strip()!r}") from None
+    synchronised, local = row[13] != "Not synchronised", row[0].upper() == _NOBODY
+    return Tracking(row[1], synchronised, local, stratum, offset_s, rms_s, delay_s, dispersion_s)
+
+
+def follow(server: Host) -> list[str]:
+    """Lines of chrony.conf that make a machine follow `server`: asked every 1 to 16 s, stepped only at the
+    start where it is off by more than 10 ms. Servers of the internet, which packages of chrony bring, would
+    outvote the room's one: it is the one to trust, and to take before others."""
+    return [
+        f"server {server.name} port {server.port} iburst minpoll 0 maxpoll 4 prefer trust",
+        "makestep 0.01 3",
+        "rtcsync",
+    ]

@@ -1,0 +1,149 @@
+"""What Linux tells of the computer: processor, USB, udev, disk. Every root can be a tree of a test.
+
+What is not there is None or empty: containers and virtual machines show little.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shutil
+import socket
+from collections.abc import Sequence
+from pathlib import Path
+
+from share.devices.camera_check import UsbCamera
+
+_VENDOR, _D435I = "8086", "0b3a"
+_RULES = ("etc/udev/rules.d", "lib/udev/rules.d", "usr/lib/udev/rules.d")
+_CPUS = "sys/devices/system/cpu/cpu[0-9]*"
+_NATIVE = ("numpy", "cv2", "scipy.linalg", "zmq", "onnxruntime")
+_WHERE_THERE_IS_ONE = ("poselib",)  # for this processor; share.geometry.absolute_pose does without
+
+
+def governors(root: Path = Path("/")) -> list[str]:
+    """Of each core."""
+    return [text for path in root.glob(f"{_CPUS}/cpufreq/scaling_governor") if (text := _text(path))]
+
+
+def throttles(root: Path = Path("/")) -> list[int]:
+    """How often each core was slowed by heat since the start (Intel's; core_throttle_count)."""
+    files = root.glob(f"{_CPUS}/thermal_throttle/core_throttle_count")
+    return [count for path in files if (count := _whole(path)) is not None]
+
+
+def pi_throttled(root: Path = Path("/")) -> int | None:
+    """What a Raspberry Pi's firmware says of supply and heat, as `vcgencmd get_throttled` has it; None of
+    another computer. A kernel that is not the Pi's own tells of the supply alone (rpi_volt)."""
+    for path in root.glob("sys/devices/platform/soc*/*firmware*/get_throttled"):
+        if re.fullmatch(r"(0x)?[0-9a-fA-F]{1,8}", text := _text(path) or ""):
+            return int(text, 16)
+    for path in root.glob("sys/class/hwmon/hwmon*/in0_lcrit_alarm"):
+        if _text(path.parent / "name") == "rpi_volt":
+            return _whole(path)
+    return None
+
+
+def resets_governor(root: Path = Path("/")) -> bool:
+    """Whether a power-profiles-daemon is installed and may run, which sets the governor of processors that
+    have an energy preference (Intel's, AMD's) to powersave whenever it starts."""
+    unit = "systemd/system/power-profiles-daemon.service"
+    masked = os.path.realpath(root / "etc" / unit) == "/dev/null"
+    there = any((root / folder / unit).exists() for folder in ("lib", "usr/lib"))
+    preference = "sys/devices/system/cpu/cpufreq/policy*/energy_performance_preference"
+    return there and not masked and any(root.glob(preference))
+
+
+def usb_memory_mb(root: Path = Path("/")) -> int | None:
+    return _whole(root / "sys/module/usbcore/parameters/usbfs_memory_mb")
+
+
+def cameras(root: Path = Path("/")) -> list[UsbCamera] | None:
+    """All D435i, by port; None where the system shows no USB."""
+    folder = root / "sys/bus/usb/devices"
+    if not folder.is_dir():
+        return None
+    return [_camera(path, root / "dev/bus/usb") for path in sorted(folder.iterdir()) if _is_d435i(path)]
+
+
+def camera_rules(root: Path = Path("/")) -> list[str]:
+    """Files of udev that name the camera and its IMU in lines that are no comments."""
+    files = [path for folder in _RULES for path in sorted((root / folder).glob("*.rules"))]
+    found = {path.resolve(): path for path in files if _names_camera(_text(path) or "")}  # /lib is /usr/lib
+    return [f"/{path.relative_to(root)}" for path in found.values()]
+
+
+def free_bytes(folder: Path) -> tuple[Path, int]:
+    """Of the disk of `folder`, by the nearest folder above that is there."""
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    return there, shutil.disk_usage(there).free
+
+
+def port_free(port: int) -> bool:
+    """Whether a TCP port can be listened at, on all addresses."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as asked:
+        asked.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # what has ended does not count
+        try:
+            asked.bind(("", port))
+            asked.listen()
+        except OSError:
+            return False
+    return True
+
+
+def native_libraries(
+    names: Sequence[str] = _NATIVE, optional: Sequence[str] = _WHERE_THERE_IS_ONE
+) -> dict[str, str | None]:
+    """Why each does not load; None where it does. optional: those that may not be installed at all."""
+    there = [name for name in optional if importlib.util.find_spec(name) is not None]
+    return {name: _trouble(name) for name in (*names, *there)}
+
+
+def _trouble(name: str) -> str | None:
+    try:
+        importlib.import_module(name)
+    except ImportError as error:  # also a wrong glibc, a missing .so
+        return str(error).splitlines()[0]
+    return None
+
+
+def _is_d435i(path: Path) -> bool:
+    return (_text(path / "idVendor"), _text(path / "idProduct")) == (_VENDOR, _D435I)
+
+
+def _camera(path: Path, nodes: Path) -> UsbCamera:
+    speed_mbit_s, control = _number(path / "speed") or 0.0, _text(path / "power/control")
+    node = nodes / f"{_whole(path / 'busnum') or 0:03}" / f"{_whole(path / 'devnum') or 0:03}"
+    may_open = os.access(node, os.R_OK | os.W_OK)
+    return UsbCamera(path.name, speed_mbit_s, control, may_open, _may_start_imu(path))
+
+
+def _may_start_imu(path: Path) -> bool | None:
+    switches = list(path.glob(f"{path.name}:*/*/HID-SENSOR-*/iio:device*/scan_elements/*_en"))
+    return all(os.access(switch, os.W_OK) for switch in switches) if switches else None
+
+
+def _names_camera(text: str) -> bool:
+    """librealsense's own file names each product; ours the D435i. Without a line for iio the IMU is shut."""
+    lines = [line.lower() for line in text.splitlines() if not line.lstrip().startswith("#")]
+    named = [line for line in lines if _VENDOR in line and _D435I in line]
+    return any("iio" in line for line in named) and any("iio" not in line for line in named)
+
+
+def _text(path: Path) -> str | None:
+    try:
+        return path.read_text(errors="replace").strip()
+    except OSError:
+        return None
+
+
+def _number(path: Path) -> float | None:
+    """Also None of `unknown`, as the kernel calls the speed of a device that is coming or going."""
+    text = _text(path) or ""
+    return float(text) if re.fullmatch(r"\d+(\.\d+)?", text) else None
+
+
+def _whole(path: Path) -> int | None:
+    text = _text(path)
+    return int(text) if text and text.isdigit() else None

@@ -1,0 +1,168 @@
+"""Lines that a live run puts down and reads once more at its end, so that they take no memory meanwhile."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO
+
+from share.errors import ShareError
+from share.files.reading import MB, open_regular
+from share.files.writing import fresh
+
+# ---- A text file that a live run appends to, and that never ends the run: a full disk is said once.
+
+
+class LineFile:
+    """Every line is in the system's hands when `write` returns, so a crash loses none.
+
+    After the first line that cannot be written (disk full, quota), `say` is told once and nothing
+    more is tried: what is there stays, in whole lines.
+    """
+
+    def __init__(
+        self, path: Path, say: Callable[[str], None], opened: Callable[[Path], IO[bytes]] = fresh
+    ) -> None:
+        """opened: makes the file; may raise OSError."""
+        self.path, self._say = path, say
+        self.whole_bytes = 0  # of whole lines
+        self._file: IO[str] | None = None
+        self._failure = ""
+        try:
+            self._file = io.TextIOWrapper(opened(path), "utf-8", line_buffering=True)
+        except OSError as error:
+            self._fail(error)
+
+    def write(self, line: str) -> None:
+        """One line, without its end."""
+        if self._file is None:
+            return
+        try:
+            self._file.write(line + "\n")
+            self.whole_bytes += len(line.encode()) + 1
+        except OSError as error:
+            self._fail(error)
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def check(self) -> None:
+        """Raises ShareError if a line is missing."""
+        if self._failure:
+            raise ShareError(f"{self.path}: is not complete: {self._failure}")
+
+    def _fail(self, error: OSError) -> None:
+        self._failure = error.strerror or str(error)
+        if self._file is not None:
+            with contextlib.suppress(OSError):  # what it still holds cannot be written either
+                self._file.close()
+            self._file = None
+            with contextlib.suppress(OSError):  # a device has no end to cut off
+                os.truncate(self.path, self.whole_bytes)
+        self._say(f"{self.path}: cannot be written: {self._failure}; the run goes on without it")
+
+
+_LASTING = Path("/var/tmp")  # /tmp may lie in memory
+_AT_ONCE = 1 << 20  # bytes
+
+
+class Spool:
+    """As `LineFile`, made by the first line, and readable while it is open, even if it was removed.
+
+    path None: a file without a name in the system's folder of temporary ones, of which nothing is left
+    however the run ends.
+    """
+
+    def __init__(self, path: Path | None, say: Callable[[str], None]) -> None:
+        self._path, self._say = path, say
+        self._file: LineFile | None = None
+        self._reading: int | None = None  # a handle of the same file
+
+    def write(self, line: str) -> None:
+        """One line, without its end."""
+        if self._file is None:
+            shown = _lasting() / "share (without a name)" if self._path is None else self._path
+            self._file = LineFile(shown, self._say, self._opened)
+        self._file.write(line)
+
+    def read(self) -> Iterator[str]:
+        """Lines in order, but for those that could not be written. Raises ShareError if the disk fails."""
+        if self._file is None or self._reading is None:
+            return
+        at, cut = 0, b""
+        while at < self._file.whole_bytes:
+            lines = (cut + self._part(at, min(_AT_ONCE, self._file.whole_bytes - at))).split(b"\n")
+            at += sum(map(len, lines)) + len(lines) - 1 - len(cut)
+            cut = lines.pop()
+            yield from (line.decode() for line in lines)
+
+    def check(self) -> None:
+        """Raises ShareError if a line is missing."""
+        if self._file is not None:
+            self._file.check()
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+        if self._reading is not None:
+            os.close(self._reading)
+            self._reading = None
+
+    def _opened(self, path: Path) -> IO[bytes]:
+        file = self._nameless() if self._path is None else fresh(path)
+        self._reading = os.dup(file.fileno())
+        return file
+
+    def _nameless(self) -> IO[bytes]:
+        return tempfile.TemporaryFile(dir=_lasting())
+
+    def _part(self, at: int, size: int) -> bytes:
+        assert self._file is not None and self._reading is not None
+        try:
+            part = os.pread(self._reading, size, at)
+        except OSError as error:
+            raise ShareError(f"{self._file.path}: cannot be read: {error.strerror}") from None
+        if not part:
+            raise ShareError(f"{self._file.path}: somebody cut it off while it was written")
+        return part
+
+
+def _lasting() -> Path:
+    return _LASTING if os.access(_LASTING, os.W_OK) else Path(tempfile.gettempdir())
+
+
+# ---- A text file that another process is writing, read as it grows.
+
+_PIECE = 10 * MB  # the rest the next time
+
+
+class GrowingFile:
+    """Its lines, each once. partial: the name that it has until it is whole; what has the other name before
+    that is of earlier."""
+
+    def __init__(self, path: Path, partial: Path | None = None) -> None:
+        self._path, self._partial = path, partial
+        self._read = 0  # bytes
+
+    def lines(self) -> list[str]:
+        """Whole lines that have come since the last time; none while there is no file."""
+        new = b"" if self._partial is None else self._beyond(self._partial)
+        if not new and (self._partial is None or self._read):
+            new = self._beyond(self._path)
+        whole = new[: new.rfind(b"\n") + 1]
+        self._read += len(whole)
+        return whole.decode(errors="replace").splitlines()
+
+    def _beyond(self, path: Path) -> bytes:
+        try:
+            with open_regular(path) as file:
+                file.seek(self._read)
+                return file.read(_PIECE)
+        except OSError:
+            return b""

@@ -1,0 +1,143 @@
+"""Allan deviation of a sensor at rest, over stretches without gaps.
+
+Source: IEEE Std 952-1997, annex C; the overlapping estimator of Howe, Allan and Barnes 1981 (NIST SP 1065,
+5.2.4). What the curve tells: `share.lab.calibrate.imu_noise`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.errors import DataError
+from share.types import F64, I64
+
+_LEAST_SAMPLES = 100
+_OVERLAP = 16
+
+
+@dataclass(frozen=True, eq=False)
+class AllanCurve:
+    """sizes (T,): samples in an average; deviation (T, A) in the unit of the samples, A axes.
+    lengths (S,): samples of each stretch; rate_hz of the samples."""
+
+    sizes: I64
+    deviation: F64
+    lengths: I64
+    rate_hz: float
+
+    @property
+    def taus(self) -> F64:
+        """(T,) s that an average lasts."""
+        return np.asarray(self.sizes / self.rate_hz, np.float64)
+
+    @property
+    def clusters(self) -> I64:
+        """(T,) independent averages, side by side: in each stretch as many as fit, less those that have
+        no neighbour."""
+        fit = self.lengths // self.sizes[:, None]
+        return np.asarray(np.where(fit >= 2, fit, 0).sum(axis=1), np.int64)
+
+
+def allan_deviation(samples: F64 | Sequence[F64], rate_hz: float, per_octave: int = 4) -> AllanCurve:
+    """Of samples (N, A) at `rate_hz`, or of several stretches of them with gaps between: no difference is
+    taken across a gap. Over averages of one sample up to a quarter of the longest stretch.
+
+    Raises DataError where no stretch has 100 samples, or for values that are not finite.
+    """
+    given = [samples] if isinstance(samples, np.ndarray) else samples
+    stretches = [np.asarray(one, np.float64) for one in given if len(one) >= 2]
+    longest = max(map(len, stretches), default=0)
+    if longest < _LEAST_SAMPLES:
+        raise DataError(f"Allan deviation: {longest} samples in a row, needs {_LEAST_SAMPLES}; record longer")
+    if not all(np.isfinite(s).all() for s in stretches):
+        raise DataError("Allan deviation: has samples that are not finite")
+    octaves = np.log2(longest / 4)
+    sizes = np.unique(np.rint(2 ** np.linspace(0, octaves, int(octaves * per_octave) + 1)).astype(np.int64))
+    total = np.sum([_squares(_summed(one), sizes) for one in stretches], axis=0)
+    return AllanCurve(
+        sizes=sizes,
+        deviation=np.sqrt(total[:, :-1] / total[:, -1:] / 2) / sizes[:, None],
+        lengths=np.array([len(s) for s in stretches], np.int64),
+        rate_hz=rate_hz,
+    )
+
+
+def _summed(samples: F64) -> F64:
+    """Running sum (N + 1, A) of samples (N, A) less their mean, which tells nothing."""
+    sums = np.cumsum(samples - samples.mean(axis=0), axis=0)
+    return np.concatenate([np.zeros((1, samples.shape[1])), sums])
+
+
+def _squares(theta: F64, sizes: I64) -> F64:
+    """(T, A + 1): sum of squared second differences of the running sum at each size, and their number."""
+    out = np.zeros((len(sizes), theta.shape[1] + 1))
+    for row, m in zip(out, sizes, strict=True):
+        if 2 * m < len(theta):
+            step = max(1, m // _OVERLAP)  # starts closer than that tell nothing new
+            second = theta[2 * m :: step] - 2 * theta[m:-m:step] + theta[: -2 * m : step]
+            row[:-1], row[-1] = (second**2).sum(axis=0), len(second)
+    return out
+
+
+# ---- How much Allan variances of one recording scatter, and how alike.
+
+_FULL, _NEAR = 65, 33  # lags over all of a sum, and about each of its nine corners
+_SECOND = np.array([1.0, -2.0, 1.0])
+
+
+def _white(h: F64) -> F64:
+    return -h / 2
+
+
+def _flicker(h: F64) -> F64:
+    return np.asarray(h * h * np.log(np.maximum(h, 1e-300)) / (2 * np.pi), np.float64)
+
+
+def _walk(h: F64) -> F64:
+    return h**3 / 12
+
+
+_PARTS: tuple[Callable[[F64], F64], ...] = (_white, _flicker, _walk)
+
+
+def scatter(sizes: I64, lengths: I64, rate_hz: float) -> F64:
+    """(3, 3, T, T): with squares p = (N^2, B^2, K^2) of one axis, sum_ab p_a p_b out[a, b] is the covariance
+    of its Allan variances at T sizes, from stretches of `lengths` (S,) samples."""
+    out = np.zeros((3, 3, len(sizes), len(sizes)))
+    for i, m in enumerate(sizes):
+        for j, n in enumerate(sizes[: i + 1]):
+            out[:, :, i, j] = out[:, :, j, i] = _pair(int(m), int(n), lengths, 1 / rate_hz)
+    return out
+
+
+def _pair(m: int, n: int, lengths: I64, dt: float) -> F64:
+    """(3, 3) of the variances at m and n samples."""
+    corners = np.arange(3)[:, None] * m - np.arange(3) * n
+    k, weight = _lags(corners, m, n)
+    h = np.abs(k[:, None, None] - corners) * dt
+    R = np.stack([np.einsum("kab,a,b->k", part(h), _SECOND, _SECOND) for part in _PARTS])
+    count, pairs = _pairs(k, lengths, m, n)
+    return np.asarray(
+        2 * (R * (weight * count)) @ R.T / pairs / (4 * (m * dt) ** 2 * (n * dt) ** 2), np.float64
+    )
+
+
+def _lags(corners: I64, m: int, n: int) -> tuple[I64, F64]:
+    """Whole lags, close where the covariance has corners, and how many each stands for."""
+    reach, near = 2 * (m + n), 2 * min(m, n)
+    around = corners.reshape(-1, 1) + np.linspace(-near, near, _NEAR)
+    everywhere = m - n + np.linspace(-reach, reach, _FULL)
+    k = np.unique(np.rint(np.concatenate([around.ravel(), everywhere])).astype(np.int64))
+    gaps = np.diff(k, prepend=k[0] - 1, append=k[-1] + 1)
+    return k, (gaps[1:] + gaps[:-1]) / 2
+
+
+def _pairs(k: I64, lengths: I64, m: int, n: int) -> tuple[F64, float]:
+    """At how many places each lag is found, over all stretches; the product of the numbers of differences."""
+    of_m, of_n = np.maximum(lengths + 1 - 2 * m, 0), np.maximum(lengths + 1 - 2 * n, 0)
+    lag = k[:, None]
+    count = np.clip(np.minimum(of_m, of_n - lag) - np.maximum(0, -lag), 0, None).sum(axis=1)
+    return count.astype(np.float64), float(of_m.sum()) * float(of_n.sum())

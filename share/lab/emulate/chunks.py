@@ -1,0 +1,47 @@
+"""A few frames of one agent, encoded, on disk until its recording is written: what a break leaves
+is not drawn again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from share.errors import DataError
+from share.files.reading import ARRAYS, read_bytes
+from share.files.writing import atomic_write
+from share.recordings.images import EncodedImage
+from share.sensors.measurement import DEPTH, Measurement
+
+DEPTH_SCALE = 1000.0  # millimetres
+
+
+class Picture(msgspec.Struct, frozen=True, array_like=True):
+    """One image as it will be recorded: JPEG or PNG."""
+
+    stream: str
+    stamp_ns: int
+    width: int
+    height: int
+    data: bytes
+
+
+def write_chunk(path: Path, pictures: list[Picture]) -> None:
+    """Whole or not at all. Raises as `atomic_write`."""
+    atomic_write(path, msgspec.msgpack.encode(pictures))
+
+
+def read_chunk(path: Path) -> Iterator[Measurement]:
+    """In the order in which they were written. Raises DataError if it is damaged."""
+    try:
+        pictures = msgspec.msgpack.decode(read_bytes(path, ARRAYS), type=list[Picture])
+    except (OSError, msgspec.DecodeError, msgspec.ValidationError) as error:
+        raise DataError(f"{path}: is damaged ({error}); delete it and run the command again") from None
+    for p in pictures:
+        yield Measurement(p.stream, p.stamp_ns, encoded(p, str(path)))
+
+
+def encoded(p: Picture, where: str) -> EncodedImage:
+    """As a reader has it. where: what an error names."""
+    return EncodedImage(p.data, where, p.width, p.height, DEPTH_SCALE if p.stream == DEPTH else 0.0)

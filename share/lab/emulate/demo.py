@@ -1,0 +1,20 @@
+"""What `share demo` plays: two headset wearers and a robot in one room."""
+
+from __future__ import annotations
+
+from share.lab.emulate.recipe import Recipe
+
+MOTIONS = ("ar1=walk:speed=0.65", "ar2=walk:speed=0.55", "robot=robot:speed=0.3")
+AGENTS = tuple(motion.partition("=")[0] for motion in MOTIONS)
+PROFILE = "d435i:640x480@15"  # four processes share two cores: half of what the device can do
+SCENE, FALLBACK = "warehouse", "plain"
+
+
+def meeting_seed(scene: str) -> int:
+    """Of a room in which all three soon look at the same things; in others 20 s may be too short for that."""
+    return 3 if scene == FALLBACK else 11
+
+
+def recipe(scene: str, seconds: float, seed: int) -> Recipe:
+    """The same three for every scene."""
+    return Recipe(scene, MOTIONS, seconds, seed, profiles={"": PROFILE})

@@ -1,0 +1,125 @@
+"""When to be where on a way: as fast as one likes, slow in bends, never where another is.
+
+Path-velocity decomposition (Kant & Zucker, IJRR 5(3), 1986): the way is fixed, and the others are
+forbidden regions in the plane of time and place on it. Dynamic programming finds the cheapest monotone
+line through that plane; the cost is the square of the deviation from the speed one would like.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.lab.emulate.motion.route import Way
+from share.types import F64
+
+STEP_S = 0.2
+_SPEEDS = 14  # that the search tells apart, besides standing
+_SUB = 2  # times within a step at which the others are looked at
+_FINE_S = 0.05
+_SMOOTH_S = 0.4  # sigma of the smoothing in time: a step of 1 m/s becomes 1 m/s^2 at most
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a body can do. speed: m/s at most. turn: rad/s at most. aside: m/s^2 in a bend. gain: m/s^2
+    of gaining and losing speed."""
+
+    speed: float
+    turn: float
+    aside: float
+    gain: float
+
+
+@dataclass(frozen=True, eq=False)
+class Other:
+    """One to keep `distance` m away from: where it is, xy (K, 2) m every STEP_S / 2 from the start; its
+    last place counts for the time after."""
+
+    xy: F64
+    distance: float
+
+
+def speed_limit(way: Way, limits: Limits) -> F64:
+    """Most speed (N,) m/s at each place of the way, such that one can also brake for what comes."""
+    bend = np.abs(way.bend) + 1e-9
+    v: F64 = np.minimum(limits.speed, np.minimum(limits.turn / bend, np.sqrt(limits.aside / bend)))
+    v = np.maximum(v, 0.05)
+    gain = 2 * limits.gain * np.diff(way.gone)
+    for i in range(1, len(v)):
+        v[i] = min(v[i], np.sqrt(v[i - 1] ** 2 + gain[i - 1]))
+    for i in range(len(v) - 2, -1, -1):
+        v[i] = min(v[i], np.sqrt(v[i + 1] ** 2 + gain[i]))
+    return v
+
+
+def schedule(
+    way: Way,
+    most: F64,
+    wanted: F64,
+    others: Sequence[Other] = (),
+    end: float | None = None,
+) -> F64 | None:
+    """Metres along the way (T,) at the instants k * STEP_S, T = len(wanted) + 1; None if the others leave
+    no way through.
+
+    most (N,) m/s: speed limit at each place of the way; wanted (T - 1,) m/s: the speed one
+    would like in each step. end: metres to have gone at the end, as nearly as possible.
+    """
+    cell = float(most.max()) * STEP_S / _SPEEDS
+    place = np.arange(int(way.gone[-1] / cell) + 1) * cell
+    limit = np.interp(place, way.gone, most)
+    xy = np.stack([np.interp(place, way.gone, way.xy[:, k]) for k in range(2)], axis=1)
+    speeds = np.arange(_SPEEDS + 1) * (cell / STEP_S)
+    barred = np.where(speeds[:, None] <= np.maximum(limit, speeds[1] + 1e-9), 0.0, np.inf)
+    cost, back = np.full(len(place), np.inf), np.zeros((len(wanted), len(place)), np.int8)
+    cost[0], first, last = 0.0, 0, 1  # where one can be by now: in place[first:last]
+    for k, want in enumerate(wanted):
+        reach = min(last + _SPEEDS, len(place))
+        paid = np.full((len(speeds), reach - first), np.inf)
+        here = slice(first, last)
+        price = (speeds[:, None] - np.minimum(want, limit[here])) ** 2 + barred[:, here] + cost[here]
+        for j in range(len(speeds)):
+            kept = min(last, reach - j) - first
+            paid[j, j : j + max(kept, 0)] = price[j, : max(kept, 0)]
+        back[k, first:reach] = np.argmin(paid, axis=0)
+        now = np.min(paid, axis=0)
+        now[_blocked(xy[first:reach], others, k + 1)] = np.inf
+        cost[first:reach] = now
+        can = np.flatnonzero(np.isfinite(now))
+        if not len(can):
+            return None
+        first, last = first + int(can[0]), first + int(can[-1]) + 1
+        cost[:first] = np.inf
+    total = cost + (0 if end is None else 30 * (place - end) ** 2)
+    return _traced(back, int(np.argmin(total))) * cell
+
+
+def smoothed(steps: F64, seconds: F64) -> F64:
+    """Metres along the way (M,) at `seconds` (M,) of what `schedule` found, smooth in time."""
+    from scipy.interpolate import make_interp_spline
+    from scipy.ndimage import gaussian_filter1d
+
+    fine = np.arange(0, (len(steps) - 1) * STEP_S + _FINE_S / 2, _FINE_S)
+    rough = np.interp(fine, np.arange(len(steps)) * STEP_S, steps)
+    soft = gaussian_filter1d(rough, _SMOOTH_S / _FINE_S, mode="nearest")
+    out: F64 = make_interp_spline(fine, soft, k=5)(seconds)
+    return out.clip(steps[0], steps[-1])
+
+
+def _blocked(xy: F64, others: Sequence[Other], step: int) -> np.ndarray:
+    out = np.zeros(len(xy), bool)
+    for other in others:
+        for k in range(_SUB * (step - 1) + 1, _SUB * step + 1):
+            there = other.xy[min(k, len(other.xy) - 1)]
+            out |= ((xy - there) ** 2).sum(axis=1) < other.distance**2
+    return out
+
+
+def _traced(back: np.ndarray, end: int) -> F64:
+    places = [end]
+    for row in back[::-1]:
+        places.append(places[-1] - int(row[places[-1]]))
+    return np.array(places[::-1], float)

@@ -1,0 +1,188 @@
+"""What a user asks for: `walk:`, `robot:speed=0.5`, `ann=euroc:V1_02,start=5`, `paper:3`.
+
+[NAME=]KIND:[ARGUMENT][,key=value ...]
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from dataclasses import dataclass, fields
+from typing import TypeAlias
+
+from share.errors import UsageError
+from share.plain_data import from_mapping
+from share.types import AgentKind
+
+LOOKS = ("person", "robot", "drone")
+
+
+@dataclass(frozen=True)
+class RecordedSpec:
+    """A recording's motion, from `start` (s after its beginning), for `seconds` (None: to its end, or
+    the session's). kind: ar or robot. look: what the others see, person, robot or drone."""
+
+    path: str = ""
+    start: float = 0.0
+    seconds: float | None = None
+    kind: str = "ar"
+    look: str = "person"
+
+    def __post_init__(self) -> None:
+        if not self.path:
+            raise ValueError("says no folder or file")
+        _one_of("kind", self.kind, tuple(AgentKind))
+        _one_of("look", self.look, LOOKS)
+        _positive(self, "seconds")
+
+
+@dataclass(frozen=True)
+class EurocSpec(RecordedSpec):
+    """`euroc:FOLDER`: truth, real IMU and image stamps in EuRoC's files."""
+
+    kind: str = "robot"
+    look: str = "drone"
+
+
+@dataclass(frozen=True)
+class TumviSpec(RecordedSpec):
+    """`tumvi:FOLDER`: the same of a handheld device."""
+
+
+@dataclass(frozen=True)
+class TumSpec(RecordedSpec):
+    """`tum:FILE`: poses alone; the IMU is simulated."""
+
+
+@dataclass(frozen=True)
+class WalkSpec:
+    """`walk:` a person with a headset. speed: m/s, cruising. pauses: a minute. height: m, of the eyes
+    (None: 1.60 to 1.75 by the seed). turns: rad/s, the quickest turn of the head."""
+
+    speed: float = 0.9
+    seconds: float | None = None
+    pauses: float = 3.0
+    height: float | None = None
+    turns: float = 2.6
+
+    def __post_init__(self) -> None:
+        _positive(self, "speed", "seconds", "height", "turns")
+        _within("speed", self.speed, 0.2, 2.0, "m/s")
+        _within("turns", self.turns, 0.5, 3.0, "rad/s")
+        _within("pauses", self.pauses, 0.0, 12.0, "a minute")
+        if self.height is not None:
+            _within("height", self.height, 1.2, 2.0, "m")
+
+
+@dataclass(frozen=True)
+class RobotSpec:
+    """`robot:` a differential drive. speed: m/s, cruising. pauses: a minute. height: m, of the camera.
+    vibration: m/s^2, rms of the vertical while it drives at 0.3 m/s."""
+
+    speed: float = 0.35
+    seconds: float | None = None
+    pauses: float = 3.0
+    height: float = 0.35
+    vibration: float = 0.4
+
+    def __post_init__(self) -> None:
+        _positive(self, "speed", "seconds", "height")
+        _within("speed", self.speed, 0.05, 1.0, "m/s")
+        _within("pauses", self.pauses, 0.0, 12.0, "a minute")
+        _within("height", self.height, 0.1, 1.5, "m")
+        _within("vibration", self.vibration, 0.0, 2.0, "m/s^2")
+
+
+@dataclass(frozen=True)
+class BoardSpec:
+    """`board:` a device in a hand before a calibration board. distance: m, the usual one; it comes to a
+    little more than half of it and to nearly twice. vigour: 1 for camera and IMU together; below 0.5 it
+    is slow and pauses, for a camera alone."""
+
+    distance: float = 0.8
+    vigour: float = 1.0
+    seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        _positive(self, "distance", "vigour", "seconds")
+        _within("distance", self.distance, 0.3, 3.0, "m")
+        _within("vigour", self.vigour, 0.1, 2.0, "times the usual speed")
+
+
+@dataclass(frozen=True)
+class PaperSpec:
+    """`paper:1` .. `paper:5`: the three agents of one of the paper's experiments, 60 s."""
+
+    number: int = 1
+
+
+Spec: TypeAlias = EurocSpec | TumviSpec | TumSpec | WalkSpec | RobotSpec | BoardSpec | PaperSpec
+
+KINDS: dict[str, type[Spec]] = {
+    "euroc": EurocSpec,
+    "tumvi": TumviSpec,
+    "tum": TumSpec,
+    "walk": WalkSpec,
+    "robot": RobotSpec,
+    "board": BoardSpec,
+    "paper": PaperSpec,
+}
+_NAME = re.compile(r"([^:=]*)=(.*)", re.DOTALL)
+_GOOD_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}")
+_OPTION = re.compile(r"\s*([a-z_]+)=(.*)", re.DOTALL)
+
+
+def parse(text: str) -> tuple[str | None, Spec]:
+    """(name or None, spec) of `NAME=SPEC` or `SPEC`. Raises UsageError naming what is wrong."""
+    named = _NAME.fullmatch(text)
+    name, spec = (named[1], named[2]) if named else (None, text)
+    if name is not None and not _GOOD_NAME.fullmatch(name):
+        raise UsageError(f"'{text}': '{name}' is no name; use letters, digits, '-' and '_', at most 32")
+    kind, colon, rest = spec.partition(":")
+    if kind not in KINDS or not colon:
+        near = difflib.get_close_matches(kind, KINDS, n=1)
+        hint = f"did you mean '{near[0]}:'?" if near else "known: " + ", ".join(f"{k}:" for k in KINDS)
+        raise UsageError(f"'{text}': '{kind}' is not a kind of motion; {hint}")
+    argument, options = _split(rest)
+    return name, _make(kind, argument, options, text)
+
+
+def _split(rest: str) -> tuple[str, dict[str, str]]:
+    """`FOLDER,start=5,seconds=20` -> the folder, which may hold commas, and the options behind it."""
+    parts, options = rest.split(","), {}
+    while parts and (found := _OPTION.fullmatch(parts[-1])):
+        options[found[1]] = found[2].strip()
+        parts.pop()
+    return ",".join(parts), options
+
+
+def _make(kind: str, argument: str, options: dict[str, str], text: str) -> Spec:
+    cls = KINDS[kind]
+    if cls is PaperSpec:
+        if argument not in ("1", "2", "3", "4", "5") or options:
+            raise UsageError(
+                f"'{text}': the paper has five experiments; say paper:1 to paper:5, nothing more"
+            )
+        return PaperSpec(int(argument))
+    takes_path = issubclass(cls, RecordedSpec)
+    if argument and not takes_path:
+        known = ", ".join(f.name for f in fields(cls))
+        raise UsageError(f"'{text}': '{argument}' is not key=value; known keys: {known}")
+    return from_mapping(cls, options | ({"path": argument} if takes_path else {}), f"'{text}'")
+
+
+def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise ValueError(f"{name} '{value}' is not known; known: {', '.join(known)}")
+
+
+def _positive(spec: object, *names: str) -> None:
+    for name in names:
+        value = getattr(spec, name)
+        if value is not None and not value > 0:
+            raise ValueError(f"{name}={value:g} must be positive")
+
+
+def _within(name: str, value: float, low: float, high: float, unit: str) -> None:
+    if not low <= value <= high:
+        raise ValueError(f"{name}={value:g}: expected {low:g} to {high:g} {unit}")

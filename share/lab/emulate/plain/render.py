@@ -1,0 +1,150 @@
+"""Gray image and exact depth of a room, by casting a ray through every pixel centre.
+
+All in inverse depth q = 1/z: where a ray r (world frame, camera z = 1) from c meets the plane
+x_k = p, q = r_k / (p - c_k), a multiple of an image that is affine in the pixel. A box is the q-interval
+between its exit and entry planes (the slab method of Kay & Kajiya 1986). Textures are mip-mapped,
+trilinear (Williams 1983): the room's pyramid holds two levels in a pixel, so one remap fetches both.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from share.geometry.camera import Camera
+from share.geometry.se3 import inverse, transform
+from share.lab.emulate.plain.room import LEVELS, TEXELS_PER_M, Room
+from share.types import F32, F64, U8
+
+_NEAR = 0.05  # m; nothing is nearer
+_ANISOTROPY = 0.6  # blur on slanted faces: 0 by the short side of a pixel's footprint, 1 by the long
+_MAX_FACES = 256  # a face fits in a byte
+
+
+class Renderer:
+    """Pictures of one room by one undistorted camera. Not safe for threads: it reuses its buffers."""
+
+    def __init__(self, room: Room, camera: Camera) -> None:
+        if camera.distortion:
+            raise ValueError("camera: the plain renderer has no lens distortion")
+        if len(room.origin) > _MAX_FACES:
+            raise ValueError(f"room: {len(room.origin)} faces, at most {_MAX_FACES}")
+        self._room, self._camera = room, camera
+        self._pyramid = room.pyramid.pixels
+        self._corner, self._origin = _table(room.pyramid.corners), _table(room.origin)
+        shape = (camera.height, camera.width)
+        self._q, self._face = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
+
+    def render(self, T_world_cam: F64) -> tuple[U8, F32]:
+        """(image (H, W) uint8, depth (H, W) float32 m along the optical axis), the camera being
+        anywhere in the room and in no box."""
+        centre = T_world_cam[:3, 3]
+        rays = self._rays(T_world_cam[:3, :3])
+        self._cast_room(rays, centre)
+        for b in range(1, len(self._room.boxes)):
+            window = self._window(self._room.boxes[b], T_world_cam)
+            if window is not None:
+                self._cast_box(b, [r[window] for r in rays], centre, window)
+        depth: F32 = np.reciprocal(self._q)
+        return self._texture(rays, depth, centre), depth
+
+    def _rays(self, R: F64) -> list[F32]:
+        c = self._camera
+        u = (np.arange(c.width) - c.cx) / c.fx
+        v = (np.arange(c.height) - c.cy) / c.fy
+        return [
+            np.add.outer((R[k, 1] * v + R[k, 2]).astype(np.float32), (R[k, 0] * u).astype(np.float32))
+            for k in range(3)
+        ]
+
+    def _cast_room(self, rays: list[F32], centre: F64) -> None:
+        """From inside, the nearest of the six planes ahead is the one seen."""
+        slopes = 1 / (self._room.boxes[0] - centre)
+        self._q.fill(0)
+        for k, ray in enumerate(rays):
+            for side in (0, 1):
+                _keep_larger(self._q, self._face, ray * np.float32(slopes[side, k]), 2 * k + side)
+
+    def _cast_box(self, b: int, rays: list[F32], centre: F64, window: tuple[slice, slice]) -> None:
+        box = self._room.boxes[b]
+        q, face = self._q[window], self._face[window]
+        entry = np.full(q.shape, np.inf, np.float32)
+        entered = np.zeros(q.shape, np.uint8)
+        behind = q  # a hit must lie before all that is drawn, and before the ray leaves the box
+        for k, ray in enumerate(rays):
+            slopes = (1 / (box[:, k] - centre[k])).astype(np.float32)
+            near = 0 if centre[k] < box[0, k] else 1 if centre[k] > box[1, k] else None
+            if near is None:
+                behind = np.maximum(behind, np.maximum(ray * slopes[0], ray * slopes[1]))
+                continue
+            plane = ray * slopes[near]
+            closer = plane < entry
+            np.copyto(entry, plane, where=closer)
+            np.copyto(entered, np.uint8(6 * b + 2 * k + near), where=closer)
+            behind = np.maximum(behind, ray * slopes[1 - near])
+        hit = entry > behind
+        np.copyto(q, entry, where=hit)
+        np.copyto(face, entered, where=hit)
+
+    def _window(self, box: F64, T_world_cam: F64) -> tuple[slice, slice] | None:
+        """The part of the image that may show the box, or None."""
+        c = self._camera
+        corners = np.array(
+            [[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+        )
+        seen = transform(inverse(T_world_cam), corners)
+        if (seen[:, 2] < _NEAR).all():
+            return None
+        if (seen[:, 2] < _NEAR).any():
+            return slice(0, c.height), slice(0, c.width)
+        px = c.project(seen)
+        (left, top), (right, bottom) = np.floor(px.min(0)).astype(int), np.ceil(px.max(0)).astype(int) + 1
+        rows, columns = slice(max(top, 0), min(bottom, c.height)), slice(max(left, 0), min(right, c.width))
+        return (rows, columns) if rows.start < rows.stop and columns.start < columns.stop else None
+
+    def _texture(self, rays: list[F32], depth: F32, centre: F64) -> U8:
+        hit = [ray * depth + np.float32(x) for ray, x in zip(rays, centre, strict=True)]
+        axis = cv2.LUT(self._face, _AXIS)
+        column, row = hit[0], -hit[2]
+        np.copyto(column, hit[1], where=axis == 0)
+        np.copyto(row, hit[1], where=axis == 2)
+        level = self._level(depth, centre)
+        whole = level.astype(np.uint8)
+        shrink = cv2.LUT(whole, _SHRINK)
+        for k, at in enumerate((column, row)):
+            at *= np.float32(TEXELS_PER_M)
+            at += cv2.LUT(self._face, self._origin[k])
+            at *= shrink
+            at += cv2.LUT(whole, self._corner[k])
+        fine, coarse = cv2.split(cv2.remap(self._pyramid, column, row, cv2.INTER_LINEAR))
+        level -= whole
+        out: U8 = cv2.blendLinear(fine, coarse, 1 - level, level)
+        return out
+
+    def _level(self, depth: F32, centre: F64) -> F32:
+        """log2 of a pixel's footprint in texels. On a plane at distance d the footprint is z / f
+        by z^2 / (f d)."""
+        room = self._room
+        away = np.abs(room.boxes.swapaxes(1, 2) - centre[:, None]).reshape(-1).clip(_NEAR)
+        scale = np.log2(TEXELS_PER_M / self._camera.fx) - _ANISOTROPY * np.log2(away)
+        level = np.log2(depth)
+        level *= np.float32(1 + _ANISOTROPY)
+        level += cv2.LUT(self._face, _table(scale[:, None].astype(np.float32))[0])
+        return np.clip(level, 0, LEVELS - 1.001, out=level)
+
+
+def _keep_larger(q: F32, face: U8, candidate: F32, name: int) -> None:
+    larger = candidate > q
+    np.copyto(q, candidate, where=larger)
+    np.copyto(face, np.uint8(name), where=larger)
+
+
+def _table(values: F32) -> F32:
+    """Columns of (N, C) as lookup tables by a byte: (C, 256)."""
+    out = np.zeros((values.shape[1], 256), np.float32)
+    out[:, : len(values)] = values.T
+    return out
+
+
+_AXIS = (np.arange(256) % 6 // 2).astype(np.uint8)
+_SHRINK = (0.5 ** np.arange(256)).astype(np.float32)

@@ -1,0 +1,169 @@
+"""A plain furnished room: axis-aligned boxes, each face with a texture of its own.
+
+World frame: z up, origin in a lower corner of the room, metres. Box 0 is the room itself, seen from
+inside; the others are furniture. Face 6 b + 2 k + s is the lower (s = 0) or upper (s = 1) face of
+box b across axis k; its picture is one patch of the atlas.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from share.lab.emulate.plain import texture
+from share.types import F32, F64, U8
+
+TEXELS_PER_M = 250.0
+LEVELS = 6  # of the mip pyramid: level l has 2^-l of the resolution
+_PAD = 1 << (LEVELS - 1)  # texels repeated around a patch, so that no level bleeds into its neighbour
+_ATLAS_WIDTH = 4096
+_SHADE = (0.92, 1.0, 1.06)  # light falls a little differently on each axis
+
+
+@dataclass(frozen=True, eq=False)
+class Pyramid:
+    """An atlas at all LEVELS side by side. pixels: (H, W', 2) uint8, channel 1 the next coarser level at the
+    same size; corners: (LEVELS, 2) float32, where (column, row) each level begins."""
+
+    pixels: U8
+    corners: F32
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """boxes: (B, 2, 3) m, lower and upper corners. atlas: (H, W) uint8. origin: (6 B, 2) float32, the
+    texel (column, row) of world (0, 0) in each face's picture (see `face_axes`)."""
+
+    boxes: F64
+    atlas: U8
+    origin: F32
+
+    @property
+    def size(self) -> F64:
+        """Extent of the room (3,) m."""
+        size: F64 = self.boxes[0, 1]
+        return size
+
+    @cached_property
+    def pyramid(self) -> Pyramid:
+        """The atlas as renderers want it, made once for all of them."""
+        return _pyramid(self.atlas)
+
+
+def make_room(seed: int, size: tuple[float, float, float] = (9.0, 6.0, 3.0)) -> Room:
+    """Another room for every seed. Furniture keeps to a strip of 0.75 m along the walls, but for a
+    column in the middle: between them one can walk."""
+    rng = np.random.default_rng([seed, 1])
+    boxes = _boxes(rng, size)
+    pictures = [_picture(rng, boxes, face) for face in range(6 * len(boxes))]
+    atlas, corners = _pack(pictures)
+    return Room(boxes, atlas, _origins(boxes, corners))
+
+
+def room_boxes(seed: int, size: tuple[float, float, float]) -> F64:
+    """`make_room(seed, size).boxes`, without drawing its pictures."""
+    return _boxes(np.random.default_rng([seed, 1]), size)
+
+
+def _boxes(rng: np.random.Generator, size: tuple[float, float, float]) -> F64:
+    return np.stack([np.array([(0, 0, 0), size]), _column(rng, size), *_furniture(rng, size)])
+
+
+def face_axes(face: int) -> tuple[int, int, int]:
+    """(axis across the face, axis along its picture's columns, axis along its rows)."""
+    return ((0, 1, 2), (1, 0, 2), (2, 0, 1))[face % 6 // 2]
+
+
+def _column(rng: np.random.Generator, size: tuple[float, float, float]) -> F64:
+    half = rng.uniform(0.15, 0.22)
+    x, y = np.array(size[:2]) / 2 + rng.uniform(-0.1, 0.1, 2)
+    return np.array([(x - half, y - half, 0), (x + half, y + half, size[2])])
+
+
+def _furniture(rng: np.random.Generator, size: tuple[float, float, float]) -> list[F64]:
+    """Shelves, cupboards and crates along the four walls, with gaps between them."""
+    out = []
+    for across, along in ((0, 1), (1, 0)):
+        for side in (0, 1):
+            at = rng.uniform(0.8, 1.4)
+            while True:
+                wide, deep = rng.uniform(0.5, 1.4), rng.uniform(0.25, 0.7)
+                if at + wide > size[along] - 0.8:
+                    break
+                lo, hi = np.zeros(3), np.zeros(3)
+                lo[along], hi[along] = at, at + wide
+                lo[across], hi[across] = (0, deep) if side == 0 else (size[across] - deep, size[across])
+                hi[2] = rng.choice([0.45, 0.75, 1.1, 2.0])
+                out.append(np.stack([lo, hi]))
+                at += wide + rng.uniform(0.3, 1.5)
+    return out
+
+
+def _picture(rng: np.random.Generator, boxes: F64, face: int) -> U8:
+    box, (across, along, up) = boxes[face // 6], face_axes(face)
+    extent = (box[1] - box[0]) * TEXELS_PER_M
+    size = (max(int(np.ceil(extent[up])), 8) + 1, max(int(np.ceil(extent[along])), 8) + 1)
+    if face < 6:
+        draw = texture.wall if across < 2 else (texture.floor, texture.ceiling)[face % 2]
+    else:
+        draw = texture.shelf if across < 2 and box[1, 2] > 1.5 and face >= 12 else texture.crate
+    picture = draw(rng, size, TEXELS_PER_M) * _SHADE[across]
+    if face < 6:
+        picture *= _corner_shadow(size)
+    if across < 2 and (across + face) % 2 == (face < 6):
+        picture = picture[:, ::-1]  # columns rise with the world axis: turn what is seen the other way
+    out: U8 = cv2.GaussianBlur(picture.clip(4, 250), (0, 0), 0.7).astype(np.uint8)
+    return out
+
+
+def _corner_shadow(size: tuple[int, int]) -> F32:
+    """Less light reaches the corners of a room."""
+    fall = [1 - 0.35 * np.exp(-np.minimum(np.arange(n), n - 1 - np.arange(n)) / 60) for n in size]
+    return np.outer(*fall).astype(np.float32)
+
+
+def _pack(pictures: list[U8]) -> tuple[U8, list[tuple[int, int]]]:
+    """The atlas and the (column, row) of each picture in it: shelves, tallest first."""
+    corners = [(0, 0)] * len(pictures)
+    x = y = height = 0
+    for i in sorted(range(len(pictures)), key=lambda i: -pictures[i].shape[0]):
+        h, w = ((n + 2 * _PAD + _PAD - 1) // _PAD * _PAD for n in pictures[i].shape)
+        if x + w > _ATLAS_WIDTH:
+            x, y, height = 0, y + height, 0
+        corners[i], x, height = (x + _PAD, y + _PAD), x + w, max(height, h)
+    atlas = np.zeros((y + height, _ATLAS_WIDTH), np.uint8)
+    for (cx, cy), picture in zip(corners, pictures, strict=True):
+        framed = cv2.copyMakeBorder(picture, _PAD, _PAD, _PAD, _PAD, cv2.BORDER_REPLICATE)
+        atlas[cy - _PAD :, cx - _PAD :][: framed.shape[0], : framed.shape[1]] = framed
+    return atlas, corners
+
+
+def _origins(boxes: F64, corners: list[tuple[int, int]]) -> F32:
+    """Where world (0, 0) of each face's axes would lie in the atlas. Rows of upright faces run down."""
+    out = np.zeros((len(corners), 2), np.float32)
+    for face, (cx, cy) in enumerate(corners):
+        across, along, up = face_axes(face)
+        lo, hi = boxes[face // 6]
+        top = -lo[up] if across == 2 else hi[up]
+        out[face] = cx - lo[along] * TEXELS_PER_M, cy + top * TEXELS_PER_M
+    return out
+
+
+def _pyramid(atlas: U8) -> Pyramid:
+    """Pixel x of level 0 is pixel x / 2 of level 1 (pyrDown keeps even pixels)."""
+    levels = [atlas]
+    for _ in range(LEVELS):
+        levels.append(cv2.pyrDown(levels[-1]))
+    width = sum(level.shape[1] for level in levels[:-1])
+    pixels = np.zeros((atlas.shape[0], width, 2), np.uint8)
+    corners, x = np.zeros((LEVELS, 2), np.float32), 0
+    for i, (level, coarser) in enumerate(pairwise(levels)):
+        h, w = level.shape
+        pixels[:h, x : x + w, 0] = level
+        pixels[:h, x : x + w, 1] = cv2.pyrUp(coarser, dstsize=(w, h))
+        corners[i], x = (x, 0), x + w
+    return Pyramid(pixels, corners)

@@ -1,0 +1,85 @@
+"""All that decides what a session holds: the same recipe gives the same bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from share.errors import UsageError
+from share.files.reading import TABLE, read_bytes
+from share.lab.emulate.motion.spec import RecordedSpec, parse
+from share.lab.emulate.sensor.effects import Effects
+
+GENERATOR_VERSION = 2  # raise it when any picture, motion or file changes: cached sessions are made anew
+SENSORS = ("stereo", "rgbd", "mono")
+IMAGES = ("jpeg", "png")
+_DEPTHS, _TEXTS = ("*", "*/*", "*/*/*"), (".csv", ".txt", ".yaml")  # FOLDER/mav0/imu0/data.csv
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """scene: a name, or a glTF file. motions: `[NAME=]SPEC` each. size: of the room, m; None: the scene's
+    own. sensors, profiles: one for all (key "") or by an agent's name; profiles may name a mode, as
+    `d435i:848x480@30`. images: jpeg is quality 95; png keeps every gray level. Raises UsageError for what
+    cannot be made."""
+
+    scene: str
+    motions: tuple[str, ...]
+    seconds: float = 30.0
+    seed: int = 0
+    size: tuple[float, float, float] | None = None
+    sensors: dict[str, str] = field(default_factory=dict)
+    profiles: dict[str, str] = field(default_factory=dict)
+    effects: Effects = field(default_factory=Effects)
+    images: str = "jpeg"
+
+    def __post_init__(self) -> None:
+        if not 3 <= self.seconds <= 3600:
+            raise UsageError(f"{self.seconds:g} seconds: a session lasts 3 to 3600 seconds")
+        if not 0 <= self.seed < 2**63:
+            raise UsageError(f"seed {self.seed}: must be 0 .. 2^63 - 1")
+        for sensors in self.sensors.values():
+            if sensors not in SENSORS:
+                raise UsageError(f"sensors '{sensors}' are not known; known: {', '.join(SENSORS)}")
+        if self.images not in IMAGES:
+            raise UsageError(f"images '{self.images}' are not known; known: {', '.join(IMAGES)}")
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data, for a person and for session.yaml."""
+        out = asdict(self) | {"motions": list(self.motions), "generator_version": GENERATOR_VERSION}
+        out["size"] = None if self.size is None else list(self.size)
+        return out
+
+    @property
+    def digest(self) -> str:
+        """Twelve characters that differ where anything does, the user's own files included. Raises UsageError
+        for a motion that cannot be understood."""
+        digest = hashlib.sha256(json.dumps(self.plain(), sort_keys=True).encode())
+        for path in self._own_files():
+            try:
+                digest.update(read_bytes(path, TABLE))
+            except OSError as error:
+                raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+        return digest.hexdigest()[:12]
+
+    def _own_files(self) -> Iterator[Path]:
+        """Scene and profiles where they are files, not ours by their names, and all of recorded motions
+        but images."""
+        for name in (self.scene, *self.profiles.values()):
+            path = Path(name.partition(":")[0])
+            if path.suffix and path.is_file():
+                yield path
+        for text in self.motions:
+            _, spec = parse(text)
+            if isinstance(spec, RecordedSpec):
+                yield from _tables(Path(spec.path))
+
+
+def _tables(path: Path) -> list[Path]:
+    """The file, or what a recording's folder holds as text."""
+    found = [path] if path.is_file() else [p for depth in _DEPTHS for p in path.glob(depth)]
+    return sorted(p for p in found if p.is_file() and (p == path or p.suffix in _TEXTS))

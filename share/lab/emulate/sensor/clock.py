@@ -1,0 +1,117 @@
+"""When a device's streams are sampled, and what stamps its clock writes.
+
+True time is the path's, in ns: the time in which the motion happens. A picture's time is the middle of
+its exposure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from share.lab.emulate.sensor.draws import Seed, normal, uniform
+from share.types import I64
+
+_LONGEST_BURST = 64  # frames
+_IN_ORDER = 0.45  # of a period: how far a stamp may be off without overtaking the next
+
+
+@dataclass(frozen=True)
+class DeviceClock:
+    """A clock that shows true time plus an offset and a drift since `origin_ns`, in ticks of tick_ns.
+
+    bits: width of its counter, which wraps; 0 = it does not.
+    """
+
+    origin_ns: int = 0
+    offset_ns: int = 0
+    drift_ppm: float = 0.0
+    tick_ns: int = 1
+    bits: int = 0
+
+    @property
+    def period_ns(self) -> int:
+        """After how long the counter wraps; 0 = it does not."""
+        return self.tick_ns << self.bits if self.bits else 0
+
+    def read(self, true_ns: I64) -> I64:
+        """What the clock shows at true times (N,)."""
+        since = true_ns - self.origin_ns
+        shown = true_ns + self.offset_ns + np.rint(since * (self.drift_ppm * 1e-6)).astype(np.int64)
+        ticks = shown // self.tick_ns
+        if self.bits:
+            ticks = ticks % (1 << self.bits)
+        out: I64 = ticks * self.tick_ns
+        return out
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Samples at `rate_hz`, the first at `first_ns` true time; sample k is the same in every span."""
+
+    rate_hz: float
+    first_ns: int
+
+    def times(self, start_ns: int, end_ns: int) -> tuple[I64, I64]:
+        """(index, true_ns), each (N,), of the samples in [start, end], both included."""
+        rate = self.rate_hz / 1e9
+        low = max(0, int(np.ceil((start_ns - self.first_ns) * rate)) - 1)
+        high = int(np.floor((end_ns - self.first_ns) * rate)) + 1
+        index = np.arange(low, high + 1, dtype=np.int64)
+        true = self.first_ns + np.rint(index / rate).astype(np.int64)
+        inside = (true >= start_ns) & (true <= end_ns)
+        return index[inside], true[inside]
+
+
+def phase_ns(seed: Seed, rate_hz: float) -> int:
+    """Where in its first period a free-running stream starts, ns."""
+    return int(np.random.default_rng(seed).random() * 1e9 / rate_hz)
+
+
+def dropped(seed: Seed, index: I64, share: float, burst: float) -> np.ndarray:
+    """Which frames (N,) bool are lost: `share` of them on average, in bursts of `burst` frames on average.
+
+    A burst starts at any frame alike and lasts a geometrically distributed number of frames, up to 64;
+    bursts may overlap, so starts are thinned such that the share comes out.
+    """
+    if share <= 0 or len(index) == 0:
+        return np.zeros(len(index), bool)
+    reach = np.arange(_LONGEST_BURST)
+    survive = (1 - 1 / burst) ** reach  # probability that a burst lasts longer than `reach` frames
+    first = max(0, int(index.min()) - _LONGEST_BURST)
+    frames = np.arange(first, int(index.max()) + 1)
+    begins = uniform((*seed, 0), frames) < _start_probability(share, survive)
+    lasts = uniform((*seed, 1), frames)
+    lost = begins.copy()
+    for back in reach[1:][survive[1:] > 1e-9]:
+        lost[back:] |= begins[:-back] & (lasts[:-back] < survive[back])
+    out: np.ndarray = lost[index - first]
+    return out
+
+
+def _start_probability(share: float, survive: NDArray[Any]) -> float:
+    """p with 1 - prod(1 - p s_i) = share, by bisection: what leaves 1 - share of the frames whole."""
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        p = (low + high) / 2
+        low, high = (p, high) if 1 - np.prod(1 - p * survive) < share else (low, p)
+    return (low + high) / 2
+
+
+def jitter(seed: Seed, index: I64, sigma_ns: float, rate_hz: float) -> I64:
+    """Error of each sample's stamp (N,) ns: normal, cut at 3 sigma and so that stamps stay in order."""
+    if sigma_ns <= 0:
+        return np.zeros(len(index), np.int64)
+    most = min(3 * sigma_ns, _IN_ORDER * 1e9 / rate_hz)
+    return np.rint(np.clip(normal(seed, index) * sigma_ns, -most, most)).astype(np.int64)
+
+
+def unwrapped(stamps_ns: I64, period_ns: int) -> I64:
+    """Stamps (N,) of one stream in order, without the wraps of its counter."""
+    if not period_ns:
+        return stamps_ns
+    wraps = np.cumsum(np.diff(stamps_ns, prepend=stamps_ns[:1]) < -period_ns // 2)
+    return stamps_ns + period_ns * wraps

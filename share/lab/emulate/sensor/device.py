@@ -1,0 +1,188 @@
+"""One emulated device: all that a session needs to turn perfect pictures and motion into a recording.
+
+Everything follows from (seed, stream, frame): call it in any order, in any process.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from share.lab.emulate.sensor import clock as clocks
+from share.lab.emulate.sensor import exposure as exposures
+from share.lab.emulate.sensor.clock import DeviceClock, Stream
+from share.lab.emulate.sensor.depth import DepthSensor
+from share.lab.emulate.sensor.draws import Seed
+from share.lab.emulate.sensor.effects import Effects
+from share.lab.emulate.sensor.exposure import Shot, Shots
+from share.lab.emulate.sensor.imu import ImuStreams, measured
+from share.lab.emulate.sensor.photometry import Imager
+from share.lab.emulate.sensor.vibration import knocks, turning, vibration
+from share.lab.emulate.types import Path
+from share.sensors.profile_types import Inertial, Profile
+from share.types import F32, F64, I64, U8
+
+_READOUT = 0.9  # of a frame's time is what an exposure can take
+# streams of random numbers
+_PHASE, _DROPS, _JITTER, _LAMP, _CAMERA, _DEPTH, _GYRO, _ACCEL, _SHAKING = range(9)
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """Frames that arrive: index (N,), when they are exposed (true time) and their stamps, both (N,) ns."""
+
+    index: I64
+    true_ns: I64
+    stamp_ns: I64
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+class Device:
+    """A device of `profile` with `effects`.
+
+    origin_ns: true time (the path's) at which it is switched on; frames count from there. seed: its own;
+    room_seed: what all devices in the room share, the lamps.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        effects: Effects | None = None,
+        seed: Seed = (0,),
+        origin_ns: int = 0,
+        room_seed: Seed = (0,),
+    ) -> None:
+        self.profile, self.effects = profile, effects or Effects()
+        self._seed, self._origin_ns, self._room_seed = seed, origin_ns, room_seed
+        facts = profile.device.clock
+        self.clock = DeviceClock(
+            origin_ns,
+            round(self.effects.clock_offset_ms * 1e6),
+            self.effects.clock_drift_ppm,
+            facts.tick_ns,
+            facts.bits if self.effects.wrap else 0,
+        )
+
+    # -- pictures ----------------------------------------------------------------------------
+
+    def pictures(self, start_ns: int, end_ns: int) -> Pictures:
+        """The frames exposed in [start, end] true time that are not dropped."""
+        effects = self.effects
+        index, true = self._stream(self.profile.rate_hz, _CAMERA).times(start_ns, end_ns)
+        lost = clocks.dropped((*self._seed, _DROPS), index, effects.drops, effects.drop_burst)
+        index, true = index[~lost], true[~lost]
+        error = clocks.jitter(
+            (*self._seed, _JITTER, _CAMERA), index, effects.jitter_ms * 1e6, self.profile.rate_hz
+        )
+        return Pictures(index, true, self.clock.read(true - round(effects.time_offset_ms * 1e6) + error))
+
+    def truth_times(self, pictures: Pictures) -> tuple[I64, I64]:
+        """(true_ns, stamp_ns), each (N,): when the clock shows the stamps of `pictures`, and these stamps
+        as a reader repairs them, without wraps."""
+        error = pictures.stamp_ns - self.clock.read(pictures.true_ns)
+        if period := self.clock.period_ns:
+            error = (error + period // 2) % period - period // 2
+        return pictures.true_ns + error, clocks.unwrapped(pictures.stamp_ns, self.clock.period_ns)
+
+    def light(self, true_ns: I64) -> F64:
+        """Of the room's lamps (N,) at true times (N,), against what the room was made with."""
+        effects = self.effects
+        since = np.asarray(true_ns) - self._origin_ns
+        return exposures.lamp((*self._room_seed, _LAMP), since, effects.lamp_every_s, effects.lamp_stops)
+
+    def shots(self, true_ns: I64, brightness: F64) -> Shots:
+        """How the pictures at true_ns (N,) are taken; brightness (N,): mean radiance of what they see."""
+        light, device = self.light(true_ns), self.profile.device
+        model, reference = self.profile.emulation.exposure, self._reference_ms
+        if not self.effects.exposure:
+            return Shots(np.full(len(light), reference), np.ones(len(light)), light)
+        seen = np.asarray(brightness, np.float64) * light * self._imagers[0].mean_response
+        least, most = device.exposure_ms
+        most = min(most, _READOUT * 1000 / self.profile.rate_hz)
+        time, gain = exposures.auto_exposure(seen, model, reference, (least, most), device.gain)
+        return Shots(time, gain, light)
+
+    def blur_offsets(self, shot: Shot, pixels_of_motion: float) -> F64:
+        """Times (S,) s about a picture's at which to draw it; pixels_of_motion: most, in the exposure."""
+        return exposures.blur_offsets(shot.exposure_ms, pixels_of_motion if self.effects.blur else 0.0)
+
+    def develop(self, radiance: F32, frame: int, camera: int, shot: Shot | None = None) -> U8:
+        """Radiance (H, W) float32 of camera 0 or 1 -> gray (H, W) uint8. frame: its `Pictures.index`.
+        Without `shot`: the reference exposure."""
+        return self._imagers[camera].develop(radiance, frame, shot or Shot(self._reference_ms))
+
+    def depth_mm(self, depth: F32, left: U8, frame: int, shot: Shot | None = None) -> np.ndarray:
+        """Exact depth (H, W) m and the developed left picture -> the device's, uint16 mm, 0 = none."""
+        return self._depth.read(depth, left, frame, shot.gain if shot else 1.0)
+
+    # -- IMU ---------------------------------------------------------------------------------
+
+    def imu(self, path: Path) -> ImuStreams:
+        """All IMU samples of the span of `path`: recorded ones untouched, else simulated. Stamps are the
+        device clock's."""
+        if path.recorded is not None:
+            stamps = self.clock.read(path.recorded.stamps_ns)
+            return ImuStreams(stamps, path.recorded.gyro, stamps, path.recorded.accel, self.clock.period_ns)
+        facts = self.profile.device.imu
+        gyro_ns, gyro = self._inertial(path, facts.gyro, _GYRO, 0)
+        accel_ns, accel = self._inertial(path, facts.accel, _GYRO if facts.joined else _ACCEL, 1)
+        return ImuStreams(gyro_ns, gyro, accel_ns, accel, self.clock.period_ns)
+
+    def _inertial(self, path: Path, sensor: Inertial, stream: int, which: int) -> tuple[I64, F64]:
+        index, true = self._stream(sensor.rate_hz, stream).times(path.start_ns, path.end_ns)
+        effects = self.effects
+        errors = (effects.imu_noise, effects.imu_bias, effects.imu_limits)
+        shaken = path.inertial(true)[which] + self._shaking(true, which)
+        values = measured(shaken, sensor, (*self._seed, _GYRO, which), *errors)
+        sigma_ns = effects.imu_jitter_ms * 1e6
+        error = clocks.jitter((*self._seed, _JITTER, stream), index, sigma_ns, sensor.rate_hz)
+        return self.clock.read(true + error), values
+
+    def _shaking(self, times_ns: I64, which: int) -> F64:
+        """What vibration and knocks add to gyro (0) or accelerometer (1), (N, 3)."""
+        effects, seed = self.effects, (*self._seed, _SHAKING)
+        seconds = np.asarray((times_ns - self._origin_ns) * 1e-9, np.float64)
+        out = np.zeros((len(seconds), 3))
+        if effects.vibration:
+            out += vibration(seconds, effects.vibration, seed)
+        if effects.knocks:
+            out += knocks(seconds, effects.knocks, effects.knock_every_s, seed)
+        return out if which else turning(out)
+
+    # -- parts -------------------------------------------------------------------------------
+
+    def _stream(self, rate_hz: float, stream: int) -> Stream:
+        """A free-running stream begins somewhere in its first period; a triggered one at the origin."""
+        begin_ns = self._origin_ns
+        if stream == _CAMERA:
+            begin_ns += round(self.effects.camera_phase_ms * 1e6)
+        if not self.profile.device.clock.triggered:
+            begin_ns += clocks.phase_ns((*self._seed, _PHASE, stream), rate_hz)
+        return Stream(rate_hz, begin_ns)
+
+    @property
+    def _reference_ms(self) -> float:
+        return self.profile.emulation.camera.reference_ms
+
+    @cached_property
+    def _imagers(self) -> list[Imager]:
+        effects, model = self.effects, self.profile.emulation.camera
+        return [
+            Imager(
+                camera,
+                model,
+                (*self._seed, _CAMERA, i),
+                effects.noise,
+                effects.vignetting,
+                effects.lens_blur,
+            )
+            for i, camera in enumerate(self.profile.mode.cameras())
+        ]
+
+    @cached_property
+    def _depth(self) -> DepthSensor:
+        return DepthSensor(self.profile, (*self._seed, _DEPTH), self.effects.depth_noise)

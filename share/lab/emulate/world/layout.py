@@ -1,0 +1,85 @@
+"""A room before it has pictures and light: what stands where, and what shines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from share.lab.calibrate.target import Target
+from share.lab.emulate.world.mesh import Shape
+from share.lab.emulate.world.proximity import within
+from share.types import F64
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """One whole object: a shelf with everything on it. name: unique in the layout. solid: bodies cannot
+    pass through it (a decal, a cable or a lamp high up need not be)."""
+
+    name: str
+    shape: Shape
+    solid: bool = True
+
+    @property
+    def bounds(self) -> F64:
+        """Lower and upper corner (2, 3) m."""
+        return self.shape.bounds
+
+
+@dataclass(frozen=True)
+class Light:
+    """A rectangular panel that shines to one side. position: its middle, m. power: relative to the
+    other lights (the room is scaled to a mean brightness). size: its extent, m. facing: where it shines."""
+
+    position: tuple[float, float, float]
+    power: float = 1.0
+    size: tuple[float, float] = (1.2, 0.3)
+    facing: tuple[float, float, float] = (0.0, 0.0, -1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedTarget:
+    """A calibration target in a room. T_world_target (4, 4): frame as `share.lab.calibrate.target` has it."""
+
+    target: Target
+    T_world_target: F64
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """size: extent (3,) m from the origin. shell: walls, floor, ceiling and what carries them, which
+    nothing removes, facing inwards. pieces: everything else. ambient: light that comes from nowhere, as a
+    share of the mean. brightness: mean light, 1 = albedo is the gray level. target: what cameras are
+    calibrated with, where there is one."""
+
+    name: str
+    seed: int
+    size: tuple[float, float, float]
+    shell: tuple[Piece, ...]
+    pieces: tuple[Piece, ...]
+    lights: tuple[Light, ...]
+    ambient: float = 0.15
+    brightness: float = 1.0
+    target: PlacedTarget | None = None
+
+    @property
+    def everything(self) -> tuple[Piece, ...]:
+        """Shell and pieces."""
+        return self.shell + self.pieces
+
+    def without(self, positions: F64, clearance: float) -> tuple[Layout, tuple[str, ...]]:
+        """The room without the solid pieces that come nearer than `clearance` m to any of `positions`
+        (N, 3) m or hold one inside, and the names of what was removed. The shell always stays."""
+        blocked = [piece.solid and within(piece.shape.mesh, positions, clearance) for piece in self.pieces]
+        kept = tuple(p for p, gone in zip(self.pieces, blocked, strict=True) if not gone)
+        removed = tuple(p.name for p, gone in zip(self.pieces, blocked, strict=True) if gone)
+        return replace(self, pieces=kept), removed
+
+    def __post_init__(self) -> None:
+        names = [piece.name for piece in self.everything]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise ValueError(f"layout: two pieces are named '{twice}'")
+        if not all(np.isfinite(piece.bounds).all() for piece in self.everything):
+            raise ValueError("layout: a piece has corners that are not finite")

@@ -1,0 +1,220 @@
+"""Figures of an evaluation: bars, parts of a base and their intervals, lines, ways from above, heat maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from share.files.writing import atomic_write
+from share.geometry.se3 import transform
+from share.lab.evaluate.statistics import Interval
+from share.recordings.trajectory import Trajectory
+from share.types import F64
+
+# ---- Figures of matplotlib as PNG files.
+
+
+def save(figure: Any, path: Path, dpi: int) -> None:
+    """Whole or not at all, and its memory is given back. Raises as `atomic_write`."""
+    from matplotlib import pyplot
+
+    try:
+        data = BytesIO()
+        figure.savefig(data, dpi=dpi, format="png")
+    finally:
+        pyplot.close(figure)
+    atomic_write(path, data.getvalue())
+
+
+_NOTHING = Interval(float("nan"), float("nan"), float("nan"))
+_COLOURS = ("#00798c", "#d1495b", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
+_ABREAST = 3  # panels
+
+
+def draw_bars(
+    path: Path,
+    panels: Mapping[str, Mapping[str, Sequence[float]]],
+    groups: Sequence[str],
+    unit: str,
+    line: float | None = None,
+) -> None:
+    """PNG, a panel for each of `panels`: {series: a value for each of `groups`}; NaN is left out.
+
+    line: a level to be told from, drawn across.
+    """
+    pyplot = _pyplot()
+    width = max(6.0, 0.16 * len(groups) * max(map(len, panels.values())) + 2)
+    figure, axes = pyplot.subplots(
+        len(panels), 1, figsize=(width, 2.6 * len(panels)), layout="constrained", sharex=True, squeeze=False
+    )
+    at = np.arange(len(groups))
+    for axis, (title, series) in zip(axes[:, 0], panels.items(), strict=True):
+        wide = 0.8 / len(series)
+        for k, (name, values) in enumerate(series.items()):
+            offset = (k - (len(series) - 1) / 2) * wide
+            axis.bar(at + offset, values, wide, label=name, color=_COLOURS[k % len(_COLOURS)])
+        if line is not None:
+            axis.axhline(line, color="black", linewidth=1, linestyle="--")
+        axis.set(title=title, ylabel=unit)
+        axis.grid(axis="y", alpha=0.3)
+        axis.set_axisbelow(True)
+    axes[-1, 0].set_xticks(at, groups, rotation=30, ha="right")
+    handles, names = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper right", ncols=len(names), fontsize=8)
+    save(figure, path, 110)
+
+
+def draw_parts(
+    path: Path, series: Mapping[str, Mapping[str, Interval]], base: str, names: Sequence[str]
+) -> None:
+    """PNG: for each of `series` a bar a measure, as parts of `base`, which is 1; whiskers are intervals.
+
+    names: of all that have a colour, those of `series` among them, so that they have it in every picture.
+    """
+    pyplot = _pyplot()
+    measures = list(dict.fromkeys(name for values in series.values() for name in values))
+    figure, axis = pyplot.subplots(figsize=(9, 0.5 + 0.5 * len(measures)), layout="constrained")
+    at, wide = np.arange(len(measures)), 0.8 / len(series)
+    for k, (name, values) in enumerate(series.items()):
+        here = [values.get(measure, _NOTHING) for measure in measures]
+        value, low, high = (np.array([getattr(one, of) for one in here]) for of in ("value", "low", "high"))
+        off = np.nan_to_num(np.stack([value - low, high - value])).clip(0)
+        y = at + (k - (len(series) - 1) / 2) * wide
+        colour = _COLOURS[names.index(name) % len(_COLOURS)]
+        axis.barh(y, value, wide, xerr=off, label=name, color=colour, ecolor="#555")
+    axis.axvline(1, color="black", linewidth=1, linestyle="--")
+    axis.set_yticks(at, measures)
+    axis.invert_yaxis()
+    axis.set(xlabel=f"part of {base}", xlim=(0, None))
+    axis.grid(axis="x", alpha=0.3)
+    axis.set_axisbelow(True)
+    figure.legend(loc="outside upper right", ncols=len(series), fontsize=8)
+    save(figure, path, 110)
+
+
+def draw_lines(
+    path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]], across: str, units: Sequence[str]
+) -> None:
+    """PNG, a panel for each of `panels`, of one of `units`: {series: (x (N,), y (N,))}. across: what x is."""
+    pyplot = _pyplot()
+    figure, axes = pyplot.subplots(
+        len(panels), 1, figsize=(9, 2.4 * len(panels)), layout="constrained", sharex=True, squeeze=False
+    )
+    names = list(dict.fromkeys(name for series in panels.values() for name in series))
+    for axis, unit, (title, series) in zip(axes[:, 0], units, panels.items(), strict=True):
+        for name, (x, y) in series.items():
+            axis.step(x, y, where="post", label=name, color=_COLOURS[names.index(name) % len(_COLOURS)])
+        axis.set(title=title, ylabel=unit)
+        axis.grid(alpha=0.3)
+    axes[-1, 0].set_xlabel(across)
+    handles = [pyplot.Line2D([], [], color=_COLOURS[k % len(_COLOURS)]) for k in range(len(names))]
+    figure.legend(handles, names, loc="outside upper right", ncols=max(1, len(names)), fontsize=8)
+    save(figure, path, 110)
+
+
+def draw_ways(path: Path, panels: Mapping[str, Mapping[str, tuple[F64, F64]]]) -> None:
+    """PNG, a panel for each of `panels`, from above: {series: (its way (N, 2) m, dots on it (M, 2) m)}."""
+    pyplot = _pyplot()
+    across = min(_ABREAST, len(panels))
+    down = -(-len(panels) // across)
+    wide, high = np.ptp(
+        [xy for series in panels.values() for way, _ in series.values() for xy in way], axis=0
+    )
+    size = 3.2 * across, (3.0 * np.clip(high / max(wide, 1e-9), 0.3, 2) + 0.5) * down + 0.5
+    figure, axes = pyplot.subplots(down, across, figsize=size, layout="constrained", sharex=True, sharey=True)
+    flat = np.atleast_1d(axes).ravel()
+    names = list(dict.fromkeys(name for series in panels.values() for name in series))
+    colours = {name: _COLOURS[k % len(_COLOURS)] for k, name in enumerate(names)}
+    for axis, (title, series) in zip(flat, panels.items(), strict=False):
+        for name, (way, dots) in series.items():
+            axis.plot(*way.T, color=colours[name], linewidth=0.6, alpha=0.6)
+            axis.scatter(*dots.T, color=colours[name], s=9, alpha=0.35, linewidths=0)
+        axis.set(title=title, aspect="equal")
+        axis.grid(alpha=0.3)
+    for axis in flat[len(panels) :]:
+        axis.set_visible(False)
+    figure.supxlabel("m")
+    figure.supylabel("m")
+    handles = [pyplot.Line2D([], [], color=colour, marker="o") for colour in colours.values()]
+    figure.legend(handles, names, loc="outside upper right", ncols=max(1, len(names)), fontsize=8)
+    save(figure, path, 110)
+
+
+def draw_heat(
+    path: Path,
+    maps: Mapping[str, NDArray[np.floating[Any]]],
+    down: tuple[str, Sequence[str]],
+    across: tuple[str, Sequence[str]],
+) -> None:
+    """PNG: a map for each of `maps`, (V, W) over V values down and W across, each with what it is of."""
+    pyplot = _pyplot()
+    figure, axes = pyplot.subplots(
+        1, len(maps), figsize=(1 + 3.2 * len(maps), 3.4), layout="constrained", squeeze=False
+    )
+    for axis, (title, cells) in zip(axes[0], maps.items(), strict=True):
+        image = axis.imshow(cells, cmap="Blues", aspect="auto", origin="lower")
+        axis.set_xticks(range(len(across[1])), across[1])
+        axis.set_yticks(range(len(down[1])), down[1])
+        axis.set(xlabel=across[0], ylabel=down[0], title=title)
+        for (i, j), cell in np.ndenumerate(cells):
+            dark = np.isfinite(cell) and image.norm(cell) > 0.5
+            axis.text(j, i, f"{cell:.3g}", ha="center", va="center", color="white" if dark else "black")
+    save(figure, path, 110)
+
+
+def _pyplot() -> Any:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot
+
+
+# ---- The trajectories of a run as one picture: seen from above, and height over time.
+
+_PATH_COLOURS = ("#d1495b", "#00798c", "#edae49", "#66508c", "#3a7d44", "#8d5b4c")
+
+
+def draw_trajectories(
+    path: Path,
+    agents: Mapping[str, tuple[Trajectory | None, Trajectory]],
+    T_truth_map: F64,
+    title: str,
+) -> None:
+    """PNG of {name: (poses in the shared map or None, truth)}; T_truth_map (4, 4) lays one on the other."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, (above, error) = pyplot.subplots(
+        1, 2, figsize=(13, 6.2), width_ratios=(3, 2), layout="constrained"
+    )
+    start = min(truth.stamps_ns[0] for _, truth in agents.values())
+    for (name, (estimate, truth)), colour in zip(agents.items(), _PATH_COLOURS * len(agents), strict=False):
+        p = truth.T[:, :3, 3]
+        above.plot(p[:, 0], p[:, 1], color=colour, alpha=0.3, linewidth=5, solid_capstyle="round")
+        if estimate is None:
+            continue
+        q = transform(T_truth_map, estimate.T[:, :3, 3])
+        above.plot(q[:, 0], q[:, 1], color=colour, linewidth=1.2, label=name)
+        above.plot(*q[0, :2], "o", color=colour, markersize=6)
+        t = (estimate.stamps_ns - start) * 1e-9
+        at = np.array([np.interp(estimate.stamps_ns, truth.stamps_ns, p[:, k]) for k in range(3)]).T
+        error.plot(t, 100 * np.linalg.norm(q - at, axis=1), color=colour, linewidth=1.2, label=name)
+    above.set(title="from above: truth (broad), in the shared map (thin)", xlabel="x [m]", ylabel="y [m]")
+    above.set_aspect("equal")
+    error.set(title="position error in the shared map", xlabel="time [s]", ylabel="cm")
+    error.set_ylim(bottom=0)
+    for axes in (above, error):
+        axes.grid(alpha=0.3)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend()
+    figure.suptitle(title)
+    save(figure, path, 110)

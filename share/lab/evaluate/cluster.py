@@ -1,0 +1,57 @@
+"""Jobs on other machines, by dask.distributed: a worker that dies has its jobs done by another."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Iterable, Iterator
+from types import TracebackType
+from typing import TypeVar
+
+from share.errors import ShareError, UsageError, not_installed
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+_CONNECT_S = 10
+
+
+class Cluster:
+    """As `share.runtime.pool.Pool`, where a scheduler listens at `address`. Workers need SHARE, and the same
+    files at the same paths."""
+
+    def __init__(self, address: str) -> None:
+        if importlib.util.find_spec("distributed") is None:
+            raise UsageError(f"--scheduler: {not_installed('distributed', 'cluster')}")
+        from distributed import Client
+
+        try:
+            self._client = Client(address, timeout=_CONNECT_S)
+        except (OSError, ValueError) as error:
+            raise UsageError(f"--scheduler {address}: nobody answers there: {error}") from None
+
+    @property
+    def count(self) -> int:
+        """Of workers now; as if there were one where none has come yet."""
+        return max(1, len(self._client.nthreads()))
+
+    def run(self, work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result]]:
+        """Every job with `work(job)`, in the order in which they are done. Raises what a job raised."""
+        from distributed import KilledWorker, as_completed
+
+        running = {self._client.submit(work, job, pure=False): job for job in jobs}
+        try:
+            for future in as_completed(list(running)):
+                yield running[future], future.result()
+        except KilledWorker:
+            raise ShareError(
+                "a run has ended several workers, one after the other; is their memory short?"
+            ) from None
+        finally:
+            self._client.cancel(list(running))
+
+    def __enter__(self) -> Cluster:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._client.close()

@@ -1,0 +1,60 @@
+"""What a fit says of the time between its nodes.
+
+Between two nodes the path is the IMU's own, freed of its bias, from the node before; what it misses
+the node after by, in place and in speed, is spread over the way by a cubic (Hermite), so that the path
+and its velocity are continuous and still shake as the IMU shook.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from share.geometry import se3
+from share.lab.mocap.factors import preintegrate
+from share.lab.mocap.fit import Fit
+from share.types import F64, I64, ImuBatch
+
+
+@dataclass(frozen=True, eq=False)
+class FittedPath:
+    """The path of `fit` at any stamp within its nodes. imu: the samples that were fitted."""
+
+    fit: Fit
+    imu: ImuBatch
+
+    def moving(self, stamps_ns: I64) -> tuple[F64, F64]:
+        """T_fit_body (N, 4, 4) and velocity (N, 3) m/s, in the fit's world, at stamps within the nodes."""
+        stamps, fit = stamps_ns, self.fit
+        i = np.clip(np.searchsorted(fit.stamps_ns, stamps, "right") - 1, 0, len(fit.stamps_ns) - 2)
+        span = (fit.stamps_ns[i + 1] - fit.stamps_ns[i])[:, None] * 1e-9
+        s = (stamps - fit.stamps_ns[i])[:, None] * 1e-9 / span
+        T, v = self._carried(i, np.where(fit.breaks[i], fit.stamps_ns[i], stamps))
+        turn, miss, miss_v = (e[i] for e in self._missed)
+        R = T[:, :3, :3] @ se3.so3_exp((3 - 2 * s) * s**2 * turn)
+        p = T[:, :3, 3] + (3 - 2 * s) * s**2 * miss + (s - 1) * s**2 * span * miss_v
+        return se3.compose(R, p), v + 6 * s * (1 - s) * miss / span + (3 * s - 2) * s * miss_v
+
+    @cached_property
+    def _missed(self) -> tuple[F64, F64, F64]:
+        """By how much every node is missed from the one before: rotation rad (N - 1, 3) at the right,
+        position m and velocity m/s in the fit's world. Across a break nothing is carried, only closed."""
+        fit = self.fit
+        i = np.arange(len(fit.stamps_ns) - 1)
+        T, v = self._carried(i, np.where(fit.breaks, fit.stamps_ns[:-1], fit.stamps_ns[1:]))
+        turn = se3.so3_log(T[:, :3, :3].swapaxes(1, 2) @ fit.T_world_body[1:, :3, :3])
+        return turn, fit.T_world_body[1:, :3, 3] - T[:, :3, 3], fit.velocity[1:] - v
+
+    def _carried(self, node: I64, stamps_ns: I64) -> tuple[F64, F64]:
+        """Pose (N, 4, 4) and velocity (N, 3) at stamps by the IMU alone, from the nodes given."""
+        fit = self.fit
+        inc = preintegrate(
+            self.imu, fit.stamps_ns[node], stamps_ns, fit.gyro_bias[node], fit.accel_bias[node]
+        )
+        T0, v0, t = fit.T_world_body[node], fit.velocity[node], inc.dt[:, None]
+        g = np.array([0.0, 0.0, -fit.gravity])
+        R0 = T0[:, :3, :3]
+        p = T0[:, :3, 3] + v0 * t + g * t**2 / 2 + (R0 @ inc.dp[..., None])[..., 0]
+        return se3.compose(R0 @ inc.dR, p), v0 + g * t + (R0 @ inc.dv[..., None])[..., 0]

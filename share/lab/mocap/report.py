@@ -1,0 +1,109 @@
+"""What `share calibrate mocap` leaves behind, and reading it back."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from share.errors import UsageError
+from share.files.yaml_file import read_yaml
+from share.lab.calibrate.handeye import Check
+from share.lab.mocap.fit import Fit
+from share.lab.mocap.verdict import doubts, sigmas, unsure
+from share.types import F64
+
+MOCAP = "mocap.yaml"
+_LEAST = 1e-4  # rad, m: no mounting is known better
+
+
+def mocap_text(fit: Fit, name: str, truth: str) -> str:
+    """mocap.yaml."""
+    sigma = sigmas(fit)
+    return "\n".join(
+        [
+            f"# share calibrate mocap: {name} with {truth}",
+            "# p_body = T_body_mocap p_mocap: from the motion capture's body to the IMU",
+            "T_body_mocap:",
+            *_matrix(fit.T_body_mocap),
+            "# p_mocap = R_mocap_world p_world: the world is level, z up",
+            "R_mocap_world:",
+            *_matrix(fit.R_mocap_world),
+            f"up: {fit.up}  # the axis of the motion capture's world that is nearest to up; tilt: how near",
+            f"tilt_deg: {fit.tilt_deg:.5f}",
+            f"timeshift_imu_mocap: {fit.offset_ns * 1e-9:.9f}  # s, IMU's clock less mocap's, at mid-time",
+            f"drift_ppm: {fit.drift_ppm:.3f}",
+            "sigma:",
+            f"  rotation_deg: {_list(np.degrees(sigma[2:5]))}",
+            f"  position_m: {_list(sigma[5:8])}",
+            f"  tilt_deg: {_list(np.degrees(sigma[:2]))}",
+            f"  timeshift_s: {sigma[8]:.3e}",
+            f"  drift_ppm: {sigma[9] * 1e6:.3f}",
+            "",
+        ]
+    )
+
+
+def read_mounting(path: Path) -> tuple[F64, tuple[float, float]]:
+    """T_body_mocap (4, 4) of a mocap.yaml, or of the folder that has one; and how far off it may be, rad and
+    m: twice the worst axis' sigma, as real recordings show. Raises UsageError, ConfigError."""
+    file = path / MOCAP if path.is_dir() else path
+    if not file.is_file():
+        raise UsageError(f"{file}: no such file; `share calibrate mocap` makes one")
+    top = read_yaml(file)
+    sigma = top.section("sigma")
+    turn, shift = (max(sigma.numbers(key, (3,))) for key in ("rotation_deg", "position_m"))
+    return top.pose("T_body_mocap"), (max(2 * float(np.radians(turn)), _LEAST), max(2 * shift, _LEAST))
+
+
+def mocap_json(fit: Fit, name: str, truth: str, checked: Check | None) -> dict[str, Any]:
+    """mocap-report.json."""
+    sigma = sigmas(fit)
+    return {
+        "source": name,
+        "truth": truth,
+        "T_body_mocap": fit.T_body_mocap.tolist(),
+        "R_mocap_world": fit.R_mocap_world.tolist(),
+        "up": fit.up,
+        "tilt_deg": fit.tilt_deg,
+        "timeshift_imu_mocap_s": fit.offset_ns * 1e-9,
+        "drift_ppm": fit.drift_ppm,
+        "sigma": {
+            "rotation_deg": np.degrees(sigma[2:5]).tolist(),
+            "position_m": sigma[5:8].tolist(),
+            "tilt_deg": np.degrees(sigma[:2]).tolist(),
+            "timeshift_s": float(sigma[8]),
+            "drift_ppm": float(sigma[9] * 1e6),
+        },
+        "too_long_percent": (100 * fit.too_long).tolist(),
+        "too_long_sigma_percent": (100 * fit.too_long_sigma).tolist(),
+        "unsure": unsure(fit),
+        "doubts": doubts(fit),
+        "residuals": {
+            k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(fit.residuals).items()
+        },
+        "hand_eye": None if checked is None else _hand_eye(checked),
+    }
+
+
+def _hand_eye(checked: Check) -> dict[str, Any]:
+    found = checked.found
+    return {
+        "T_body_mocap": found.T_a_b.tolist(),
+        "turned_deg": float(np.degrees(checked.turned)),
+        "shifted_m": checked.shifted,
+        "sigmas": checked.sigmas,
+        "agrees": checked.agrees,
+        "motions": found.motions,
+        "turning_deg": np.degrees(found.turning).tolist(),
+    }
+
+
+def _matrix(values: np.ndarray) -> list[str]:
+    return [f"- {_list(row)}" for row in values]
+
+
+def _list(values: np.ndarray) -> str:
+    return "[" + ", ".join(f"{value:.9g}" for value in values) + "]"

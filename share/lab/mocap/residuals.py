@@ -1,0 +1,61 @@
+"""How well a fit fits: what is left of each measurement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.lab.mocap.factors import Chain
+from share.types import F64
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """position_mm, rotation_deg: rms distance of the path from the mocap samples that are not doubted;
+    position_sigmas: the former in units of what was said of the mocap's noise; position_p95_mm,
+    rotation_p95_deg of all. samples: how many there are; doubted: share of them.
+
+    imu_sigmas (6,): rms residual of the turn (x, y, z) and the change of velocity (x, y, z) between
+    nodes, in units of what the data sheet's noise explains. gyro (3,) rad/s, accel (3,) m/s^2: the same
+    as mean rates, so the gyro against the fitted rotation.
+    """
+
+    position_mm: float
+    rotation_deg: float
+    position_sigmas: float
+    position_p95_mm: float
+    rotation_p95_deg: float
+    samples: int
+    doubted: float
+    imu_sigmas: F64
+    gyro: F64
+    accel: F64
+
+
+def residuals(
+    chain: Chain, dt: F64, inflation: float, apart: F64, turned: F64, trusted: np.ndarray, noise: float
+) -> Residuals:
+    """chain with intervals dt (M,) s, its noise inflated; apart (K,) m and turned (K,) rad from the mocap,
+    whose noise is said to be so many m on each axis."""
+    pick = [0, 1, 2, 6, 7, 8]
+    sigma = np.sqrt(np.diagonal(chain.cov, axis1=1, axis2=2))[:, pick] / inflation
+    raw = chain.raw[:, pick]
+    rates = _rms(raw / dt[:, None])
+    mm, deg = apart * 1e3, np.degrees(turned)
+    return Residuals(
+        position_mm=float(_rms(mm[trusted])),
+        rotation_deg=float(_rms(deg[trusted])),
+        position_sigmas=float(_rms(apart[trusted])) / (noise * np.sqrt(3)),
+        position_p95_mm=float(np.percentile(mm, 95)),
+        rotation_p95_deg=float(np.percentile(deg, 95)),
+        samples=len(mm),
+        doubted=float(1 - trusted.mean()),
+        imu_sigmas=_rms(raw / sigma),
+        gyro=rates[:3],
+        accel=rates[3:],
+    )
+
+
+def _rms(values: F64) -> F64:
+    return np.asarray(np.sqrt((values**2).mean(0)), np.float64)

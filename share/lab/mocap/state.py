@@ -1,0 +1,99 @@
+"""What the fit solves for: the body at every node, and how mocap and IMU lie to each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from share.geometry import se3
+from share.types import F64, I64
+
+NODE = 15  # rotation, position, velocity, gyro bias, accel bias
+SHARED = 10  # tilt, mocap body's rotation and position, time offset and drift
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Nodes at stamps_ns (N,), IMU clock: R (N, 3, 3), p (N, 3) m, v (N, 3) m/s of the body in the
+    levelled world, biases (N, 3).
+
+    tilt (2,): R_mocap_world = Exp(tilt_x, tilt_y, 0), so that levelling turns nothing about the
+    vertical. T_body_mocap (4, 4). offset_s: IMU clock minus mocap clock at middle_ns, in addition to
+    what was taken off before; drift: by how much it grows, seconds a second.
+    """
+
+    stamps_ns: I64
+    R: F64
+    p: F64
+    v: F64
+    gyro_bias: F64
+    accel_bias: F64
+    tilt: F64
+    T_body_mocap: F64
+    middle_ns: int
+    offset_s: float = 0.0
+    drift: float = 0.0
+
+    def in_imu_clock(self, stamps_ns: I64) -> I64:
+        """Mocap's stamps (K,), the former offset taken off, as the IMU's clock would have them."""
+        late = self.offset_s * 1e9 + self.drift * (stamps_ns - self.middle_ns)
+        return np.asarray(stamps_ns + np.round(late).astype(np.int64), np.int64)
+
+    @property
+    def R_mocap_world(self) -> F64:
+        return se3.so3_exp(np.append(self.tilt, 0.0))
+
+    def moved(self, nodes: F64, shared: F64) -> State:
+        """Nodes (N, 15): rotations at the right, the others added. shared (10,): tilt added, the body's
+        pose perturbed at the right, offset [s] and drift added."""
+        return State(
+            self.stamps_ns,
+            self.R @ se3.so3_exp(nodes[:, :3]),
+            self.p + nodes[:, 3:6],
+            self.v + nodes[:, 6:9],
+            self.gyro_bias + nodes[:, 9:12],
+            self.accel_bias + nodes[:, 12:15],
+            self.tilt + shared[:2],
+            self.T_body_mocap @ se3.exp(shared[2:8]),
+            self.middle_ns,
+            self.offset_s + float(shared[8]),
+            self.drift + float(shared[9]),
+        )
+
+
+# ---- What a user of the fit may choose.
+
+
+@dataclass(frozen=True, eq=False)
+class FitOptions:
+    """How to fit.
+
+    sigma_position m, sigma_rotation rad: noise of the mocap, for samples that err independently
+    independent_hz times a second; denser ones count for less each, and more than most_hz are not taken.
+    cauchy: in sigmas, where a sample
+    begins to be doubted. imu_inflation: times the data sheet's noise.
+    within_s: how far apart the clocks may be, None for any distance, 0 for one clock; offset_sigma s:
+    how far the offset may still be from there; drift_sigma: how much one clock may run faster than
+    the other (1e-4: 100 ppm).
+    T_body_mocap (4, 4): a guess, needed only for a body that turns about one axis; then with
+    guess_sigma (rad, m). gravity m/s^2. node_s: time between nodes. bridge_s: longest hole in the mocap
+    where the IMU's word is taken; break_s: longest that it is integrated across at all.
+    """
+
+    sigma_position: float = 0.002
+    sigma_rotation: float = np.radians(0.3)
+    independent_hz: float = 20.0
+    most_hz: float = 250.0
+    cauchy: float = 2.5
+    imu_inflation: float = 2.0
+    within_s: float | None = 0.5
+    offset_sigma: float = 0.02
+    drift_sigma: float = 1e-4
+    T_body_mocap: F64 | None = None
+    guess_sigma: tuple[float, float] = (np.radians(10.0), 0.3)
+    gravity: float = 9.81
+    node_s: float = 0.05
+    bridge_s: float = 0.5
+    break_s: float = 10.0
+    max_iterations: int = 50

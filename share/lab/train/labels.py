@@ -1,0 +1,208 @@
+"""`share train labels`: our own tracker over sessions with truth, and how wrong it was at each keyframe."""
+
+from __future__ import annotations
+
+import io
+import json
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from share import __version__
+from share.config import Config
+from share.errors import DataError, UsageError
+from share.files.arrays import read_arrays
+from share.files.json_file import parse_json
+from share.files.writing import atomic_write
+from share.lab.evaluate.campaign import check_names
+from share.lab.train.spoil import KINDS, Spell, draw, spoiled
+from share.metrics.local_error import WINDOW_S, LocalError
+from share.odometry.error_model.features import SHAPES, Features, features, kind_of
+from share.odometry.error_model.history import Odometer
+from share.recordings.session import Session, read_session
+from share.runtime.error_model import fared
+from share.runtime.pipeline import check_trackable, frames_of, tracker_of
+from share.runtime.pool import Pool
+from share.runtime.source import Source, open_source
+from share.sensors.sequencer import SequencerCounters
+from share.startup import prepare
+from share.types import F32, I64, U8, ImuBatch
+
+_MOST_KINDS = 3  # that come together in one run
+_AS = {True: "", False: "-without-imu"}
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of one agent. number: 0 is as recorded, each other one spoiled in its own way. imu: False plays
+    it as if there were none."""
+
+    session: Path
+    agent: str
+    number: int
+    seed: int
+    imu: bool
+    out: Path
+
+
+def plan(sessions: Sequence[Session], runs: int, seed: int, imu: bool, out: Path) -> list[Job]:
+    """Everything, done or not. Raises UsageError where there is no truth, or two sessions have one name."""
+    check_names(sessions)
+    jobs = []
+    for session in sessions:
+        name = session.folder.resolve().name
+        for agent in session.agents:
+            if not (session.folder / "truth" / f"{agent}.tum").is_file():
+                raise UsageError(f"{session.folder}: has no truth/{agent}.tum to tell how wrong it is")
+            jobs += [
+                Job(session.folder, agent, number, seed, imu, out / f"{name}-{agent}{_AS[imu]}-{number}.npz")
+                for number in range(runs)
+            ]
+    return jobs
+
+
+def make(jobs: Sequence[Job], config: Config, workers: int) -> Iterator[tuple[Job, Labels]]:
+    """Those that are not there yet are made; each of `jobs` with its labels, as they come. Raises UsageError
+    where one is there that was spoiled otherwise."""
+    left = [job for job in jobs if not job.out.exists()]
+    for job in jobs:
+        if job.out.exists():
+            found = read_labels(job.out)
+            if (seed := found.about.get("seed")) != job.seed:
+                raise UsageError(f"{job.out}: is of seed {seed}; give another --out")
+            yield job, found
+    if workers == 1:
+        for job in left:
+            _make((job, config))
+            yield job, read_labels(job.out)
+        return
+    with Pool(min(workers, max(1, len(left))), prepare, ()) as pool:
+        for (job, _), _ in pool.run(_make, [(job, config) for job in left]):
+            yield job, read_labels(job.out)
+
+
+def _make(work: tuple[Job, Config]) -> None:
+    job, config = work
+    session = read_session(job.session)
+    source = open_source(f"{job.session}/{job.agent}")
+    truth = source.truth()
+    assert truth is not None
+    rng = np.random.default_rng((job.seed, job.number, zlib.crc32(job.out.name.encode())))
+    known = [kind for kind in KINDS if job.imu or kind != "deaf"]
+    kinds = rng.permutation(known)[: rng.integers(1, _MOST_KINDS + 1)].tolist() if job.number else []
+    spells = draw(rng, int(truth.stamps_ns[0]), int(truth.stamps_ns[-1]), kinds)
+    about = {
+        "session": job.session.resolve().name,
+        "agent": job.agent,
+        "kind": str(session.agents[job.agent].kind),
+        "sensors": session.agents[job.agent].sensors,
+        "provenance": session.provenance,
+        "number": job.number,
+        "seed": job.seed,
+        "imu": job.imu and source.rig.imu is not None,
+        "spells": [asdict(spell) for spell in spells],
+        "window_s": WINDOW_S,
+        "version": __version__,
+    }
+    rows = list(keyframes(source, config, spells, job.seed, job.imu))
+    write_labels(job.out, Labels.of(about, rows))
+
+
+def keyframes(
+    source: Source, config: Config, spells: Sequence[Spell] = (), seed: int = 0, imu: bool = True
+) -> Iterator[tuple[int, float, Features]]:
+    """Of each keyframe of our own tracker: its stamp, how wrong the tracker is by then (cm, NaN unknown),
+    and what the error model is told. imu: False plays it as if there were none. Raises UsageError without a
+    truth, or where no tracker fits."""
+    truth = source.truth()
+    if truth is None:
+        raise UsageError(f"{source.name}: comes without a truth, so nobody knows how wrong a tracker is")
+    # Not `without_imu`, which makes cam0 the body: the truth stays that of the body that was recorded.
+    rig = source.rig if imu else replace(source.rig, imu=None)
+    check_trackable(source.name, rig)
+    tracker, error, odometer = tracker_of(rig, config), LocalError(truth), Odometer()
+    for frame in spoiled(frames_of(source, config, SequencerCounters()), spells, seed, rig):
+        frame = frame if imu else replace(frame, imu=ImuBatch.empty())
+        result = tracker.track(frame)
+        error_cm = error.after(frame.stamp_ns, result.T_odom_body, result.new_stretch)
+        odometer.frame(fared(frame, result))
+        if result.keyframe:
+            footing = tracker.footing()
+            lately = odometer.keyframe(frame.stamp_ns, tracker.keyframe(frame))
+            told = float("nan") if error_cm is None else error_cm
+            yield frame.stamp_ns, told, features(frame.image0, footing, lately)
+
+
+# ---- What a tracker's keyframes looked like and how wrong it was: one file a run, for training.
+
+SCHEMA = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Keyframes of one run, in order: stamps_ns (N,); error_cm (N,), NaN unknown; picture (N, 128, 128), psd
+    (N, 3, 12, 16), scalars (N, 8), recent (N, 14) as in `Features`. about: plain data."""
+
+    about: dict[str, Any]
+    stamps_ns: I64
+    error_cm: F32
+    picture: U8
+    psd: F32
+    scalars: F32
+    recent: F32
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @classmethod
+    def of(cls, about: dict[str, Any], rows: Sequence[tuple[int, float, Features]]) -> Labels:
+        """rows: stamp_ns, error_cm and features of each keyframe."""
+        return cls(
+            about,
+            np.array([row[0] for row in rows], np.int64),
+            np.array([row[1] for row in rows], np.float32),
+            *(
+                np.array([getattr(row[2], name) for row in rows], kind_of(name)).reshape(-1, *shape)
+                for name, shape in SHAPES.items()
+            ),
+        )
+
+
+_KINDS: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
+    "stamps_ns": ((), np.int64),
+    "error_cm": ((), np.float32),
+    **{name: (shape, kind_of(name)) for name, shape in SHAPES.items()},
+}
+_COLUMNS = tuple(_KINDS)
+
+
+def write_labels(path: Path, labels: Labels) -> None:
+    """Whole or not at all."""
+    data = io.BytesIO()
+    about = json.dumps({"schema": SCHEMA, **labels.about})
+    np.savez_compressed(data, about=np.array(about), **{name: getattr(labels, name) for name in _COLUMNS})
+    atomic_write(path, data.getvalue())
+
+
+def read_labels(path: Path) -> Labels:
+    """Raises DataError that names it."""
+    found = read_arrays(path, "is no file of labels")
+    try:
+        about = parse_json(str(found["about"]))
+        columns = [found[name] for name in _COLUMNS]
+        if about.pop("schema", None) != SCHEMA:
+            raise DataError(
+                f"{path}: is of another schema than {SCHEMA}; make it anew with `share train labels`"
+            )
+        count = len(columns[0])
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        raise DataError(f"{path}: is no file of labels, or damaged: {error!r:.200}") from None
+    for name, column in zip(_COLUMNS, columns, strict=True):
+        shape, kind = _KINDS[name]
+        if column.shape != (count, *shape) or column.dtype != kind:
+            raise DataError(f"{path}: is damaged: {name} is {column.shape} of {column.dtype}")
+    return Labels(about, *columns)

@@ -1,0 +1,88 @@
+"""The network of the error model but for its backbone, in torch; and what it is taught by.
+
+Three branches are joined: what the picture looks like (by a backbone that stays as it is), where there are
+points, and numbers. Source: SHARE, IMWUT 10(3) 97, 2026; that these are also of the last seconds is ours
+(docs/error-model.md).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from share.odometry.error_model.features import NAMES, RECENT
+
+DEEP, EMBEDDING, JOINED = 1280, 64, 96
+NUMBERS = len(NAMES) + len(RECENT)
+LOW, HIGH = 0.05, 0.95  # quantiles
+
+
+class Head(nn.Module):  # type: ignore[misc]
+    """deep (N, 1280), psd (N, 3, 12, 16), numbers (N, 22: scalars, recent) to log of cm (N, 3):
+    expected, low, high.
+
+    What numbers say goes to what is expected also straight on, since many are logarithms of what the error is
+    a product of powers of: so it goes on beyond what has been learnt.
+    """
+
+    def __init__(self, dropout: float = 0.0) -> None:
+        super().__init__()
+        self.forgets = nn.Dropout(dropout)
+        self.visual = nn.Sequential(nn.Linear(DEEP, EMBEDDING), nn.ReLU(), nn.LayerNorm(EMBEDDING))
+        self.spread = nn.Sequential(
+            nn.Conv2d(3, 8, 3, stride=2, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(8, 16, 3, stride=2, padding=1),
+            nn.ReLU(),
+            nn.AdaptiveAvgPool2d(1),
+            nn.Flatten(),
+        )
+        self.numbers = nn.Sequential(nn.Linear(NUMBERS, 16), nn.ReLU())
+        self.joined = nn.Sequential(nn.Linear(JOINED, 48), nn.ReLU(), nn.Linear(48, 3))
+        self.straight = nn.Linear(NUMBERS, 1)
+
+    def join(self, deep: Tensor, psd: Tensor, numbers: Tensor) -> Tensor:
+        """(N, 96)."""
+        branches = (self.visual(self.forgets(deep)), self.spread(psd), self.numbers(numbers))
+        return torch.cat(branches, dim=1)
+
+    def forward(self, deep: Tensor, psd: Tensor, numbers: Tensor) -> Tensor:
+        expected, below, above = self.joined(self.join(deep, psd, numbers)).unbind(dim=1)
+        expected = expected + self.straight(numbers)[:, 0]
+        low, high = expected - functional.softplus(below), expected + functional.softplus(above)
+        return torch.stack([expected, low, high], dim=1)
+
+
+class Heads(nn.Module):  # type: ignore[misc]
+    """Several heads that began differently. What rooms have taught all of them is what they agree on, so
+    their mean is less wrong than each (deep ensembles, Lakshminarayanan et al. 2017)."""
+
+    def __init__(self, count: int, dropout: float = 0.0) -> None:
+        super().__init__()
+        self.each = nn.ModuleList(Head(dropout) for _ in range(count))
+
+    def join(self, deep: Tensor, psd: Tensor, numbers: Tensor) -> Tensor:
+        """(N, 96), the first one's."""
+        joined: Tensor = self.each[0].join(deep, psd, numbers)
+        return joined
+
+    def forward(self, deep: Tensor, psd: Tensor, numbers: Tensor) -> Tensor:
+        """(H, N, 3), each one's."""
+        return torch.stack([head(deep, psd, numbers) for head in self.each])
+
+
+def loss(told: Tensor, log_error: Tensor) -> Tensor:
+    """told (..., N, 3) by `Head`, log_error (N,) of cm.
+
+    What is expected is learnt by the Poisson deviance, whose least is the mean, and which minds large errors
+    more than a logarithm and less than a square would; the interval by the pinball loss of its quantiles.
+    """
+    expected, low, high = told.unbind(dim=-1)
+    deviance = torch.exp(expected) - torch.exp(log_error) * expected
+    return deviance.mean() + _pinball(log_error - low, LOW) + _pinball(log_error - high, HIGH)
+
+
+def _pinball(above: Tensor, quantile: float) -> Tensor:
+    """Koenker and Bassett 1978."""
+    return torch.maximum(quantile * above, (quantile - 1) * above).mean()

@@ -1,0 +1,184 @@
+"""The edges of a pose graph as arrays: residuals and their derivatives, all in one batch.
+
+xi = log(measured^-1 T_a^-1 T_b), perturbations on the right, whitened by W with W'W = cov^-1.
+Source: Barfoot, *State Estimation for Robotics* (2017), ch. 7; Grisetti et al., *A Tutorial on
+Graph-Based SLAM*, 2010.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from share.geometry import se3
+from share.types import F64, I64, checked, checked_pose
+
+# ---- How one pose was seen from another.
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """Pose b as measured from pose a: T_a_b (4, 4) and its covariance (6, 6), perturbed on the right."""
+
+    a: int
+    b: int
+    T_a_b: F64
+    cov: F64
+
+    def __post_init__(self) -> None:
+        if self.a == self.b or min(self.a, self.b) < 0:
+            raise ValueError(f"edge: {self.a} - {self.b} does not join two poses")
+        object.__setattr__(self, "T_a_b", checked_pose("T_a_b", self.T_a_b))
+        object.__setattr__(self, "cov", checked("cov", self.cov, (6, 6), np.float64))
+
+    def reverse(self) -> Edge:
+        """The same, from the other end."""
+        return Edge(self.b, self.a, se3.inverse(self.T_a_b), se3.inverse_cov(self.T_a_b, self.cov))
+
+    @property
+    def spread(self) -> float:
+        """Trace of the covariance: one number for how loose the edge is."""
+        return float(self.cov.trace())
+
+
+_SUREST = 1e-5  # rad and m; no measurement is taken to be surer, so a singular covariance is no trouble
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """E edges: ends a, b (E,), T_b_a as measured (E, 4, 4), W (E, 6, 6), spread (E,) = trace of the
+    covariance, is_loop (E,): judged robustly. Indexed like an array."""
+
+    a: I64
+    b: I64
+    T_b_a: F64
+    W: F64
+    spread: F64
+    is_loop: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.a)
+
+    def __getitem__(self, chosen: Any) -> Edges:
+        return Edges(
+            self.a[chosen],
+            self.b[chosen],
+            self.T_b_a[chosen],
+            self.W[chosen],
+            self.spread[chosen],
+            self.is_loop[chosen],
+        )
+
+    def between(self, a: I64, b: I64) -> Edges:
+        """The same measurements with their ends named otherwise."""
+        return Edges(a, b, self.T_b_a, self.W, self.spread, self.is_loop)
+
+    def with_those(self, other: Edges) -> Edges:
+        return Edges(
+            np.concatenate([self.a, other.a]),
+            np.concatenate([self.b, other.b]),
+            np.concatenate([self.T_b_a, other.T_b_a]),
+            np.concatenate([self.W, other.W]),
+            np.concatenate([self.spread, other.spread]),
+            np.concatenate([self.is_loop, other.is_loop]),
+        )
+
+    @staticmethod
+    def measured(ends: I64, T_a_b: F64, covs: F64, is_loop: NDArray[np.bool_]) -> Edges:
+        """From ends (E, 2), T_a_b (E, 4, 4) and their covariances (E, 6, 6)."""
+        spread = np.maximum(np.trace(covs, axis1=1, axis2=2), _SUREST**2)
+        return Edges(ends[:, 0], ends[:, 1], se3.inverse(T_a_b), _whitening(covs), spread, is_loop)
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """At some poses: T_a_b (E, 4, 4), xi (E, 6), whitened (E, 6), and its square chi2 (E,)."""
+
+    T_a_b: F64
+    xi: F64
+    whitened: F64
+    chi2: F64
+
+    def __getitem__(self, chosen: Any) -> Residuals:
+        return Residuals(self.T_a_b[chosen], self.xi[chosen], self.whitened[chosen], self.chi2[chosen])
+
+
+def _whitening(covs: F64) -> F64:
+    """W (E, 6, 6) with W'W = cov^-1, for covariances (E, 6, 6)."""
+    variances, axes = np.linalg.eigh(covs)
+    return np.asarray(np.swapaxes(axes, 1, 2) / np.sqrt(np.maximum(variances, _SUREST**2))[:, :, None])
+
+
+def residuals(poses: F64, edges: Edges) -> Residuals:
+    """Of all edges at poses (N, 4, 4)."""
+    T_a_b = se3.inverse(poses)[edges.a] @ poses[edges.b]
+    xi = _log(edges.T_b_a @ T_a_b)
+    whitened = (edges.W @ xi[:, :, None])[:, :, 0]
+    return Residuals(T_a_b, xi, whitened, np.asarray((whitened**2).sum(1)))
+
+
+def jacobians(at: Residuals, edges: Edges) -> tuple[F64, F64]:
+    """Of the whitened residual by right perturbations of a and of b, each (E, 6, 6)."""
+    by_b = edges.W @ _right_jacobian_inverse(at.xi)
+    return -by_b @ se3.adjoint(se3.inverse(at.T_a_b)), by_b
+
+
+def _right_jacobian_inverse(xi: F64) -> F64:
+    """(E, 6) -> (E, 6, 6): 1 + ad/2 + ad^2/12 (Barfoot eq. 7.79); the next term is ad^4/720."""
+    ad = np.zeros((len(xi), 6, 6))
+    ad[:, :3, :3] = ad[:, 3:, 3:] = se3.hat(xi[:, :3])
+    ad[:, 3:, :3] = se3.hat(xi[:, 3:])
+    return np.asarray(np.eye(6) + ad / 2 + ad @ ad / 12)
+
+
+def _log(T: F64) -> F64:
+    """`se3.log`, (E, 4, 4) -> (E, 6), at a tenth of its cost for angles below a right one; the others,
+    of false loops mostly, are left to it."""
+    R, t = T[:, :3, :3], T[:, :3, 3]
+    twice_sine = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], 1)
+    sine = np.linalg.norm(twice_sine, axis=1) / 2
+    cosine = (R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2] - 1) / 2
+    angle = np.arctan2(sine, cosine)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    phi = np.where(small, 0.5, safe / np.maximum(2 * sine, 1e-300))[:, None] * twice_sine
+    second = np.where(small, 1 / 12, (1 - safe / 2 / np.tan(safe / 2)) / safe**2)
+    turned = np.cross(phi, t)
+    xi = np.concatenate([phi, t - turned / 2 + second[:, None] * np.cross(phi, turned)], 1)
+    far = cosine < 0
+    if far.any():
+        xi[far] = se3.log(T[far])
+    return xi
+
+
+# ---- Which way is up at a pose, as its agent's IMU knows it: what a plumb line says there.
+
+
+def cost(poses: F64, plumb: F64) -> float:
+    """Sum of the squared residuals at poses (N, 4, 4)."""
+    return float((_residual(poses, plumb) ** 2).sum())
+
+
+def equations(poses: F64, plumb: F64) -> tuple[F64, F64]:
+    """Slope (N, 6) and curvature (N, 6, 6) of half the cost by each pose's own perturbation."""
+    J = -(poses[:, :2, :3] @ se3.hat(plumb))
+    slope, curvature = np.zeros((len(poses), 6)), np.zeros((len(poses), 6, 6))
+    slope[:, :3] = (np.swapaxes(J, 1, 2) @ _residual(poses, plumb)[:, :, None])[:, :, 0]
+    curvature[:, :3, :3] = np.swapaxes(J, 1, 2) @ J
+    return slope, curvature
+
+
+def tilting(pose: F64) -> F64:
+    """Projector (6, 6) of a perturbation of `pose` (4, 4) on its turns about level axes."""
+    level = pose[:2, :3]
+    out = np.zeros((6, 6))
+    out[:3, :3] = level.T @ level
+    return out
+
+
+def _residual(poses: F64, plumb: F64) -> F64:
+    """(N, 2)."""
+    return np.asarray((poses[:, :2, :3] @ plumb[:, :, None])[:, :, 0])

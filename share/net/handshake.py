@@ -1,0 +1,132 @@
+"""The door of an edge with keys: ZAP (RFC 27) within the context of the edge's socket."""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import Enum
+from threading import Thread
+
+import zmq
+from zmq.utils import z85
+from zmq.utils.monitor import recv_monitor_message
+
+from share.net.guard import Guard
+from share.net.keys import EdgeKeys
+
+# ---- How handshakes end: what libzmq's monitor tells of a socket (zmq_socket_monitor).
+
+_MECHANISM_MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
+
+
+class Outcome(Enum):
+    CONNECTED = "connected"  # the handshake begins
+    DISCONNECTED = "disconnected"
+    JOINED = "joined"
+    UNKNOWN_KEY = "unknown key"  # the edge does not let this key in
+    NO_KEYS = "no keys"  # one side uses keys, the other none, and libzmq could tell
+    BROKEN_OFF = "broken off"  # by the other side, which says no more
+
+
+class Handshakes:
+    """The outcomes of one socket's handshakes, as they happen. descriptor: of its newest connection."""
+
+    def __init__(self, socket: zmq.Socket[bytes]) -> None:
+        self._monitored = socket
+        self.descriptor: int | None = None
+        self.events: zmq.Socket[bytes] = socket.get_monitor_socket(
+            zmq.EVENT_CONNECTED
+            | zmq.EVENT_DISCONNECTED
+            | zmq.EVENT_HANDSHAKE_SUCCEEDED
+            | zmq.EVENT_HANDSHAKE_FAILED_AUTH
+            | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+            | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+        )
+
+    def next(self) -> Outcome | None:
+        """None: nothing has happened since."""
+        try:
+            event = recv_monitor_message(self.events, zmq.NOBLOCK)
+        except zmq.Again:
+            return None
+        if event["event"] == zmq.EVENT_CONNECTED:
+            self.descriptor = int(event["value"])
+            return Outcome.CONNECTED
+        if event["event"] == zmq.EVENT_DISCONNECTED:
+            return Outcome.DISCONNECTED
+        if event["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+            return Outcome.JOINED
+        if event["event"] == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+            return Outcome.UNKNOWN_KEY
+        return Outcome.NO_KEYS if event["value"] == _MECHANISM_MISMATCH else Outcome.BROKEN_OFF
+
+    def close(self) -> None:
+        """Before the socket itself is closed."""
+        self._monitored.disable_monitor()
+        self.events.close(linger=0)
+
+
+_ENDPOINT = "inproc://zeromq.zap.01"
+_DOMAIN = b"share"
+
+
+class Doorkeeper:
+    """Makes `socket` a CURVE server and answers for each handshake whether that key may come in.
+
+    A thread of its own, so that agents connect also while the edge is busy. It ends by itself when the
+    context is terminated; `join` then. Must be made before the socket is bound.
+    """
+
+    def __init__(
+        self, context: zmq.Context[zmq.Socket[bytes]], socket: zmq.Socket[bytes], keys: EdgeKeys, guard: Guard
+    ) -> None:
+        self._guard = guard
+        self._refusals: deque[str] = deque(maxlen=128)
+        self._allowed = keys.allowed
+        self._inside: set[str] = set()  # keys let in so far
+        socket.setsockopt(zmq.CURVE_SERVER, 1)
+        socket.setsockopt(zmq.CURVE_SECRETKEY, keys.own.secret.encode())
+        socket.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN)
+        socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without it nobody at the door lets everyone in
+        self._requests = context.socket(zmq.REP)
+        self._requests.bind(_ENDPOINT)
+        self._thread = Thread(target=self._serve, name="doorkeeper", daemon=True)
+        self._thread.start()
+
+    def revoked(self) -> bool:
+        """Whether someone who was let in may not be here any more."""
+        return not all(self._allowed.admits(key) for key in tuple(self._inside))
+
+    def trouble(self) -> str | None:
+        """Why nobody is let in, for a person; None where the list can be read."""
+        wrong = self._allowed.trouble()
+        return None if wrong is None else f"nobody is let in: {wrong}"
+
+    def refusals(self) -> list[str]:
+        """A line for each since the last call."""
+        return [self._refusals.popleft() for _ in range(len(self._refusals))]
+
+    def join(self) -> None:
+        self._thread.join()
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                self._requests.send_multipart(self._answer(self._requests.recv_multipart()))
+            except zmq.ContextTerminated:
+                self._requests.close()
+                return
+
+    def _answer(self, request: list[bytes]) -> list[bytes]:
+        version, number, _domain, address, _identity, _mechanism, credentials = request
+        key = z85.encode(credentials).decode()
+        if self._allowed.admits(key):
+            if not self._guard.admits(key, address.decode()):  # 300: for now, so libzmq goes on trying
+                return [version, number, b"300", b"kept out", b"", b""]
+            self._inside.add(key)  # a revocation since then is seen by the next `revoked`
+            return [version, number, b"200", b"", key.encode(), b""]
+        self._refusals.append(
+            self.trouble()
+            or f"the key '{key}' ({address.decode()}) is not authorized; "
+            f"to let it in: share keys authorize NAME '{key}'"
+        )
+        return [version, number, b"400", b"not authorized", b"", b""]

@@ -1,0 +1,362 @@
+"""Who may talk to whom: CurveZMQ key pairs and the list of agents that an edge lets in, as text files.
+
+A folder holds one machine's pair, `NAME.public` and `NAME.secret`, and at an edge `authorized`. All are
+made of lines `share-public-key NAME KEY`, so the list is public keys one after the other. There, names of
+the agents that may run on that machine can follow; where none do, only the agent called NAME may. KEY is a
+32-byte Curve25519 key in Z85 (RFC 26 CurveZMQ, RFC 32 Z85): 40 characters, none of them a quote.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import socket
+import stat
+import struct
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+from share.errors import UsageError
+from share.files.reading import KEYS, read_text
+from share.files.writing import atomic_write, writing, xdg_folder
+
+_NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
+_Z85 = r"[0-9a-zA-Z.:+=^!/*?&<>()\[\]{}@%$#-]{40}"
+_LIST = "authorized"
+_LINE = re.compile(rf"share-(public|secret)-key ({_NAME}) ({_Z85})((?: {_NAME})*)")
+
+
+@dataclass(frozen=True)
+class KeyPair:
+    """Of one machine. Keys are Z85 text."""
+
+    name: str
+    public: str
+    secret: str = field(repr=False)
+
+
+@dataclass(frozen=True)
+class AgentKeys:
+    """What an agent needs: its own pair and the public key of its edge."""
+
+    own: KeyPair
+    edge: str
+
+
+@dataclass(frozen=True)
+class EdgeKeys:
+    """What an edge needs: its own pair and who may connect."""
+
+    own: KeyPair
+    allowed: AllowList
+
+
+class AllowList:
+    """Agents by public key. It follows its file: whoever looks sees what the file says now.
+
+    No file: nobody. May be looked at from several threads.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._read: tuple[tuple[int, ...], dict[str, Grant]] = (), {}
+
+    def names(self) -> dict[str, str]:
+        """Name by public key. Raises UsageError if the file cannot be read or has another form."""
+        return {key: grant.name for key, grant in self.grants().items()}
+
+    def agents(self, public: str) -> frozenset[str]:
+        """Names of the agents that this key may speak for; none while the file cannot be read."""
+        try:
+            grant = self.grants().get(public)
+        except UsageError:
+            return frozenset()
+        return frozenset() if grant is None else frozenset(grant.agents)
+
+    def grants(self) -> dict[str, Grant]:
+        """By public key. Raises UsageError if the file cannot be read or has another form."""
+        try:
+            status = self.path.stat()
+        except FileNotFoundError:
+            return {}
+        except OSError as error:
+            raise UsageError(f"{self.path}: cannot be read: {error.strerror}") from None
+        _check_guarded(self.path, status)
+        state = (status.st_mtime_ns, status.st_ino, status.st_size)
+        if state != self._read[0]:
+            self._read = state, self._parsed()
+        return self._read[1]
+
+    def admits(self, public: str) -> bool:
+        """Whether that key may connect. Nobody may while the file cannot be read."""
+        try:
+            return public in self.grants()
+        except UsageError:
+            return False
+
+    def trouble(self) -> str | None:
+        """Why nobody may connect; None where the file can be read."""
+        try:
+            self.grants()
+        except UsageError as error:
+            return str(error)
+        return None
+
+    def _parsed(self) -> dict[str, Grant]:
+        return {line.key: Grant(line.name, line.agents) for line in _lines(self.path) if line.key}
+
+
+class Grant(NamedTuple):
+    """What the list says of a key: the name of its machine, and which agents it may speak for."""
+
+    name: str
+    agents: tuple[str, ...]
+
+
+class _Line(NamedTuple):
+    """Of the list, with its end. name and key are empty for a comment."""
+
+    text: str
+    name: str = ""
+    key: str = ""
+    agents: tuple[str, ...] = ()
+
+
+def default_folder() -> Path:
+    """$XDG_CONFIG_HOME/share/keys, or ~/.config/share/keys."""
+    return xdg_folder("XDG_CONFIG_HOME", ".config") / "share" / "keys"
+
+
+def generate(folder: Path, name: str | None = None) -> KeyPair:
+    """A new pair in `folder`, named after this machine unless `name` is given. Raises UsageError, also
+    if there is a pair already: it is never replaced."""
+    import zmq
+
+    name = _checked(name or re.sub(r"[^A-Za-z0-9_-]", "-", socket.gethostname()).strip("-")[:64] or "share")
+    _make(folder)
+    with _locked(folder):
+        if old := _secrets(folder):
+            raise UsageError(f"{old[0]}: there is a key pair already; give another folder with --keys")
+        public, secret = b"-", b""
+        while not public[:1].isalnum():  # or a shell command could take the key for an option
+            public, secret = zmq.curve_keypair()
+        pair = KeyPair(name, public.decode(), secret.decode())
+        _write_secret(folder / f"{name}.secret", f"share-secret-key {name} {pair.secret}\n")
+        atomic_write(folder / f"{name}.public", _line(name, pair.public))
+    return pair
+
+
+def has_pair(folder: Path) -> bool:
+    """Raises UsageError where it cannot be looked into."""
+    return bool(_secrets(folder))
+
+
+def load(folder: Path) -> KeyPair:
+    """The pair in `folder`. Raises UsageError if there is none or not just one, or others can read it."""
+    import zmq
+
+    found = _secrets(folder)
+    if not found:
+        where = "" if folder == default_folder() else f" --keys {folder}"
+        raise UsageError(f"{folder}: has no key pair; make one with `share keys generate{where}`")
+    if len(found) > 1:
+        raise UsageError(f"{folder}: has {len(found)} key pairs; keep one in each folder")
+    path = found[0]
+    _check_guarded(folder, folder.stat())
+    if path.stat().st_mode & 0o077:
+        raise UsageError(f"{path}: others can read this secret; `chmod 600 {path}`, or make a new pair")
+    match = _LINE.fullmatch(_text(path).strip())
+    if not match or match[1] != "secret" or not _is_key(match[3]) or match[4]:
+        raise UsageError(
+            f"{path}: is not a secret key of SHARE; move it away, then `share keys generate` makes a new pair"
+        )
+    return KeyPair(match[2], zmq.curve_public(match[3].encode()).decode(), match[3])
+
+
+def public_key(given: str) -> str:
+    """The key in the file `given`, or `given` itself, if it is one. Raises UsageError."""
+    if re.fullmatch(_Z85, given) and _is_key(given):
+        return given
+    if given.startswith("share-"):
+        return _public(given, "what was given")[1]
+    path = Path(given)
+    if not _is_file(path):
+        raise UsageError(f"'{given:.60}': neither a file nor a public key (40 characters, in single quotes)")
+    return _public(_text(path).strip(), given)[1]
+
+
+def allow_list(folder: Path) -> AllowList:
+    return AllowList(folder / _LIST)
+
+
+def authorize(folder: Path, name: str, public: str, agents: Sequence[str] = ()) -> None:
+    """Let the machine `name` in, to speak for `agents` (default: the one agent called `name`), in place of
+    those it could speak for before. Raises UsageError if the name or the key is taken, or the list is
+    damaged."""
+    name, agents = _checked(name), [_checked(agent) for agent in agents]
+    line = _line(name, public, agents)
+    _make(folder)
+    with _locked(folder):
+        names = dict(allow_list(folder).names())
+        if names.get(public, name) != name:
+            raise UsageError(f"'{name}': this key is authorized already, as '{names[public]}'")
+        if name in names.values() and public not in names:
+            raise UsageError(f"'{name}' has another key; `share keys revoke {name}` takes that away first")
+        lines = _lines(folder / _LIST)
+        if public not in names:
+            _save(folder, [*lines, _Line(line)])
+        elif agents:
+            _save(folder, [old._replace(text=line) if old.key == public else old for old in lines])
+
+
+def revoke(folder: Path, name: str) -> None:
+    """Let it in no more, by any of its keys. Raises UsageError if there is none of that name, or the list is
+    damaged."""
+    if not (folder / _LIST).exists():
+        raise UsageError(f"'{name}' is not authorized; there is nobody")
+    with _locked(folder):
+        lines = _lines(folder / _LIST)
+        keys = {line.key for line in lines if line.key and line.name == name}
+        if not keys:
+            others = ", ".join(dict.fromkeys(line.name for line in lines if line.key))
+            raise UsageError(f"'{name}' is not authorized; there is {others or 'nobody'}")
+        _save(folder, [line for line in lines if line.key not in keys])  # also under another name
+
+
+def agent_keys(folder: Path | None, edge: str) -> AgentKeys:
+    """folder: of the agent's own pair, None for the default one; edge: see `public_key`."""
+    return AgentKeys(load(folder or default_folder()), public_key(edge))
+
+
+def edge_keys(folder: Path | None) -> EdgeKeys:
+    """The keys in `folder`, None for the default one. Raises UsageError, also for a damaged list."""
+    folder = folder or default_folder()
+    keys = EdgeKeys(load(folder), allow_list(folder))
+    keys.allowed.names()
+    return keys
+
+
+# ---------------------------------------------------------------- files
+
+
+def _public(line: str, where: str) -> tuple[str, str]:
+    """Name and key of a line. Raises UsageError."""
+    match = _LINE.fullmatch(line.strip())
+    if match and match[1] == "secret":
+        raise UsageError(f"{where}: is a secret key, which stays on its machine; give the public one")
+    if not match or not _is_key(match[3]):
+        raise UsageError(f"{where}: is not `share-public-key NAME KEY`")
+    return match[2], match[3]
+
+
+def _granted(line: str, where: str) -> tuple[str, str, tuple[str, ...]]:
+    """Name, key and agents of a line of the list. Raises UsageError."""
+    name, key = _public(line, where)
+    match = _LINE.fullmatch(line.strip())
+    assert match is not None
+    return name, key, tuple(match[4].split()) or (name,)
+
+
+def _line(name: str, public: str, agents: Sequence[str] = ()) -> str:
+    return " ".join(("share-public-key", name, public, *agents)) + "\n"
+
+
+def _is_key(text: str) -> bool:
+    """Whether 40 characters of Z85 are 32 bytes: five can say more than four bytes hold."""
+    from zmq.utils import z85
+
+    try:
+        return len(z85.decode(text)) == 32
+    except struct.error:
+        return False
+
+
+def _checked(name: str) -> str:
+    if not re.fullmatch(_NAME, name):
+        raise UsageError(f"'{name}': a name has 1 to 64 letters, digits, '_', '-' or '.'")
+    return name
+
+
+def _text(path: Path) -> str:
+    try:
+        return read_text(path, KEYS, "ascii")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not a text file"
+        raise UsageError(f"{path}: cannot be read: {reason}") from None
+
+
+def _secrets(folder: Path) -> list[Path]:
+    """None where there is no folder. Raises UsageError where it cannot be looked into."""
+    try:
+        names = os.listdir(folder)  # glob would find nothing where it may not look
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be read: {error.strerror}") from None
+    return sorted(folder / name for name in names if name.endswith(".secret"))
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be made: {error.strerror}; give another --keys") from None
+
+
+def _lines(path: Path) -> list[_Line]:
+    """Of a list; none where there is no file. Raises UsageError."""
+    if not path.exists():
+        return []
+    found = []
+    for number, text in enumerate(_text(path).splitlines(), 1):
+        comment = not text.strip() or text.startswith("#")
+        found.append(_Line(text + "\n", *(() if comment else _granted(text, f"{path}, line {number}"))))
+    return found
+
+
+def _save(folder: Path, lines: Iterable[_Line]) -> None:
+    """Comments stay where they are."""
+    atomic_write(folder / _LIST, "".join(line.text for line in lines))
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long for any
+        return False
+
+
+def _check_guarded(path: Path, status: os.stat_result) -> None:
+    """Raises UsageError where anybody could let himself in."""
+    if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
+        raise UsageError(f"{path}: anybody may write to it; `chmod o-w {path}`")
+
+
+def _write_secret(path: Path, text: str) -> None:
+    """Nobody else can read it at any moment, and it replaces nothing."""
+    with writing(path):
+        handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
+        try:
+            with os.fdopen(handle, "w") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError:
+            path.unlink()
+            raise
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """One writer at a time, or one's revocation could be undone by another's addition."""
+    import fcntl
+
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)

@@ -1,0 +1,146 @@
+"""UDP whose datagrams are stamped by the kernel as they arrive, where it does that (Linux)."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+import select
+import socket
+import struct
+import sys
+import time
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+from share.errors import UsageError
+from share.net.transport import bind_error
+
+MAX_BYTES = 2048  # of a datagram; longer ones are cut off
+_TIMESTAMPNS = (
+    35  # SO_TIMESTAMPNS of asm-generic/socket.h, the same on x86 and ARM; Python has no name for it
+)
+_TIMESPEC = struct.Struct("@ll")
+_ADDRESS = re.compile(r"(?:\[([0-9A-Fa-f:.%\w]+)\]|([A-Za-z0-9_.-]+))(?::(\d{1,5}))?")
+
+
+@dataclass(frozen=True)
+class Host:
+    """Where a UDP socket is."""
+
+    name: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"[{self.name}]:{self.port}" if ":" in self.name else f"{self.name}:{self.port}"
+
+
+@dataclass(frozen=True)
+class Datagram:
+    """stamp_ns: Unix time of its arrival, by the kernel or else by us. source: as the socket gives it."""
+
+    data: bytes
+    source: Any
+    stamp_ns: int
+
+
+class StampedSocket:
+    """One socket; `by_kernel` says whose stamps its datagrams have."""
+
+    def __init__(self, family: int) -> None:
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self.by_kernel = False
+        if sys.platform == "linux":
+            with contextlib.suppress(OSError):
+                self._socket.setsockopt(socket.SOL_SOCKET, _TIMESTAMPNS, 1)
+                self.by_kernel = True
+
+    @classmethod
+    def bound(cls, host: Host) -> StampedSocket:
+        """Raises UsageError for a host that is unknown, TransportError where nobody can listen."""
+        family, target = resolve(host)
+        made = cls(family)
+        try:
+            made._socket.bind(target)
+        except OSError as error:
+            made.close()
+            raise bind_error(host, error.errno, error.strerror or str(error), "server") from None
+        return made
+
+    @classmethod
+    def connected(cls, host: Host) -> StampedSocket:
+        """Hears that host only. Raises UsageError for one that is unknown, OSError for one without a way."""
+        family, target = resolve(host)
+        made = cls(family)
+        try:
+            made._socket.connect(target)
+        except OSError:
+            made.close()
+            raise
+        return made
+
+    @property
+    def port(self) -> int:
+        """The one really bound."""
+        return int(self._socket.getsockname()[1])
+
+    def send(self, data: bytes, to: Any = None) -> None:
+        """Raises OSError."""
+        if to is None:
+            self._socket.send(data)
+        else:
+            self._socket.sendto(data, to)
+
+    def receive(self, timeout_s: float) -> Datagram | None:
+        """The next datagram; None after `timeout_s`. Raises OSError, on a connected socket also for what
+        became of a datagram sent before (nobody listens there)."""
+        if not select.select([self._socket], [], [], max(0.0, timeout_s))[0]:
+            return None
+        try:
+            data, extra, _, source = self._socket.recvmsg(MAX_BYTES, 64)
+        except BlockingIOError:  # a damaged one, which the kernel threw away
+            return None
+        return Datagram(data, source, _kernel_ns(extra) or time.time_ns())
+
+    def close(self) -> None:
+        """May be repeated."""
+        self._socket.close()
+
+
+def _kernel_ns(extra: list[tuple[int, int, bytes]]) -> int | None:
+    for level, kind, data in extra:
+        if (level, kind, len(data)) == (socket.SOL_SOCKET, _TIMESTAMPNS, _TIMESPEC.size):
+            seconds, rest_ns = _TIMESPEC.unpack(data)
+            return int(seconds) * 1_000_000_000 + int(rest_ns)
+    return None
+
+
+def parse_host(text: str, default_port: int, bind: bool = False) -> Host:
+    """HOST, HOST:PORT, [IPV6] or [IPV6]:PORT. Raises UsageError."""
+    match = _ADDRESS.fullmatch(text)
+    port = int(match[3]) if match and match[3] else default_port
+    if not match or text.isdigit() or not (0 if bind else 1) <= port <= 65535:
+        raise UsageError(
+            f"'{text}' is no address; give HOST or HOST:PORT, such as 192.168.1.10:{default_port}"
+        )
+    name = match[1] or match[2]
+    return Host("127.0.0.1" if name == "localhost" else name, port)
+
+
+def resolve(host: Host) -> tuple[int, Any]:
+    """Family and socket address. Raises UsageError where nobody knows that host."""
+    try:
+        found = socket.getaddrinfo(host.name, host.port, type=socket.SOCK_DGRAM)
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UsageError(f"{host.name}: no such host ({reason}); give its name or IP address") from None
+    return found[0][0], found[0][4]
+
+
+def clock_precision() -> int:
+    """How long it takes to read this machine's clock, as log2 of s (RFC 5905, section 7.3)."""
+    readings = [time.time_ns() for _ in range(200)]
+    least_ns = min((b - a for a, b in pairwise(readings) if b > a), default=1_000_000)
+    return math.ceil(math.log2(least_ns * 1e-9))

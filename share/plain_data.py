@@ -1,0 +1,81 @@
+"""Plain data to frozen dataclasses and back, strictly.
+
+An unknown key is refused by its full name, with the nearest known one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+import types
+import typing
+from typing import Any, TypeVar
+
+from share.errors import ConfigError
+
+T = TypeVar("T")
+_LARGEST = 1e9  # no setting means anything beyond; NaN and infinity are refused with it
+
+
+def from_mapping(cls: type[T], data: Any, where: str) -> T:
+    """The dataclass `cls` from a mapping, recursively; absent keys keep theirs. Raises ConfigError."""
+    if not isinstance(data, dict):
+        raise ConfigError(f"{where}: expected a mapping of settings, found {type(data).__name__}")
+    hints = typing.get_type_hints(cls)
+    values = {}
+    for key, value in data.items():
+        if key not in hints:
+            near = difflib.get_close_matches(str(key), hints, n=1)
+            hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(hints)}"
+            raise ConfigError(f"{where}: unknown key '{key}'{hint}")
+        values[key] = _convert(hints[key], value, f"{where}: {key}")
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+        given = field.default, field.default_factory
+        if field.name not in values and given == (dataclasses.MISSING, dataclasses.MISSING):
+            raise ConfigError(f"{where}: key '{field.name}' is missing")
+    try:
+        return cls(**values)
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from None
+
+
+def to_mapping(config: Any) -> dict[str, Any]:
+    """Plain data of a configuration, for a report."""
+    return dataclasses.asdict(config)
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        return from_mapping(hint, value, where)
+    if typing.get_origin(hint) is dict and isinstance(value, dict):
+        return {str(k): _convert(typing.get_args(hint)[1], v, f"{where}: {k}") for k, v in value.items()}
+    accepted = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    if float in accepted and isinstance(value, str):  # PyYAML reads 1e-3 as text
+        with contextlib.suppress(ValueError):
+            value = float(value)
+    if type(value) in (int, float) and not 0 <= value <= _LARGEST:
+        raise ConfigError(f"{where}: expected a number from 0 to {_LARGEST:g}, found {value}")
+    if float in accepted and type(value) is int:
+        return float(value)
+    for kind in accepted:
+        if isinstance(kind, type) and type(value) is kind:
+            return value
+    names = " or ".join(getattr(kind, "__name__", str(kind)) for kind in accepted)
+    raise ConfigError(f"{where}: expected {names}, found {value!r}")
+
+
+def load_yaml(text: str, where: str) -> Any:
+    """As yaml.safe_load, but it refuses a key that stands there twice and what would take more time or
+    memory than a file of settings needs. Raises ConfigError."""
+    import yaml
+
+    from share.plain_yaml import PlainLoader
+
+    try:
+        return yaml.load(text, PlainLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark else ""
+        reason = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise ConfigError(f"{where}{line}: not valid YAML: {reason}") from None

@@ -1,0 +1,283 @@
+"""The edge's clock as seen from the agent: offset, drift and round trip, from ping and pong."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from share.config import ClockConfig, LinkConfig
+from share.rates import SECOND_NS, Every
+from share.types import F64
+from share.wire.messages import Ping, Pong
+
+# ---- One question and its answer between two clocks: what it tells of the one against the other.
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """sent, back: by the clock of who asks; received, replied: by that of who answers (RFC 5905, section
+    8: T1, T4 and T2, T3). All ns."""
+
+    sent_ns: int
+    received_ns: int
+    replied_ns: int
+    back_ns: int
+
+    @property
+    def offset_ns(self) -> int:
+        """The other clock minus the own, to the half ns below; wrong by at most half of `delay_ns`,
+        namely by half of what the way there took longer than the way back."""
+        return ((self.received_ns - self.sent_ns) + (self.replied_ns - self.back_ns)) // 2
+
+    @property
+    def delay_ns(self) -> int:
+        """Time on the way, both ways. Negative only if a clock was set meanwhile."""
+        return (self.back_ns - self.sent_ns) - (self.replied_ns - self.received_ns)
+
+    @property
+    def unproven_ns(self) -> int:
+        """Twice what `offset_ns` can be wrong by if one of the two times of the other clock is made up: that
+        one was read within the exchange, which the own clock has timed, is all that it cannot feign."""
+        return (self.back_ns - self.sent_ns) + (self.replied_ns - self.received_ns)
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether it can be of clocks that nobody set meanwhile."""
+        return self.back_ns >= self.sent_ns and self.replied_ns >= self.received_ns and self.delay_ns >= 0
+
+
+_SMOOTHING = 1 / 8  # RFC 6298, section 2
+MOST_APART_NS = 10 * 365 * 86_400 * SECOND_NS  # clocks that begin at start-up: no machine is up for longer
+_WITNESSES = 3  # exchanges that agree before a clock is believed: its stamps must advance as ours do
+_SETTLED = 8  # exchanges before the quickest of them counts as one that met no queue
+
+
+def smoothed(before: float | None, now: float) -> float:
+    """As the round trip time of TCP is."""
+    return now if before is None else before + _SMOOTHING * (now - before)
+
+
+class ClockFilter:
+    """A Kalman filter over [offset (us), drift (us/s = ppm)] of edge time minus agent time.
+
+    Measurement: RFC 5905, section 8. An exchange that took longer than the quickest recent one
+    waited in a queue, and how that wait was shared out between the ways is unknown: its variance
+    grows with the square of the excess. A constant asymmetry of the path cannot be seen by any
+    such filter and is not in `sigma_ns`; `asymmetry_ns` bounds it.
+    """
+
+    def __init__(self, config: ClockConfig) -> None:
+        from filterpy.kalman import KalmanFilter  # takes a second to import: now, not at the first pong
+
+        self._make_filter = KalmanFilter
+        self._config = config
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets everything: another clock."""
+        self.accepted = 0
+        self.rejected = 0
+        self.steps = 0
+        self.rtt_ms: float | None = None
+        self._filter: Any = None
+        self._base_ns = 0  # the state is relative to this offset, so that it stays small
+        self._at_ns = 0
+        self._recent_ns: deque[int] = deque(maxlen=self._config.least_of)
+        self._unproven_ns: deque[int] = deque(maxlen=self._config.least_of)
+        self._refused_in_a_row = 0
+        self._agreeing = 0  # exchanges since the clock was last set
+
+    @property
+    def is_witnessed(self) -> bool:
+        """Whether so many exchanges agree that it is a clock at all."""
+        return self._agreeing >= _WITNESSES
+
+    def update(self, sent_ns: int, received_ns: int, replied_ns: int, back_ns: int) -> bool:
+        """One exchange: sent and back by the agent's clock, received and replied by the edge's.
+
+        Returns whether it was believed.
+        """
+        exchange = Exchange(sent_ns, received_ns, replied_ns, back_ns)
+        if not exchange.is_possible or abs(exchange.offset_ns) > MOST_APART_NS:
+            self.rejected += 1
+            return False
+        rtt_ns, offset_ns = exchange.delay_ns, exchange.offset_ns
+        middle_ns = (sent_ns + back_ns) // 2
+        self._recent_ns.append(rtt_ns)
+        self._unproven_ns.append(exchange.unproven_ns)
+        self.rtt_ms = smoothed(self.rtt_ms, rtt_ns / 1e6)
+        variance = self._variance(rtt_ns)
+        if self._filter is None:
+            self._start(offset_ns, middle_ns, variance)
+            return True
+        return self._correct(offset_ns, middle_ns, variance)
+
+    def offset_ns(self, now_ns: int) -> int | None:
+        """Edge time minus agent time at the agent's `now_ns`; None before the first exchange."""
+        if self._filter is None:
+            return None
+        offset_us, drift_ppm = self._filter.x
+        return self._base_ns + round(float(offset_us + drift_ppm * self._since_s(now_ns)) * 1e3)
+
+    def sigma_ns(self, now_ns: int) -> float | None:
+        """Standard deviation of `offset_ns`."""
+        if self._filter is None:
+            return None
+        P = self._predicted(now_ns)[1]
+        return float(np.sqrt(P[0, 0])) * 1e3
+
+    @property
+    def asymmetry_ns(self) -> int | None:
+        """What `offset_ns` can be wrong by unseen, rounded up; None before the first exchange. It is half of
+        the least sum, among recent exchanges, of the round trip by our own clock and the time that the edge
+        says it held the question. Added, so that an edge that says it held it for long makes this more."""
+        return -(-min(self._unproven_ns) // 2) if self._unproven_ns else None
+
+    @property
+    def drift_ppm(self) -> float | None:
+        return None if self._filter is None else float(self._filter.x[1])
+
+    def report(self) -> dict[str, Any]:
+        """Plain data; the offset is that of the last exchange."""
+        sigma_ns = self.sigma_ns(self._at_ns)
+        return {
+            "rtt_ms": self.rtt_ms,
+            "clock_offset_ns": self.offset_ns(self._at_ns),
+            "clock_sigma_ms": None if sigma_ns is None else sigma_ns / 1e6,
+            "clock_drift_ppm": self.drift_ppm,
+            "clock_steps": self.steps,
+        }
+
+    def _variance(self, rtt_ns: int) -> float:
+        """us^2. Half the round trip is the most that an exchange can be wrong by (RFC 5905, section 8)."""
+        settled = len(self._recent_ns) >= _SETTLED
+        excess_us = (rtt_ns - (min(self._recent_ns) if settled else 0)) / 1e3
+        return self._config.noise_us**2 + (self._config.asymmetry * excess_us) ** 2
+
+    def _start(self, offset_ns: int, at_ns: int, variance: float) -> None:
+        self._filter = self._make_filter(dim_x=2, dim_z=1)
+        self._filter.x = np.zeros(2)
+        self._filter.P = np.diag([variance, self._config.drift_ppm**2])
+        self._filter.H = np.array([[1.0, 0.0]])
+        self._base_ns, self._at_ns = offset_ns, at_ns
+        self._refused_in_a_row = 0
+        self._agreeing = 1
+        self.accepted += 1
+
+    def _correct(self, offset_ns: int, at_ns: int, variance: float) -> bool:
+        kf = self._filter
+        kf.x, kf.P = self._predicted(at_ns)
+        self._at_ns = max(at_ns, self._at_ns)
+        innovation = (offset_ns - self._base_ns) / 1e3 - kf.x[0]
+        if innovation**2 > self._config.gate_sigma**2 * (kf.P[0, 0] + variance):
+            return self._refuse(offset_ns, at_ns, variance)
+        kf.update(np.array([(offset_ns - self._base_ns) / 1e3]), R=variance)
+        self._refused_in_a_row = 0
+        self._agreeing += 1
+        self.accepted += 1
+        return True
+
+    def _refuse(self, offset_ns: int, at_ns: int, variance: float) -> bool:
+        self._refused_in_a_row += 1
+        self.rejected += 1
+        if self._refused_in_a_row >= self._config.step_after:
+            self.steps += 1
+            self._start(offset_ns, at_ns, variance)
+        return False
+
+    def _predicted(self, now_ns: int) -> tuple[F64, F64]:
+        """State and covariance at `now_ns`: random walks of the offset and of its drift."""
+        dt = max(0.0, self._since_s(now_ns))
+        F = np.array([[1.0, dt], [0.0, 1.0]])
+        q, r = self._config.offset_walk_us**2, self._config.drift_walk_ppm**2
+        Q = np.array([[q * dt + r * dt**3 / 3, r * dt**2 / 2], [r * dt**2 / 2, r * dt]])
+        return F @ self._filter.x, F @ self._filter.P @ F.T + Q
+
+    def _since_s(self, now_ns: int) -> float:
+        return (now_ns - self._at_ns) / SECOND_NS
+
+
+# ---- Whether an agent may say how far the edge's clock is off, and so compare the stamps of two machines.
+
+
+@dataclass(frozen=True)
+class ClockClaim:
+    """Of the edge's monotonic clock minus the agent's, ms. sigma_ms: standard deviation by the filter;
+    asymmetry_ms: half of the least recent round trip by the agent's own clock, which no filter sees and no
+    word of the edge makes smaller; None before exchanges that agree. offset_ms: None too where it is not
+    claimed."""
+
+    offset_ms: float | None
+    sigma_ms: float | None
+    asymmetry_ms: float | None
+    claim_ms: float  # setting `clock.claim_ms`
+
+    @classmethod
+    def of(cls, clock: ClockFilter, now_ns: int, claim_ms: float) -> ClockClaim:
+        """At `now_ns`: what was not asked for long is known less."""
+        offset_ns, sigma_ns, asymmetry_ns = (
+            clock.offset_ns(now_ns),
+            clock.sigma_ns(now_ns),
+            clock.asymmetry_ns,
+        )
+        if not clock.is_witnessed or offset_ns is None or sigma_ns is None or asymmetry_ns is None:
+            return cls(None, None, None, claim_ms)
+        found = cls(offset_ns / 1e6, sigma_ns / 1e6, asymmetry_ns / 1e6, claim_ms)
+        return found if found.claimed else cls(None, found.sigma_ms, found.asymmetry_ms, claim_ms)
+
+    @property
+    def uncertainty_ms(self) -> float | None:
+        if self.sigma_ms is None or self.asymmetry_ms is None:
+            return None
+        return self.sigma_ms + self.asymmetry_ms
+
+    @property
+    def claimed(self) -> bool:
+        return self.uncertainty_ms is not None and self.uncertainty_ms <= self.claim_ms
+
+    def report(self) -> dict[str, Any]:
+        """Plain data."""
+        return {**asdict(self), "uncertainty_ms": self.uncertainty_ms, "claim": self.claimed}
+
+
+# ---- Pings of an agent and what their answers tell: the round trip, and the edge's clock.
+
+_UNDER_WAY = 16
+
+
+class Pings:
+    """`clock` is that of the edge's present life."""
+
+    def __init__(self, link: LinkConfig, clock: ClockConfig) -> None:
+        self.clock = ClockFilter(clock)
+        self._every = Every(link.ping_s)
+        self._sequence = 0
+        self._under_way: deque[Ping] = deque(maxlen=_UNDER_WAY)
+
+    def due(self, now_ns: int) -> Ping | None:
+        """The ping that goes now."""
+        if not self._every.due(now_ns):
+            return None
+        self._sequence += 1
+        self._under_way.append(Ping(self._sequence, now_ns))
+        return self._under_way[-1]
+
+    def answers(self, pong: Pong) -> bool:
+        """Whether it answers a ping that waits; that waits no longer."""
+        ping = Ping(pong.sequence, pong.sent_ns)
+        known = ping in self._under_way
+        if known:
+            self._under_way.remove(ping)
+        return known
+
+    def measure(self, pong: Pong, now_ns: int) -> None:
+        """An answer, which came at `now_ns`, of the present life."""
+        self.clock.update(pong.sent_ns, pong.received_ns, pong.replied_ns, now_ns)
+
+    def begin(self) -> None:
+        """A new life of the edge: another clock."""
+        self.clock.reset()
+        self._under_way.clear()

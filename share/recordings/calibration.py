@@ -1,0 +1,330 @@
+"""Calibration files to a `Rig`: Kalibr's chains, EuRoC's sensor.yaml, and camera.yaml of RGB-D folders.
+
+The body is the IMU's frame where there is an IMU, else cam0's. Cameras are pinhole with
+radial-tangential or equidistant (fisheye) distortion or none; other models are refused by name. The files
+are written down in docs/data.md.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from share.errors import ConfigError
+from share.files.yaml_file import Section, read_yaml
+from share.geometry import se3
+from share.geometry.camera import MOST_TIMESHIFT_S, Camera, ImuNoise, Rig
+from share.geometry.lens import COUNTS, EQUIDISTANT, RADTAN
+from share.types import F64
+
+CAMCHAIN = "kalibr_imucam_chain.yaml"
+IMU_CHAIN = "kalibr_imu_chain.yaml"
+_MODELS = dict.fromkeys(("radtan", "radial-tangential", "plumb_bob"), RADTAN)  # by their names in files
+_MODELS |= dict.fromkeys(("equidistant", "kannala_brandt", "fisheye"), EQUIDISTANT)
+TIMESHIFT = "timeshift_cam_imu"
+SERIAL = "serial"
+_AGREE_S = 1e-3  # timeshifts of two cameras that look together
+_DEPTH_SCALE = 1000.0  # 16-bit depth in millimetres, as ROS and RealSense have it
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A rig and what else its file says. topics: stream -> ROS topic; depth_scale: units per metre; eyes: of
+    cam0 and cam1, as they were read; serials: of the devices that it says it is of, each once."""
+
+    rig: Rig
+    where: str
+    depth_scale: float = _DEPTH_SCALE
+    topics: dict[str, str] = field(default_factory=dict)
+    eyes: tuple[Section, ...] = ()
+    serials: tuple[str, ...] = ()
+
+    @property
+    def T_imu_cam0(self) -> F64 | None:
+        """(4, 4) as the file says, also without an IMU chain beside it. Raises ConfigError."""
+        told = self.eyes and {"T_cam_imu", "T_imu_cam"} & self.eyes[0].data.keys()
+        return kalibr_T_imu_cam(self.eyes[0]) if told else None
+
+    @property
+    def timeshift_s(self) -> float:
+        """IMU time less camera time, s, likewise. Raises ConfigError."""
+        return _timeshift_s(self.eyes)
+
+
+def read_calibration(path: Path) -> Calibration:
+    """A Kalibr camchain file, a folder with both Kalibr chains, or a camera.yaml. Raises ConfigError."""
+    if path.is_dir():
+        if not (path / CAMCHAIN).exists():
+            raise ConfigError(f"{path}: has no {CAMCHAIN}; give a Kalibr camchain file or a folder with one")
+        imu = path / IMU_CHAIN
+        return read_kalibr(path / CAMCHAIN, imu if imu.exists() else None)
+    top = read_yaml(path)
+    return read_kalibr(path) if "cam0" in top else read_camera_yaml(path)
+
+
+def read_kalibr(path: Path, imu_path: Path | None = None) -> Calibration:
+    """Kalibr's camchain and, if given, IMU chain. Without the latter the rig has no IMU, body = cam0."""
+    return kalibr(read_yaml(path), read_yaml(imu_path).section("imu0") if imu_path else None)
+
+
+def kalibr(chain: Section, imu: Section | None) -> Calibration:
+    """The rig of a camchain (cam0, cam1 and, ours alone, depth) and an IMU chain's imu0."""
+    cams = {name: chain.section(name) for name in ("cam0", "cam1", "depth") if name in chain}
+    cam0 = chain.section("cam0")
+    eyes = tuple(cams[name] for name in ("cam0", "cam1") if name in cams)
+    rig = Rig(
+        cam0=_camera(cam0),
+        T_body_cam0=kalibr_T_imu_cam(cam0) if imu else np.eye(4),
+        imu=imu_noise(imu, "update_rate") if imu else None,
+        timeshift_s=_timeshift_s(eyes) if imu else 0.0,
+    )
+    if "cam1" in cams:
+        T_cam1_cam0 = _kalibr_T_cam1_cam0(cam0, cams["cam1"])
+        with said_of(cams["cam1"].where):
+            rig = replace(rig, cam1=_camera(cams["cam1"]), T_cam1_cam0=T_cam1_cam0)
+    scale = _DEPTH_SCALE
+    if "depth" in cams:
+        depth = cams["depth"]
+        rig = replace(rig, depth=_camera(depth), T_depth_cam0=depth.pose("T_depth_cam0"))
+        scale = depth.number("depth_scale", _DEPTH_SCALE, positive=True)
+    named = cams | ({"imu": imu} if imu else {})
+    topics = {name: section.text("rostopic", "") for name, section in named.items()}
+    told = {k: v for k, v in topics.items() if v}
+    return Calibration(rig, chain.where, scale, told, eyes, serials(named.values()))
+
+
+def serials(sections: Iterable[Section]) -> tuple[str, ...]:
+    """Of which devices they say to be, each once (ours alone: Kalibr reads past it). Raises ConfigError."""
+    said = (_serial(section) for section in sections if section.data.get(SERIAL) not in (None, ""))
+    return tuple(dict.fromkeys(said))
+
+
+def _serial(section: Section) -> str:
+    found = section.get(SERIAL)
+    if not isinstance(found, str):
+        raise ConfigError(f"{section.where}: {SERIAL}: put it in quotes, else YAML takes it for a number")
+    if not re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", found):
+        raise ConfigError(f"{section.where}: {SERIAL}: {found!r:.40} is no serial number; leave it out")
+    return found
+
+
+@contextlib.contextmanager
+def said_of(where: str) -> Iterator[None]:
+    """What a camera or a rig cannot be is a ConfigError, with where it was found."""
+    try:
+        yield
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from None
+
+
+def read_camera_yaml(path: Path) -> Calibration:
+    """camera.yaml of a TUM RGB-D folder: one colour camera and its depth, registered or not."""
+    top = read_yaml(path)
+    cam0 = _camera(top)
+    if "depth_intrinsics" in top:
+        fx, fy, cx, cy = top.numbers("depth_intrinsics", (4,))
+        width, height = _resolution(top, "depth_resolution" if "depth_resolution" in top else "resolution")
+        depth, T = _make(top, width, height, (fx, fy, cx, cy)), top.pose("T_depth_cam0")
+    else:  # registered: depth lies on the pixels of the undistorted colour image
+        depth, T = replace(cam0, distortion=(), model=RADTAN), np.eye(4)
+    rig = Rig(cam0=cam0, T_body_cam0=np.eye(4), depth=depth, T_depth_cam0=T)
+    return Calibration(rig, str(path), top.number("depth_scale", positive=True), eyes=(top,))
+
+
+def read_euroc(cam0: Path, cam1: Path | None, imu0: Path | None) -> Calibration:
+    """sensor.yaml files of an ASL folder. T_BS of every sensor is taken into the IMU's frame."""
+    section = read_yaml(cam0)
+    T_b_cam0 = section.pose("T_BS")
+    rig = Rig(cam0=_camera(section), T_body_cam0=np.eye(4))
+    if cam1:
+        other = read_yaml(cam1)
+        T_cam1_cam0 = se3.inverse(other.pose("T_BS")) @ T_b_cam0
+        with said_of(other.where):
+            rig = replace(rig, cam1=_camera(other), T_cam1_cam0=T_cam1_cam0)
+    if imu0:
+        imu = read_yaml(imu0)
+        T_imu_cam0 = se3.inverse(imu.pose("T_BS")) @ T_b_cam0
+        rig = replace(rig, imu=imu_noise(imu, "rate_hz"), T_body_cam0=T_imu_cam0)
+    return Calibration(rig, str(cam0))
+
+
+def _camera(section: Section) -> Camera:
+    model = section.text("camera_model", "pinhole")
+    if model != "pinhole":
+        raise ConfigError(f"{section.where}: camera_model '{model}' is not supported; supported: pinhole")
+    fx, fy, cx, cy = section.numbers("intrinsics", (4,))
+    width, height = _resolution(section, "resolution")
+    return _make(section, width, height, (fx, fy, cx, cy), *_distortion(section))
+
+
+def _make(
+    section: Section,
+    width: int,
+    height: int,
+    intrinsics: tuple[float, float, float, float],
+    distortion: tuple[float, ...] = (),
+    model: str = RADTAN,
+) -> Camera:
+    with said_of(section.where):
+        return Camera(width, height, *intrinsics, distortion, model)
+
+
+def _resolution(section: Section, key: str) -> tuple[int, int]:
+    width, height = section.numbers(key, (2,))
+    if not (width.is_integer() and height.is_integer()):
+        raise ConfigError(f"{section.where}: {key}: expected whole numbers, found {width:g} and {height:g}")
+    return int(width), int(height)
+
+
+def _distortion(section: Section) -> tuple[tuple[float, ...], str]:
+    """Coefficients and model."""
+    named = section.text("distortion_model", "none")
+    if named == "none":
+        return (), RADTAN
+    model = lens_model(named)
+    if model is None:
+        raise ConfigError(
+            f"{section.where}: distortion_model '{named}' is not supported; supported: {', '.join(_MODELS)}, "
+            "none (calibrate again with one of these)"
+        )
+    key = "distortion_coeffs" if "distortion_coeffs" in section else "distortion_coefficients"
+    return tuple(section.numbers(key, tuple(n for n in COUNTS[model] if n))), model
+
+
+def lens_model(named: str) -> str | None:
+    """The model (`share.geometry.lens`) that files give this name; None where there is none."""
+    return _MODELS.get(named)
+
+
+def imu_noise(section: Section, rate: str) -> ImuNoise:
+    """An IMU's noise by Kalibr's keys; `rate` is the key of its rate in Hz. Raises ConfigError."""
+
+    def positive(key: str) -> float:
+        return section.number(key, positive=True)
+
+    try:
+        return ImuNoise(
+            gyro_density=positive("gyroscope_noise_density"),
+            accel_density=positive("accelerometer_noise_density"),
+            gyro_walk=positive("gyroscope_random_walk"),
+            accel_walk=positive("accelerometer_random_walk"),
+            rate_hz=positive(rate),
+        )
+    except ValueError as error:
+        raise ConfigError(f"{section.where}: {error}") from None
+
+
+def kalibr_T_imu_cam(cam: Section) -> F64:
+    """`T_cam_imu` takes IMU coordinates to the camera (Kalibr's own); `T_imu_cam` the other way."""
+    if "T_cam_imu" in cam:
+        return se3.inverse(cam.pose("T_cam_imu"))
+    if "T_imu_cam" in cam:
+        return cam.pose("T_imu_cam")
+    raise ConfigError(f"{cam.where}: has no extrinsics to the IMU; add T_cam_imu (or T_imu_cam)")
+
+
+def _timeshift_s(cams: Sequence[Section]) -> float:
+    """IMU time less camera time, s: the mean of what the cameras say, 0 where they say nothing."""
+    said = [_one_timeshift_s(cam) for cam in cams if TIMESHIFT in cam]
+    if said and max(said) - min(said) > _AGREE_S:
+        raise ConfigError(
+            f"{cams[-1].where}: {TIMESHIFT}: {said[-1]:g} s, but {said[0]:g} s of cam0; both look at "
+            f"the same time, so these must agree within {_AGREE_S:g} s"
+        )
+    return float(np.mean(said)) if said else 0.0
+
+
+def _one_timeshift_s(cam: Section) -> float:
+    shift = cam.number(TIMESHIFT)
+    if abs(shift) > MOST_TIMESHIFT_S:
+        raise ConfigError(
+            f"{cam.where}: {TIMESHIFT}: {shift:g} s is more than {MOST_TIMESHIFT_S:g} s; "
+            "it is given in seconds"
+        )
+    return shift
+
+
+def _kalibr_T_cam1_cam0(cam0: Section, cam1: Section) -> F64:
+    """`T_cn_cnm1` takes coordinates of the previous camera, cam0, to cam1; else by way of the IMU."""
+    if "T_cn_cnm1" in cam1:
+        return cam1.pose("T_cn_cnm1")
+    if not ({"T_cam_imu", "T_imu_cam"} & cam1.data.keys()):
+        raise ConfigError(f"{cam1.where}: has no extrinsics to cam0; add T_cn_cnm1, T_cam_imu or T_imu_cam")
+    return se3.inverse(kalibr_T_imu_cam(cam1)) @ kalibr_T_imu_cam(cam0)
+
+
+# ---- A rig written under Kalibr's names, as `share.recordings.calibration` reads it.
+
+
+def to_kalibr(rig: Rig, said: Calibration | None = None, serial: str | None = None) -> dict[str, Any]:
+    """cam0, cam1, depth (ours) and imu0 of the rig, as plain data for a YAML file.
+
+    said: what the rig was known by before. Of that is kept what no Rig holds: topics, depth_scale and, for a
+    rig without IMU, how cam0 sits on one and how late their clock is. serial: of the device, in each section:
+    Kalibr takes every key at the top for a camera. Raises ConfigError.
+    """
+    said = said or Calibration(rig, "")
+    T_imu_cam0, shift_s = (
+        (said.T_imu_cam0, said.timeshift_s) if rig.imu is None else (rig.T_body_cam0, rig.timeshift_s)
+    )
+    shift = {TIMESHIFT: shift_s} if shift_s else {}  # 0 is what its absence means
+    out = {"cam0": _kalibr_camera(rig.cam0) | shift}
+    if T_imu_cam0 is not None:
+        out["cam0"]["T_cam_imu"] = se3.inverse(T_imu_cam0).tolist()
+    if rig.imu is not None:
+        out["imu0"] = _imu(rig.imu)
+    if rig.cam1 is not None and rig.T_cam1_cam0 is not None:
+        out["cam1"] = _kalibr_camera(rig.cam1) | shift | {"T_cn_cnm1": rig.T_cam1_cam0.tolist()}
+    if rig.depth is not None and rig.T_depth_cam0 is not None:
+        T = rig.T_depth_cam0.tolist()
+        out["depth"] = _kalibr_camera(rig.depth) | {"T_depth_cam0": T, "depth_scale": said.depth_scale}
+    for stream, topic in said.topics.items():
+        name = "imu0" if stream == "imu" else stream
+        if name in out:
+            out[name]["rostopic"] = topic
+    return {name: section | ({SERIAL: serial} if serial else {}) for name, section in out.items()}
+
+
+def kalibr_texts(rig: Rig, remark: str, serial: str | None = None) -> dict[str, str]:
+    """Both of Kalibr's chains, by the names of their files; one where the rig has no IMU. remark: a line;
+    serial: of the device."""
+    import yaml
+
+    data = to_kalibr(rig, serial=serial)
+    parts = {CAMCHAIN: {k: v for k, v in data.items() if k != "imu0"}}
+    if "imu0" in data:
+        parts[IMU_CHAIN] = {"imu0": data["imu0"]}
+    return {
+        name: f"# {remark}\n" + yaml.safe_dump(part, sort_keys=False, default_flow_style=None)
+        for name, part in parts.items()
+    }
+
+
+def _kalibr_camera(camera: Camera) -> dict[str, Any]:
+    distortion = (
+        {"distortion_model": camera.model, "distortion_coeffs": list(camera.distortion)}
+        if camera.distortion
+        else {"distortion_model": "none"}
+    )
+    return {
+        "camera_model": "pinhole",
+        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+        **distortion,
+        "resolution": [camera.width, camera.height],
+    }
+
+
+def _imu(imu: ImuNoise) -> dict[str, Any]:
+    return {
+        "gyroscope_noise_density": imu.gyro_density,
+        "gyroscope_random_walk": imu.gyro_walk,
+        "accelerometer_noise_density": imu.accel_density,
+        "accelerometer_random_walk": imu.accel_walk,
+        "update_rate": imu.rate_hz,
+    }

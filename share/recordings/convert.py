@@ -1,0 +1,178 @@
+"""A source to a recording of ours, or to an EuRoC/ASL folder. Encoded images are copied, not recoded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from share.errors import DataError, MisfitError, UsageError
+from share.files.writing import atomic_write, check_replaceable, new_folder
+from share.geometry import se3
+from share.geometry.camera import Camera, ImuNoise
+from share.geometry.lens import EQUIDISTANT
+from share.recordings.images import EncodedImage, encode_png, image_format
+from share.recordings.mcap import rig as ros_rig
+from share.recordings.mcap.recorder import Recorder
+from share.recordings.recording import Source
+from share.recordings.trajectory import Trajectory, format_tum
+from share.sensors.measurement import CAM0, CAM1, IMU, LazyImage, Measurement
+from share.types import F64
+
+Progress = Callable[[int], None]
+Told = Callable[[str, int, int], None]  # stage, done, of how many
+
+
+def counting(told: Told, stage: str, total: int) -> Progress:
+    """What is told how much more is done, and tells how much is."""
+    done = 0
+
+    def more(count: int) -> None:
+        nonlocal done
+        done += count
+        told(stage, done, total)
+
+    return more
+
+
+def to_mcap(source: Source, out: Path, jpeg: int | None, progress: Progress) -> None:
+    """Write `out`, and the truth, if known, as NAME.truth.tum beside it. On error: nothing.
+
+    jpeg: quality to compress gray images to, None to keep them. progress: told of each cam0 image.
+    """
+    write_recording(source, out, jpeg, progress)
+    truth = source.truth()
+    if truth is not None:
+        atomic_write(out.with_name(out.stem + ".truth.tum"), format_tum(truth))
+
+
+def write_recording(source: Source, out: Path, jpeg: int | None, progress: Progress) -> None:
+    """`to_mcap` without the truth."""
+    check_replaceable(out)
+    try:
+        with Recorder(out, source.rig, jpeg, serial=source.serial) as recorder:
+            for measurement in _counted(source, progress):
+                recorder.write(measurement)
+    except BaseException:  # also Ctrl-C
+        out.with_name(out.name + ".part").unlink(missing_ok=True)
+        raise
+
+
+def to_euroc(source: Source, out: Path, progress: Progress) -> None:
+    """Write a stereo or mono source as `out`/mav0. On error: nothing. Raises UsageError."""
+    if source.rig.depth:
+        raise UsageError("--format euroc: an ASL folder has no place for depth images; use mcap")
+    if source.rig.timeshift_s:
+        raise UsageError("--format euroc: an ASL folder has no place for the cameras' timeshift; use mcap")
+    with new_folder(out) as work:
+        _write_asl(source, work / "mav0", progress)
+
+
+def _counted(source: Source, progress: Progress) -> Iterator[Measurement]:
+    """All measurements but images that are damaged; of each camera they are decoded until one is whole, to
+    find a wrong size before the end."""
+    tried = set()
+    for measurement in source.measurements():
+        stream, image = measurement.stream, measurement.payload
+        try:
+            if stream != IMU and stream not in tried:
+                image.load()
+                tried.add(stream)
+            elif isinstance(image, EncodedImage):
+                image.check()
+        except MisfitError:
+            raise
+        except DataError as error:
+            source.losses.add(what := f"images of {stream}", str(measurement.stamp_ns), str(error))
+            source.losses.check(what, source.images_count)
+            continue
+        yield measurement
+        if measurement.stream == CAM0:
+            progress(1)
+
+
+def _write_asl(source: Source, root: Path, progress: Progress) -> None:
+    rig, listings = source.rig, {}
+    T_imu = {CAM0: rig.T_body_cam0}
+    if rig.T_cam1_cam0 is not None:
+        T_imu[CAM1] = rig.T_body_cam0 @ se3.inverse(rig.T_cam1_cam0)
+    for stream, camera in ros_rig.cameras(rig).items():
+        (root / stream / "data").mkdir(parents=True)
+        (root / stream / "sensor.yaml").write_text(_camera_yaml(camera, T_imu[stream], source.rate_hz))
+        listings[stream] = ["#timestamp [ns],filename"]
+    if rig.imu:
+        (root / "imu0").mkdir()
+        (root / "imu0" / "sensor.yaml").write_text(_imu_yaml(rig.imu))
+        listings["imu0"] = ["#timestamp [ns],w_x,w_y,w_z [rad s^-1],a_x,a_y,a_z [m s^-2]"]
+    for m in _counted(source, progress):
+        if m.stream == IMU:
+            listings["imu0"].append(f"{m.stamp_ns},{_numbers(m.payload)}")
+        else:
+            name = _write_image(root / m.stream / "data", m.stamp_ns, m.payload)
+            listings[m.stream].append(f"{m.stamp_ns},{name}")
+    for stream, lines in listings.items():
+        (root / stream / "data.csv").write_text("\n".join(lines) + "\n")
+    truth = source.truth()
+    if truth is not None:
+        _write_truth(root / "state_groundtruth_estimate0", truth)
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return ",".join(repr(float(value)) for value in values)
+
+
+def _write_image(folder: Path, stamp: int, image: LazyImage) -> str:
+    """As it is if encoded, else PNG."""
+    data = image.read() if isinstance(image, EncodedImage) else encode_png(image.load())
+    name = f"{stamp}.{image_format(data)}"
+    (folder / name).write_bytes(data)
+    return name
+
+
+def _write_truth(folder: Path, truth: Trajectory) -> None:
+    folder.mkdir()
+    q = se3.quat_from_matrix(truth.T[:, :3, :3])[:, [3, 0, 1, 2]]
+    values = np.concatenate([truth.T[:, :3, 3], q], axis=1)
+    lines = [f"{t},{_numbers(row)}\n" for t, row in zip(truth.stamps_ns.tolist(), values, strict=True)]
+    (folder / "data.csv").write_text("#timestamp [ns],p_x,p_y,p_z [m],q_w,q_x,q_y,q_z\n" + "".join(lines))
+
+
+def _yaml(values: dict[str, object]) -> str:
+    import yaml
+
+    return "%YAML:1.0\n" + yaml.safe_dump(values, sort_keys=False, default_flow_style=None)
+
+
+def _pose(T: F64) -> dict[str, object]:
+    return {"rows": 4, "cols": 4, "data": T.reshape(-1).tolist()}
+
+
+def _camera_yaml(camera: Camera, T_bs: F64, rate_hz: float) -> str:
+    named = EQUIDISTANT if camera.fisheye else "radial-tangential"
+    distortion = {"distortion_model": named, "distortion_coefficients": list(camera.distortion)}
+    return _yaml(
+        {
+            "sensor_type": "camera",
+            "T_BS": _pose(T_bs),
+            "rate_hz": rate_hz,
+            "resolution": [camera.width, camera.height],
+            "camera_model": "pinhole",
+            "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+            **(distortion if camera.distortion else {"distortion_model": "none"}),
+        }
+    )
+
+
+def _imu_yaml(imu: ImuNoise) -> str:
+    return _yaml(
+        {
+            "sensor_type": "imu",
+            "T_BS": _pose(np.eye(4)),
+            "rate_hz": imu.rate_hz,
+            "gyroscope_noise_density": imu.gyro_density,
+            "gyroscope_random_walk": imu.gyro_walk,
+            "accelerometer_noise_density": imu.accel_density,
+            "accelerometer_random_walk": imu.accel_walk,
+        }
+    )

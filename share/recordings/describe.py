@@ -1,0 +1,80 @@
+"""What is in a recording, as plain data: `share dataset info`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from share.geometry.camera import Camera, Rig
+from share.recordings.recording import Source
+from share.types import I64
+
+_GAP_FACTOR = 2.5  # as the sequencer's
+
+
+def describe(source: Source) -> dict[str, Any]:
+    """Streams with counts, rates and gaps; calibration; truth. Reads stamps only, no images."""
+    stamps = source.stamps()
+    first = min((int(s[0]) for s in stamps.values() if len(s)), default=0)
+    last = max((int(s.max()) for s in stamps.values() if len(s)), default=0)
+    return {
+        "name": source.name,
+        "kind": source.rig.kind,
+        "serial": source.serial,
+        "duration_s": (last - first) / 1e9,
+        "start_ns": first,
+        "streams": {name: describe_stream(s) for name, s in stamps.items()},
+        "calibration": describe_rig(source.rig),
+        "truth": _truth(source),
+        "notes": [*source.notes, *source.losses.lines()],
+    }
+
+
+def describe_stream(stamps: I64) -> dict[str, Any]:
+    """Count, median rate, gaps longer than 2.5 median steps, stamps that repeat or go back."""
+    steps = np.diff(stamps)
+    forward = steps[steps > 0]
+    median = float(np.median(forward)) if len(forward) else 0.0
+    gaps = forward[forward > _GAP_FACTOR * median]
+    return {
+        "count": len(stamps),
+        "rate_hz": round(1e9 / median, 3) if median else 0.0,
+        "gaps": len(gaps),
+        "longest_gap_s": round(float(gaps.max()) / 1e9, 6) if len(gaps) else 0.0,
+        "duplicates": int((steps == 0).sum()),
+        "backward": int((steps < 0).sum()),
+    }
+
+
+def describe_rig(rig: Rig) -> dict[str, Any]:
+    """Cameras and IMU in short: resolution, focal length, field of view, baseline."""
+    cameras = {"cam0": rig.cam0, "cam1": rig.cam1, "depth": rig.depth}
+    out: dict[str, Any] = {name: _camera(camera) for name, camera in cameras.items() if camera}
+    if rig.cam1:
+        out["baseline_m"] = round(rig.baseline, 6)
+    if rig.imu:
+        out["imu"] = {name: getattr(rig.imu, name) for name in rig.imu.__dataclass_fields__}
+        out["timeshift_s"] = rig.timeshift_s
+    return out
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    return {
+        "resolution": [camera.width, camera.height],
+        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+        "distortion": list(camera.distortion),
+        "lens": camera.model,
+        "fov_deg": round(float(np.degrees(camera.field_rad[0])), 1),
+    }
+
+
+def _truth(source: Source) -> dict[str, Any] | None:
+    truth = source.truth()
+    if truth is None:
+        return None
+    return {
+        "poses": len(truth.stamps_ns),
+        "length_m": round(truth.metres, 3),
+        "duration_s": float(truth.stamps_ns[-1] - truth.stamps_ns[0]) / 1e9,
+    }

@@ -1,0 +1,204 @@
+"""One MCAP file, read by its index: never more than a few chunks in memory."""
+
+from __future__ import annotations
+
+import heapq
+import struct
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+
+from share.errors import DataError, UsageError
+from share.files.reading import open_regular
+from share.recordings.losses import Losses
+from share.recordings.mcap.chunks import MOST_HELD, Within, read_summary, records_of
+from share.types import I64
+
+MAGIC = b"\x89MCAP0\r\n"
+_MESSAGE_INDEX = 0x07
+_RECORD_HEADER = struct.Struct("<BQ")
+_INDEX_HEADER = struct.Struct("<HI")  # channel id, bytes of entries
+
+
+class Topic(NamedTuple):
+    """kind: ROS message type, e.g. sensor_msgs/msg/Image."""
+
+    name: str
+    kind: str
+    channels: tuple[int, ...]
+
+
+def damage() -> tuple[type[Exception], ...]:
+    """What the mcap library raises on a damaged file, and the system on a damaged disk."""
+    import zstandard
+    from mcap.exceptions import McapError
+    from mcap.stream_reader import CRCValidationError
+
+    return (McapError, CRCValidationError, zstandard.ZstdError, ValueError, IndexError, zlib.error,
+            struct.error, UnicodeDecodeError, EOFError, RuntimeError, KeyError, OverflowError, OSError,
+            MemoryError)  # fmt: skip
+
+
+def check_magic(path: Path) -> None:
+    """Raises UsageError for a file that cannot be read, DataError for one that is no MCAP."""
+    try:
+        with open_regular(path) as file:
+            head = file.read(len(MAGIC))
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    if head != MAGIC:
+        raise DataError(f"{path}: is not an MCAP file, or is empty")
+
+
+class McapFile:
+    """Opened anew for every pass. Raises DataError if it was not closed in good order or is damaged."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        check_magic(path)
+        self._check_index()
+
+    @cached_property
+    def topics(self) -> dict[str, Topic]:
+        """By name; only those in CDR."""
+        found: dict[str, Topic] = {}
+        for channel in self._summary.channels.values():
+            schema = self._summary.schemas.get(channel.schema_id)
+            if channel.message_encoding == "cdr" and schema is not None:
+                known = found.get(channel.topic)
+                ids = (*known.channels, channel.id) if known else (channel.id,)
+                found[channel.topic] = Topic(channel.topic, schema.name, ids)
+        return found
+
+    @cached_property
+    def log_times(self) -> dict[str, I64]:
+        """Stamps (N,) ns of each topic's messages as logged, in order; read from the index alone."""
+        per_channel: dict[int, list[I64]] = {}
+        with open_regular(self.path) as file:
+            for chunk in self._summary.chunk_indexes:
+                for channel, offset in chunk.message_index_offsets.items():
+                    per_channel.setdefault(channel, []).append(self._read_index(file, offset))
+        return {
+            topic.name: np.sort(
+                np.concatenate([t for c in topic.channels for t in per_channel.get(c, [_NONE])])
+            )
+            for topic in self.topics.values()
+        }
+
+    def metadata(self, name: str) -> dict[str, str]:
+        """The metadata record `name`, or {}."""
+        return dict(self._metadata.get(name, {}))
+
+    @cached_property
+    def _metadata(self) -> dict[str, dict[str, str]]:
+        """By name; of several the last."""
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Metadata
+
+        places = {index.name: index.offset for index in self._summary.metadata_indexes}
+        found: dict[str, dict[str, str]] = {}
+        with open_regular(self.path) as file:
+            for name, offset in places.items():
+                file.seek(offset + _RECORD_HEADER.size)
+                found[name] = Metadata.read(ReadDataStream(Within(file))).metadata
+        return found
+
+    def messages(
+        self,
+        topics: Iterable[str],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        losses: Losses | None = None,
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """(topic, log time, CDR bytes) in order of log time, within [start_ns, end_ns). losses: takes chunks
+        that are damaged. Raises DataError where that is not given, or more than 5 % are."""
+        channels = {id: name for name in topics if name in self.topics for id in self.topics[name].channels}
+        lo, hi = start_ns or 0, 2**64 if end_ns is None else end_ns
+        waiting: list[tuple[int, int, int, Any]] = [  # by time, then where it stands in the file
+            (chunk.message_start_time, chunk.chunk_start_offset, -1, chunk)
+            for chunk in self._summary.chunk_indexes
+            if chunk.message_end_time >= lo and chunk.message_start_time < hi and _has(chunk, channels)
+        ]
+        heapq.heapify(waiting)
+        total, held = len(waiting), 0
+        with open_regular(self.path) as file:
+            while waiting:
+                at_ns, place, number, item = heapq.heappop(waiting)
+                if number >= 0:
+                    held -= len(item.data)
+                    yield channels[item.channel_id], at_ns, item.data
+                    continue
+                for k, message in self._chunk(file, item, losses, total):
+                    if message.channel_id in channels and lo <= message.log_time < hi:
+                        held += len(message.data)
+                        heapq.heappush(waiting, (message.log_time, place, k, message))
+                if held > MOST_HELD:
+                    raise self._broken("too many of its chunks are of one time")
+
+    def _chunk(
+        self, file: IO[bytes], index: Any, losses: Losses | None, total: int
+    ) -> Iterator[tuple[int, Any]]:
+        """Messages of a chunk and their places in it."""
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Chunk, Message
+
+        try:
+            file.seek(index.chunk_start_offset + _RECORD_HEADER.size)
+            records = records_of(Chunk.read(ReadDataStream(Within(file))))
+        except damage() as error:
+            broken = self._broken(str(error) or type(error).__name__)
+            if losses is None:
+                raise broken from None
+            losses.add(what := f"chunks of {self.path}", str(index.chunk_start_offset), str(broken))
+            losses.check(what, total)
+            return
+        yield from ((k, record) for k, record in enumerate(records) if isinstance(record, Message))
+
+    @cached_property
+    def _summary(self) -> Any:
+        with open_regular(self.path) as file:
+            try:
+                return read_summary(file)
+            except damage():  # OSError: it is shorter than a footer
+                raise self._broken("it has no end") from None
+
+    def _check_index(self) -> None:
+        summary = self._summary
+        if summary is None or (not summary.chunk_indexes and _message_count(summary) != 0):
+            raise self._broken("it has no index")
+
+    def _broken(self, reason: str) -> DataError:
+        return DataError(
+            f"{self.path}: is damaged or was not closed in good order ({reason}); "
+            f"try `share dataset recover {self.path} --out GOOD.mcap`"
+        )
+
+    def _read_index(self, file: IO[bytes], offset: int) -> I64:
+        """Log times of one MessageIndex record (MCAP specification, op 0x07)."""
+        file.seek(offset)
+        head = file.read(_RECORD_HEADER.size + _INDEX_HEADER.size)
+        try:
+            opcode, _ = _RECORD_HEADER.unpack_from(head)
+            _, size = _INDEX_HEADER.unpack_from(head, _RECORD_HEADER.size)
+        except struct.error:
+            raise self._broken("its index ends too soon") from None
+        data = Within(file).read(size)
+        if opcode != _MESSAGE_INDEX or len(data) != size or size % 16:
+            raise self._broken("its index is wrong")
+        return np.frombuffer(data, "<i8").reshape(-1, 2)[:, 0].astype(np.int64)
+
+
+_NONE = np.zeros(0, np.int64)
+
+
+def _has(chunk: Any, channels: Mapping[int, str]) -> bool:
+    """Whether a chunk may have messages of these; one without an index may have any."""
+    return not chunk.message_index_offsets or any(id in channels for id in chunk.message_index_offsets)
+
+
+def _message_count(summary: Any) -> int | None:
+    return None if summary.statistics is None else int(summary.statistics.message_count)

@@ -1,0 +1,190 @@
+"""Recordings as MCAP with ROS 2 messages: Foxglove, rosbags and ROS 2 open them as they are.
+
+Topics are those of `share.recordings.mcap.types.TOPICS`. The file grows under a temporary name (`.part`) in
+chunks of at most 256 kB (or one image), and gets its name when it is closed in good order. What a
+crash leaves in the `.part`, `share.recordings.mcap.recover` brings back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from share.errors import DataError, UsageError
+from share.files.writing import check_replaceable, fresh, sync_folder, writing
+from share.geometry.camera import Rig
+from share.recordings.images import EncodedImage, encode_jpeg
+from share.recordings.mcap import images as ros_images
+from share.recordings.mcap import rig as ros_rig
+from share.recordings.mcap import types as ros
+from share.sensors.measurement import DEPTH, IMU, Measurement
+from share.types import F64
+
+CHUNK_BYTES = 256 * 1024
+_FLUSH_NS = 10**9  # a crash costs at most this much
+_FOREVER = "{sec: 9223372036, nsec: 854775807}"
+_LATCHED = {  # transient local, so that a player hands it to those who come later
+    "offered_qos_profiles": "- {history: 1, depth: 1, reliability: 1, durability: 1, "
+    f"deadline: {_FOREVER}, lifespan: {_FOREVER}, liveliness: 1, "
+    f"liveliness_lease_duration: {_FOREVER}, avoid_ros_namespace_conventions: false}}\n"
+}
+
+
+def part_of(path: Path) -> Path:
+    """The name under which the recording `path` grows."""
+    return path.with_name(path.name + ".part")
+
+
+def left_over(part: Path) -> UsageError:
+    """For who would overwrite the `.part` of another recording."""
+    return UsageError(
+        f"{part}: is left of a recording that was cut off (or one is going on there); save it with "
+        f"`share dataset recover {part} --out {part.with_suffix('')}`, or give a new name"
+    )
+
+
+class Recorder:
+    """Writes measurements to an MCAP file. Context manager; an exception inside leaves the `.part`.
+
+    jpeg: quality to which gray images are compressed; None keeps encoded images byte for byte and
+    raw ones raw. durable: of what cannot be made again: survives a power cut, at the price of one fdatasync
+    a second, and overwrites no `.part`. serial: of the device. Raises UsageError if the file cannot be made.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        rig: Rig,
+        jpeg: int | None = None,
+        durable: bool = False,
+        serial: str | None = None,
+    ) -> None:
+        from mcap.writer import Writer
+
+        self.path, self.part = check_replaceable(path), part_of(path)
+        self._rig, self._jpeg, self._durable = rig, jpeg, durable
+        try:
+            self._file = self.part.open("xb") if durable else fresh(self.part)
+        except FileExistsError:
+            raise left_over(self.part) from None
+        except OSError as error:
+            raise UsageError(f"{self.part}: cannot be written: {error.strerror}") from None
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
+        self._writer.start(profile="ros2", library="share")
+        about = {"rig": ros_rig.to_json(rig), "schema": "1"} | ({"serial": serial} if serial else {})
+        self._writer.add_metadata(ros.RIG_RECORD, about)
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._counts: dict[str, int] = {}
+        self._flushed_ns: int | None = None
+        self._log_ns = 0
+
+    def write(self, measurement: Measurement, log_ns: int | None = None) -> None:
+        """Append one measurement. log_ns: what readers sort by, where the stamps wrap; else the stamp.
+        Raises DataError for a stamp before 1970 or after 2038, ShareError if the disk is full."""
+        stamp = measurement.stamp_ns
+        self._log_ns = stamp if log_ns is None else log_ns
+        if not 0 <= stamp < 2**31 * 10**9:
+            raise DataError(f"{self.path}: stamp {stamp} ns does not fit a ROS 2 message")
+        with writing(self.path):
+            if self._flushed_ns is None:
+                self._write_rig(stamp)
+            if measurement.stream == IMU:
+                self._put(ros.TOPICS[IMU], _imu(stamp, measurement.payload))
+            else:
+                self._image(measurement.stream, stamp, measurement.payload)
+            if self._flushed_ns is None or self._log_ns - self._flushed_ns >= _FLUSH_NS:
+                self._flush(self._log_ns)
+
+    def close(self) -> None:
+        """Finish the file and give it its name."""
+        with writing(self.path):
+            self._writer.finish()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            os.replace(self.part, self.path)
+        sync_folder(self.path.parent)
+
+    def abort(self) -> None:
+        """Stop here; the `.part` stays, with all that was written."""
+        with contextlib.suppress(OSError):  # a full disk has been told already
+            self._writer.flush()
+        with contextlib.suppress(OSError):
+            self._file.close()
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.abort()
+
+    def _image(self, stream: str, stamp: int, image: Any) -> None:
+        header, is_depth, topic = ros.header(stamp, stream), stream == DEPTH, ros.TOPICS[stream]
+        data = self._encoded(image, is_depth)
+        if data is None:
+            self._put(topic, ros_images.to_raw(header, image.load()))
+        else:
+            suffix = ros.SUFFIXES[is_depth]
+            self._put(topic + suffix, ros_images.to_compressed(header, data, is_depth))
+
+    def _encoded(self, image: Any, is_depth: bool) -> bytes | None:
+        """Bytes that can be written as they are, or None where the pixels must be written raw."""
+        if is_depth:
+            mm = isinstance(image, EncodedImage) and image.depth_scale == ros_images.MILLIMETRES
+            return image.read() if mm else None
+        if self._jpeg is not None:
+            return encode_jpeg(image.load(), self._jpeg)
+        return image.read() if isinstance(image, EncodedImage) else None
+
+    def _write_rig(self, stamp: int) -> None:
+        for stream, camera in ros_rig.cameras(self._rig).items():
+            info = ros_rig.to_camera_info(camera, ros.header(stamp, stream))
+            self._put(ros.INFO_TOPICS[stream], info)
+        self._put(ros.TF_STATIC, ros_rig.to_tf(self._rig, stamp), _LATCHED)
+
+    def _put(self, topic: str, message: Any, metadata: dict[str, str] | None = None) -> None:
+        if topic not in self._channels:
+            kind = message.__msgtype__
+            if kind not in self._schemas:
+                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", ros.schema(kind))
+            self._channels[topic] = self._writer.register_channel(
+                topic, "cdr", self._schemas[kind], metadata or {}
+            )
+        number = self._counts[topic] = self._counts.get(topic, 0) + 1
+        at = self._log_ns
+        self._writer.add_message(self._channels[topic], at, ros.encode(message), at, number)
+
+    def _flush(self, stamp: int) -> None:
+        self._flushed_ns = stamp
+        self._writer.flush()
+        if self._durable:
+            os.fdatasync(self._file.fileno())
+
+
+_UNKNOWN = np.zeros(9)
+_NO_ORIENTATION = np.array([-1.0, *[0.0] * 8])  # sensor_msgs/Imu: -1 says that there is none
+
+
+def _imu(stamp: int, sample: F64) -> Any:
+    wx, wy, wz, ax, ay, az = (float(value) for value in sample)
+    return ros.make(
+        ros.IMU_MSG,
+        header=ros.header(stamp, ros_rig.BODY),
+        orientation=ros.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=_NO_ORIENTATION,
+        angular_velocity=ros.make("geometry_msgs/msg/Vector3", x=wx, y=wy, z=wz),
+        angular_velocity_covariance=_UNKNOWN,
+        linear_acceleration=ros.make("geometry_msgs/msg/Vector3", x=ax, y=ay, z=az),
+        linear_acceleration_covariance=_UNKNOWN,
+    )

@@ -1,0 +1,158 @@
+"""A rig in ROS 2 messages: CameraInfo for each camera, /tf_static for where they sit.
+
+Our recordings carry the rig a second time, as JSON in an MCAP metadata record: exact to the last
+digit and with the IMU's noise, for which ROS has no message.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from share.errors import ConfigError, DataError
+from share.files.json_file import parse_json
+from share.geometry import se3
+from share.geometry.camera import Camera, ImuNoise, Rig
+from share.geometry.lens import EQUIDISTANT, RADTAN
+from share.recordings.mcap import types as ros
+from share.sensors.measurement import CAM0, CAM1, DEPTH, IMU
+from share.types import F64
+
+BODY = "body"
+_ROS = {RADTAN: "plumb_bob", EQUIDISTANT: "equidistant"}
+_RADTAN, _FISHEYE = ("plumb_bob", "none", ""), ("equidistant", "fisheye", "kannala_brandt")
+
+
+def cameras(rig: Rig) -> dict[str, Camera]:
+    """The cameras of a rig by stream."""
+    return {k: c for k, c in ((CAM0, rig.cam0), (CAM1, rig.cam1), (DEPTH, rig.depth)) if c}
+
+
+def to_json(rig: Rig) -> str:
+    """Every number of the rig, exactly."""
+    poses = {k: getattr(rig, k) for k in ("T_body_cam0", "T_cam1_cam0", "T_depth_cam0")}
+    return json.dumps(
+        {name: _of_camera(camera) for name, camera in cameras(rig).items()}
+        | {name: T.tolist() for name, T in poses.items() if T is not None}
+        | ({"imu": asdict(rig.imu)} if rig.imu else {})
+        | ({"timeshift_s": rig.timeshift_s} if rig.timeshift_s else {})
+    )
+
+
+def _of_camera(camera: Camera) -> dict[str, Any]:
+    """The model only where it is not what it was when no record told it."""
+    return {name: value for name, value in asdict(camera).items() if (name, value) != ("model", RADTAN)}
+
+
+def from_json(text: str, where: str) -> Rig:
+    """The rig that `to_json` wrote. Raises DataError."""
+    try:
+        data = parse_json(text)
+        for name in (CAM0, CAM1, DEPTH):
+            if name in data:
+                data[name] = Camera(**{**data[name], "distortion": tuple(data[name]["distortion"])})
+        if IMU in data:
+            data[IMU] = ImuNoise(**data[IMU])
+        return Rig(**data)
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+        raise DataError(f"{where}: its calibration record is damaged ({error}); give --calib") from None
+
+
+def to_camera_info(camera: Camera, header: Any) -> Any:
+    D = np.array(camera.distortion or (0.0,) * 5)
+    if not camera.fisheye:  # ROS has five of plumb_bob, four of equidistant
+        D = np.pad(D, (0, 5 - len(D)))
+    P = np.hstack([camera.K, np.zeros((3, 1))])
+    roi = ros.make(
+        "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+    )
+    return ros.make(
+        ros.CAMERA_INFO,
+        header=header,
+        height=camera.height,
+        width=camera.width,
+        distortion_model=_ROS[camera.model],
+        d=D,
+        k=camera.K.reshape(9),
+        r=np.eye(3).reshape(9),
+        p=P.reshape(12),
+        binning_x=0,
+        binning_y=0,
+        roi=roi,
+    )
+
+
+def from_camera_info(info: Any, where: str) -> Camera:
+    """Raises ConfigError for an uncalibrated camera or a distortion that we do not model."""
+    D, fisheye = tuple(float(d) for d in info.d), info.distortion_model in _FISHEYE
+    while len(D) > (4 if fisheye else 5) and D[-1] == 0:
+        D = D[:-1]
+    if not fisheye and any(D) and (info.distortion_model not in _RADTAN or len(D) > 5):
+        raise ConfigError(
+            f"{where}: distortion_model '{info.distortion_model}' is not supported; "
+            f"supported: plumb_bob, equidistant, none"
+        )
+    fx, _, cx, _, fy, cy, *_ = (float(k) for k in info.k)
+    model = EQUIDISTANT if fisheye else RADTAN
+    try:
+        return Camera(info.width, info.height, fx, fy, cx, cy, D if any(D) or fisheye else (), model)
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}; give the calibration with --calib") from None
+
+
+def to_tf(rig: Rig, stamp_ns: int) -> Any:
+    """body -> cam0 -> cam1, depth."""
+    edges = {(BODY, CAM0): rig.T_body_cam0}
+    if rig.T_cam1_cam0 is not None:
+        edges[CAM0, CAM1] = se3.inverse(rig.T_cam1_cam0)
+    if rig.T_depth_cam0 is not None:
+        edges[CAM0, DEPTH] = se3.inverse(rig.T_depth_cam0)
+    transforms = [_transform(parent, child, T, stamp_ns) for (parent, child), T in edges.items()]
+    return ros.make(ros.TF, transforms=transforms)
+
+
+def _transform(parent: str, child: str, T: F64, stamp_ns: int) -> Any:
+    x, y, z = T[:3, 3].tolist()
+    qx, qy, qz, qw = se3.quat_from_matrix(T[:3, :3]).tolist()
+    return ros.make(
+        "geometry_msgs/msg/TransformStamped",
+        header=ros.header(stamp_ns, parent),
+        child_frame_id=child,
+        transform=ros.make(
+            "geometry_msgs/msg/Transform",
+            translation=ros.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            rotation=ros.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+        ),
+    )
+
+
+class FrameTree:
+    """Static transforms between named frames."""
+
+    def __init__(self, messages: Iterable[Any], where: str) -> None:
+        """Raises DataError for a transform that is none."""
+        self._edges: dict[str, list[tuple[str, F64]]] = {}
+        for transform in (t for message in messages for t in message.transforms):
+            parent, child = transform.header.frame_id.lstrip("/"), transform.child_frame_id.lstrip("/")
+            p, q = transform.transform.translation, transform.transform.rotation
+            quaternion = np.array([q.x, q.y, q.z, q.w])
+            if not abs(np.linalg.norm(quaternion) - 1) < 1e-3 or not np.isfinite([p.x, p.y, p.z]).all():
+                raise DataError(f"{where}: {parent} to {child} is no rigid transform; give --calib")
+            T = se3.from_quat(np.array([p.x, p.y, p.z]), quaternion)
+            self._edges.setdefault(parent, []).append((child, T))
+            self._edges.setdefault(child, []).append((parent, se3.inverse(T)))
+
+    def find(self, a: str, b: str) -> F64 | None:
+        """T_a_b (4, 4), or None where nothing connects the two."""
+        reached, todo = {a.lstrip("/"): np.eye(4)}, [a.lstrip("/")]
+        while todo:
+            frame = todo.pop()
+            for other, T in self._edges.get(frame, []):
+                if other not in reached:
+                    reached[other] = reached[frame] @ T
+                    todo.append(other)
+        return reached.get(b.lstrip("/"))

@@ -1,0 +1,177 @@
+"""A recording by the maker's SDK (2.58 and later: `.db3`, a rosbag2 in SQLite), read without the SDK.
+
+The SDK's own playback is not used: it plays in threads that may hang, and not the same twice. Stamps are
+those of the metadata beside each sample, as the device gave them; the table's are the time since it began.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from share.errors import DataError
+from share.files.reading import MB
+from share.files.sqlite_file import Untrusted
+from share.recordings.losses import Losses
+from share.recordings.mcap import types as ros
+from share.recordings.tables import MOST_NS
+from share.sensors.intake import ACCEL, GYRO, Sample
+from share.sensors.measurement import CAM0, CAM1, DEPTH
+
+STREAMS = {"Infrared_1": CAM0, "Infrared_2": CAM1, "Depth_0": DEPTH, "Accel_0": ACCEL, "Gyro_0": GYRO}
+_DATA = ("/imu/data", "/image/data/compressed", "/image/data/compressedDepth")
+_DEPTH_HEADER = 12  # bytes of compressed_depth_image_transport's ConfigHeader before the PNG
+_HARDWARE = "Hardware Clock"
+_COLUMNS = {"topics": ("id", "name"), "messages": ("id", "topic_id", "timestamp", "data")}  # rosbag2's
+_MOST_TOPICS, _LONGEST = 10_000, 500  # the SDK writes 100 of 60 characters
+_MOST_MESSAGE = 64 * MB  # of bytes; four times as much as a raw image of 8 megapixels
+_MOST_ROW = 4 * _MOST_MESSAGE
+
+
+class Db3:
+    """`streams`: by our name, the folder of its topics. Raises DataError for a file that is none."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._ids = self._topics()
+        parts = [(name.split("/"), name) for name in self._ids if name.endswith(_DATA)]
+        self._data = {STREAMS[p[3]]: name for p, name in parts if len(p) > 3 and p[3] in STREAMS}
+        self.streams = {stream: "/".join(name.split("/")[:4]) for stream, name in self._data.items()}
+
+    @property
+    def serial(self) -> str | None:
+        """Of the device."""
+        told = self.told("/device_0/info").get("Serial Number")
+        return told if told is not None and re.fullmatch(r"[\w-]{1,64}", told) else None
+
+    def number(self, topic: str, key: str | None, default: float, least: float, most: float) -> float:
+        """What `told` says by `key`, or all of it; `default` where it says nothing. Raises DataError where it
+        is no number from `least` to `most`."""
+        told = self.told(topic)
+        text = next(iter(told), None) if key is None else told.get(key)
+        try:
+            value = default if text is None else float(text)
+        except ValueError:
+            value = math.nan
+        if not least <= value <= most:
+            raise DataError(f"{self.path}: {topic}: '{text:.40}' is no number from {least:g} to {most:g}")
+        return value
+
+    def told(self, topic: str) -> dict[str, str]:
+        """What a text such as `key=value;key=value` says, empty if it is not there."""
+        query = f"SELECT {_DATA_OR_NULL} FROM messages NOT INDEXED WHERE topic_id = ? ORDER BY id LIMIT 1"
+        for (data,) in self._rows(query, self._ids.get(topic, -1)):
+            return self._text(data)
+        return {}
+
+    def topic(self, begins: str) -> str:
+        """The first topic whose name begins so. Raises DataError if there is none."""
+        for name in sorted(self._ids):
+            if name.startswith(begins):
+                return name
+        raise DataError(f"{self.path}: has no {begins}, which the SDK writes")
+
+    def samples(self, losses: Losses, images: bool = True) -> Iterator[Sample]:
+        """All of them as they came; those that are damaged go to `losses`. images: with pixels, encoded; else
+        an image's payload is None. Raises DataError where more than 5 % of a stream are damaged."""
+        data = {self._ids[name]: stream for stream, name in self._data.items()}
+        metadata = {self._ids[self.topic(_metadata(name))]: s for s, name in self._data.items()}
+        read = [n for n, stream in data.items() if images or stream in (ACCEL, GYRO)] + list(metadata)
+        marks = ", ".join("?" * len(read))
+        query = (
+            f"SELECT id, topic_id, timestamp, {_DATA_OR_NULL} FROM messages NOT INDEXED "
+            f"WHERE topic_id IN ({marks}) ORDER BY id"
+        )
+        waiting: dict[str, Any] = {}
+        total = dict.fromkeys(self._data, 0)
+        for row, number, at_ns, blob in self._rows(query, *read):
+            if number in data:
+                waiting[data[number]] = blob
+                continue
+            stream = metadata[number]
+            total[stream] += 1
+            try:
+                whole = images or stream in (ACCEL, GYRO)
+                sample = self._sample(stream, waiting.pop(stream, None), whole, self._text(blob), at_ns)
+            except DataError as error:  # it costs itself
+                losses.add(f"samples of {stream}", str(row), str(error))
+                continue
+            yield sample
+        for stream, count in total.items():
+            losses.check(f"samples of {stream}", count)
+
+    def _topics(self) -> dict[str, int]:
+        """Their numbers by name."""
+        query = (
+            f"SELECT id, name FROM topics NOT INDEXED "
+            f"WHERE typeof(name) = 'text' AND length(name) <= {_LONGEST} LIMIT {_MOST_TOPICS}"
+        )
+        return {name: number for number, name in self._rows(query)}
+
+    def _sample(
+        self, stream: str, blob: bytes | None, whole: bool, told: dict[str, str], at_ns: int
+    ) -> Sample:
+        """whole: with what was recorded, not only when."""
+        try:
+            return Sample(
+                stream=stream,
+                stamp_ns=_bounded(round(float(told["timestamp"]) * 1e3) * 1000),
+                payload=_payload(stream, blob) if whole else None,
+                arrived_ns=_bounded(at_ns),
+                number=None if stream in (ACCEL, GYRO) else _bounded(int(told["Frame number"])),
+                hardware=told["timestamp_domain"] == _HARDWARE,
+            )
+        except Exception as error:  # rosbags raises many kinds on bytes that are no such message
+            raise DataError(f"{self.path}: a sample of {stream} cannot be read ({error!r})") from None
+
+    def _text(self, blob: bytes) -> dict[str, str]:
+        try:
+            text: str = ros.decode(blob, "std_msgs/msg/String").data
+        except Exception as error:
+            raise DataError(f"{self.path}: a message cannot be read ({error!r})") from None
+        return {key: value for key, _, value in (item.partition("=") for item in text.split(";") if item)}
+
+    def _rows(self, query: str, *values: int) -> Iterator[tuple[Any, ...]]:
+        try:
+            with closing(Untrusted(self.path, _COLUMNS, _MOST_ROW)) as file:
+                yield from file.rows(query, *values)
+        except OSError as error:
+            raise DataError(f"{self.path}: cannot be read: {error.strerror}") from None
+        except (sqlite3.Error, MemoryError, OverflowError, UnicodeError) as error:
+            raise DataError(
+                f"{self.path}: is no recording of the RealSense SDK, or damaged: {error}"
+            ) from None
+
+
+_DATA_OR_NULL = f"CASE WHEN typeof(data) = 'blob' AND length(data) <= {_MOST_MESSAGE} THEN data END"
+
+
+def _bounded(number: Any) -> int:
+    """A stamp, or number of a frame. Raises ValueError."""
+    if type(number) is not int or abs(number) >= MOST_NS:
+        raise ValueError(f"{number!r:.40} is out of range")
+    return number
+
+
+def _metadata(data: str) -> str:
+    """The topic with the stamps of the samples in topic `data`."""
+    return data[: data.rindex("/data")] + "/metadata"
+
+
+def _payload(stream: str, blob: bytes | None) -> Any:
+    """Raises ValueError and what rosbags does."""
+    if blob is None:
+        raise ValueError("its data are missing, or too large")
+    if stream in (ACCEL, GYRO):
+        message = ros.decode(blob, ros.IMU_MSG)
+        v = message.linear_acceleration if stream == ACCEL else message.angular_velocity
+        if not all(map(math.isfinite, (v.x, v.y, v.z))):
+            raise ValueError("it is not finite")
+        return [v.x, v.y, v.z]
+    image = ros.decode(blob, ros.COMPRESSED).data.tobytes()
+    return image[_DEPTH_HEADER:] if stream == DEPTH else image

@@ -1,0 +1,159 @@
+"""What every reader gives: a rig, streams of measurements, perhaps a true trajectory."""
+
+from __future__ import annotations
+
+import heapq
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from share.errors import DataError, UsageError
+from share.geometry.camera import Rig
+from share.recordings.losses import Losses
+from share.recordings.trajectory import Trajectory
+from share.sensors.imu_check import ImuRange
+from share.sensors.measurement import CAM0, IMU, LazyImage, Measurement
+from share.types import F64, I64
+
+
+class Source(ABC):
+    """One agent's recording, or its camera. `rig` decides which streams there are; `notes` are for people;
+    `serial` is the number of the device, None where nobody knows."""
+
+    name: str
+    rig: Rig
+    notes: tuple[str, ...]
+    serial: str | None = None
+    imu_range = ImuRange()  # of the widest usual sensor, where nobody says which it is
+    tells_silence = False  # whether a person is told by it that a stream has stopped
+
+    @abstractmethod
+    def stamps(self) -> dict[str, I64]:
+        """Stamps (N,) ns of every stream, as recorded."""
+
+    @abstractmethod
+    def measurements(self) -> Iterator[Measurement]:
+        """All samples, roughly in order of time; `share.sensors.sequencer` merges them."""
+
+    @abstractmethod
+    def truth(self) -> Trajectory | None:
+        """True poses of the body in the world, if the recording has them."""
+
+    def stop(self) -> None:  # noqa: B027 -- a recording ends by itself
+        """Ask a live camera to end, from any thread or signal handler."""
+
+    @cached_property
+    def losses(self) -> Losses:
+        """What could not be read so far and was left out."""
+        return Losses()
+
+    def report(self) -> dict[str, Any]:
+        """What a live camera met, for report.json."""
+        return {}
+
+    @property
+    def images_count(self) -> int:
+        return len(self.stamps()[CAM0])
+
+    @cached_property
+    def rate_hz(self) -> float:
+        """Frame rate, from the median step of cam0; 0 with fewer than two images."""
+        steps = np.diff(self.stamps()[CAM0])
+        steps = steps[steps > 0]
+        return float(1e9 / np.median(steps)) if len(steps) else 0.0
+
+
+class Span(NamedTuple):
+    """A part of a recording: images in (image_from, image_to], IMU samples in (imu_from, imu_to]."""
+
+    image_from: int
+    image_to: int
+    imu_from: int
+    imu_to: int
+
+    def limits(self, stream: str) -> tuple[int, int]:
+        return (self.imu_from, self.imu_to) if stream == IMU else (self.image_from, self.image_to)
+
+
+_EVER = 2**62
+
+
+def span_of(cam0: I64, frames: slice | None, where: str, imu_shift_ns: int = 0) -> Span:
+    """The span of cam0's images number `frames`, with the IMU samples since the image before them, whose
+    stamps are imu_shift_ns later than those of images taken with them.
+
+    Raises UsageError if nothing is left or the slice has a step.
+    """
+    if frames is None:
+        return Span(-_EVER, _EVER, -_EVER, _EVER)
+    first, last, step = frames.indices(len(cam0))
+    if step != 1 or first >= last:
+        wanted = ":".join("" if end is None else str(end) for end in (frames.start, frames.stop))
+        raise UsageError(f"{where}: --frames {wanted} selects nothing; it has {len(cam0)} frames")
+    before = int(cam0[first - 1]) if first else -_EVER
+    until = int(cam0[last - 1])
+    return Span(
+        image_from=(before + int(cam0[first])) // 2 if first else -_EVER,
+        image_to=(until + int(cam0[last])) // 2 if last < len(cam0) else _EVER,
+        imu_from=before + imu_shift_ns,
+        imu_to=until + imu_shift_ns if last < len(cam0) else _EVER,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class FolderSource(Source):
+    """A recording whose stamps are all known: image lists and an IMU table (stamps (N,), values (N, 6))."""
+
+    name: str
+    rig: Rig
+    images: dict[str, list[tuple[int, LazyImage]]]
+    imu: tuple[I64, F64] | None = None
+    read_truth: Callable[[], Trajectory | None] = lambda: None
+    notes: tuple[str, ...] = field(default=())
+    losses: Losses = field(default_factory=Losses)
+
+    def stamps(self) -> dict[str, I64]:
+        out = {
+            name: np.array([stamp for stamp, _ in images], np.int64) for name, images in self.images.items()
+        }
+        return out if self.imu is None else {**out, IMU: self.imu[0]}
+
+    def measurements(self) -> Iterator[Measurement]:
+        return heapq.merge(*self._streams(), key=lambda m: m.stamp_ns)
+
+    def truth(self) -> Trajectory | None:
+        return self.read_truth()
+
+    def part(self, frames: slice | None) -> FolderSource:
+        """The same recording, only the frames number `frames` of cam0."""
+        if not self.images[CAM0]:
+            raise DataError(f"{self.name}: has no images")
+        span = span_of(self.stamps()[CAM0], frames, self.name, self.rig.timeshift_ns)
+        lo, hi = span.limits(CAM0)
+        images = {
+            name: [(stamp, image) for stamp, image in items if lo < stamp <= hi]
+            for name, items in self.images.items()
+        }
+        imu = self.imu
+        if imu is not None:
+            keep = (imu[0] > span.imu_from) & (imu[0] <= span.imu_to)
+            imu = (imu[0][keep], imu[1][keep])
+        return FolderSource(self.name, self.rig, images, imu, self.read_truth, self.notes, self.losses)
+
+    def _streams(self) -> Iterator[Iterator[Measurement]]:
+        if self.imu is not None:  # first, so that samples precede an image of the same stamp
+            yield map(_imu_measurement, self.imu[0].tolist(), self.imu[1].tolist())
+        for name, items in self.images.items():
+            yield _image_measurements(name, items)
+
+
+def _imu_measurement(stamp_ns: int, values: list[float]) -> Measurement:
+    return Measurement(IMU, stamp_ns, values)
+
+
+def _image_measurements(stream: str, items: list[tuple[int, LazyImage]]) -> Iterator[Measurement]:
+    return (Measurement(stream, stamp, image) for stamp, image in items)

@@ -1,0 +1,106 @@
+"""On which machine, and with which libraries, something was measured."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import sys
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import share
+
+_LIBRARIES = ("numpy", "opencv-python-headless", "pyzmq", "scipy")
+
+
+def describe_machine() -> dict[str, Any]:
+    """Plain data. load: how many processes wanted a core over the last minute."""
+    return {
+        "cpu": _cpu() or platform.processor() or platform.machine(),
+        "cores": cores(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        **{name: version(name) for name in _LIBRARIES},
+        "load": round(os.getloadavg()[0], 2),
+    }
+
+
+def cores() -> int:
+    """That this process may run on."""
+    return len(os.sched_getaffinity(0))
+
+
+def _cpu() -> str | None:
+    """Its name, as Linux gives it."""
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text().splitlines() if path.exists() else []
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), None)
+
+
+def free_bytes(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> int | None:
+    """Memory that this process may still take: what the machine has available, or less where a control group
+    (a container, a systemd unit) has a limit. None where the system does not say."""
+    left = [
+        free for free in (_available(proc / "meminfo"), *_left_in_groups(proc, groups)) if free is not None
+    ]
+    return min(left, default=None)
+
+
+def _available(meminfo: Path) -> int | None:
+    lines = meminfo.read_text().splitlines() if meminfo.exists() else []
+    found = next((line for line in lines if line.startswith("MemAvailable:")), None)
+    return None if found is None else 1024 * int(found.split()[1])
+
+
+def _left_in_groups(proc: Path, groups: Path) -> list[int]:
+    """Of this process's control group and all that it lies in, of those with a limit."""
+    file = proc / "self" / "cgroup"
+    lines = file.read_text().splitlines() if file.exists() else []
+    out = []
+    for line in lines:
+        _, kinds, name = line.split(":", 2)
+        if kinds == "":  # version 2
+            root, limit, used = groups, "memory.max", "memory.current"
+        elif "memory" in kinds.split(","):
+            root, limit, used = groups / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes"
+        else:
+            continue
+        folder = root / name.lstrip("/")
+        while folder.is_relative_to(root):
+            most, now = _number(folder / limit), _number(folder / used)
+            if most is not None and now is not None:
+                out.append(max(0, most - now))
+            if folder == root:
+                break
+            folder = folder.parent
+    return out
+
+
+def _number(file: Path) -> int | None:
+    """None for "max", or where there is no such file."""
+    try:
+        text = file.read_text().strip()
+    except OSError:
+        return None
+    return int(text) if text.isdecimal() else None
+
+
+# ---- Which state of SHARE's code made something: a version number stays while code changes.
+
+_DIGITS = 10
+
+
+@cache
+def code_state() -> str:
+    """Hexadecimal digits that differ where any of SHARE's sources do; of a frozen program, where it does."""
+    frozen = getattr(sys, "frozen", False)
+    folder = Path(share.__file__).parent
+    files = [Path(sys.executable)] if frozen else sorted(folder.rglob("*.py"))
+    digest = hashlib.sha256()
+    for path in files:
+        digest.update(path.name.encode() if frozen else path.relative_to(folder).as_posix().encode())
+        digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:_DIGITS]

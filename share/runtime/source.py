@@ -1,0 +1,106 @@
+"""A SOURCE on the command line to the reader that knows it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from share.cameras.realsense.devices import is_camera
+from share.errors import UsageError
+from share.recordings.calibration import Calibration, read_calibration
+from share.recordings.euroc import is_euroc, open_euroc
+from share.recordings.recording import Source
+from share.recordings.session import is_session, read_session
+from share.recordings.tum import is_tum, open_tum
+
+__all__ = ["READERS", "Source", "open_source"]
+
+
+class Reader(NamedTuple):
+    """One kind of recording: how to know it, and how to open it."""
+
+    what: str
+    knows: Callable[[Path], bool]
+    open: Callable[[Path, Calibration | None, slice | None], Source]
+
+
+def _open_mcap(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
+    from share.recordings.mcap.reader import open_mcap  # rosbags and mcap only where they are needed
+
+    return open_mcap(path, calibration, frames)
+
+
+def _is_mcap(path: Path) -> bool:
+    return path.suffix == ".mcap" and path.is_file()
+
+
+def _is_agent(path: Path) -> bool:
+    return is_session(path.parent) and path.suffix != ".mcap" and not path.is_dir()
+
+
+def _open_agent(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
+    session = read_session(path.parent)
+    recording = session.recording(path.name)
+    return _open_mcap(recording, calibration or session.agents[path.name].calibration, frames)
+
+
+def _open_db3(path: Path, calibration: Calibration | None, frames: slice | None) -> Source:
+    from share.recordings.realsense import open_db3  # rosbags only where it is needed
+
+    return open_db3(path, calibration, frames)
+
+
+def _is_db3(path: Path) -> bool:
+    return path.suffix == ".db3" and path.is_file()
+
+
+READERS = (
+    Reader("SESSION/NAME (a folder with session.yaml)", _is_agent, _open_agent),
+    Reader("an MCAP recording (.mcap)", _is_mcap, _open_mcap),
+    Reader("a recording of the RealSense SDK (.db3)", _is_db3, _open_db3),
+    Reader("an EuRoC/ASL folder (mav0/)", is_euroc, open_euroc),
+    Reader("a TUM RGB-D folder (rgb.txt, depth.txt, camera.yaml)", is_tum, open_tum),
+)
+
+
+def open_source(spec: str, calib: str | None = None, frames: slice | None = None) -> Source:
+    """The recording that `spec` names, with the calibration `calib` in place of its own.
+
+    frames: only these images of cam0 (by number, no step), and the IMU samples since the one before.
+    Raises UsageError, ConfigError or DataError.
+    """
+    if is_camera(spec):
+        raise UsageError(f"{spec}: a live camera is recorded with `share capture`; then give the recording")
+    path = Path(spec)
+    calibration = calibration_of(calib)
+    for reader in READERS:
+        if reader.knows(path):
+            return reader.open(path, calibration, frames)
+    _existing(path, "SOURCE")
+    if path.name.endswith(".mcap.part"):
+        raise _unclosed(path)
+    if is_session(path):
+        agents = ", ".join(str(path / name) for name in read_session(path).agents)
+        raise UsageError(f"{spec}: is a session; name one of its agents: {agents}")
+    known = "; ".join(reader.what for reader in READERS)
+    raise UsageError(f"{spec}: is none of the recordings that SHARE reads: {known}")
+
+
+def calibration_of(calib: str | None) -> Calibration | None:
+    """What --calib names, None where it was not given. Raises UsageError, ConfigError."""
+    return None if calib is None else read_calibration(_existing(Path(calib), "--calib"))
+
+
+def _existing(path: Path, what: str) -> Path:
+    if not path.exists():
+        part = path.with_name(path.name + ".part")
+        if part.exists():
+            raise _unclosed(part)
+        raise UsageError(f"{what} {path}: no such file or folder")
+    return path
+
+
+def _unclosed(part: Path) -> UsageError:
+    saves = f"`share dataset recover {part} --out {part.with_suffix('')}` saves it"
+    return UsageError(f"{part}: was not closed, or is being recorded; {saves}")

@@ -1,0 +1,241 @@
+"""A small web server for a few readers, on one thread: no client can hold up the process that it serves.
+
+A connection is one request without a body, GET or HEAD, and its answer (RFC 9110, 9112). Whatever clients
+do, the thread computes for a fifth of the time at most: it sleeps four times as long as it has worked.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import selectors
+import socket
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from email.utils import formatdate
+from http import HTTPStatus
+
+from share.errors import UsageError
+from share.net.transport import Address, bind_error, parse_address
+
+CONNECTIONS = 16  # at a time; one more closes the oldest
+REQUEST_BYTES = 8192
+PATIENCE_S = 5.0  # to ask, and again to take the answer
+_LEAVE_S = 1.0  # what is still sent after the answer is read so long, else the answer would be lost with it
+_BREATHER_S = 0.1  # where the machine has no socket left, and the longest sleep after work
+_SLEEP = 4.0  # times as long as it worked
+
+_REQUEST = re.compile(r"([A-Z]+) (\S+) HTTP/1\.[01]")
+_HEADERS = (
+    "Cache-Control: no-store",
+    "Connection: close",
+    "Content-Security-Policy: default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy: same-origin",
+    "X-Content-Type-Options: nosniff",
+)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What is said, and of which media type."""
+
+    status: HTTPStatus
+    type: str
+    body: bytes
+
+    def message(self, with_body: bool) -> bytes:
+        """As it goes over the wire."""
+        allow = ["Allow: GET, HEAD"] if self.status is HTTPStatus.METHOD_NOT_ALLOWED else []
+        head = [
+            f"HTTP/1.1 {self.status.value} {self.status.phrase}",
+            f"Date: {formatdate(usegmt=True)}",
+            f"Content-Type: {self.type}",
+            f"Content-Length: {len(self.body)}",
+            *_HEADERS,
+            *allow,
+        ]
+        return "\r\n".join([*head, "", ""]).encode() + (self.body if with_body else b"")
+
+
+def line(status: HTTPStatus, text: str) -> Answer:
+    """One line of plain text."""
+    return Answer(status, "text/plain; charset=utf-8", f"{text}\n".encode())
+
+
+class WebServer:
+    """Listens on HOST:PORT, or PORT of this machine alone; port 0 takes a free one. `answer` is called with
+    a path, from the server's own thread, and must not raise.
+
+    Raises UsageError if that is no address, TransportError if nothing can listen there.
+    """
+
+    def __init__(self, address: str, answer: Callable[[str], Answer]) -> None:
+        self._answer, self._target = answer, _parse(address)
+        self._listener = _listen(self._target)
+        self._waker, self._woken = socket.socketpair()
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._listener, selectors.EVENT_READ)
+        self._selector.register(self._woken, selectors.EVENT_READ)
+        self._clients: list[_Client] = []  # oldest first
+        self._worked_s = 0.0  # CPU time of the thread so far
+        self._thread = threading.Thread(target=self._serve, name="web", daemon=True)
+        self.endpoint = str(Address(self._target.host, self._listener.getsockname()[1])).removeprefix(
+            "tcp://"
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """Frees the address. May be repeated."""
+        with contextlib.suppress(OSError):
+            self._waker.send(b"!")
+        self._thread.join(timeout=PATIENCE_S)
+        self._waker.close()
+
+    def _serve(self) -> None:
+        try:
+            while self._step():
+                self._breathe()
+        finally:
+            for client in list(self._clients):
+                self._drop(client)
+            self._selector.close()
+            self._listener.close()
+            self._woken.close()
+
+    def _breathe(self) -> None:
+        worked_s, self._worked_s = time.thread_time() - self._worked_s, time.thread_time()
+        time.sleep(min(_SLEEP * worked_s, _BREATHER_S))
+
+    def _step(self) -> bool:
+        """Waits for somebody and goes on with them. False once closed."""
+        next_late = min((client.deadline for client in self._clients), default=None)
+        wait_s = None if next_late is None else max(next_late - time.monotonic(), 0.0)
+        for key, _ in self._selector.select(wait_s):
+            if key.fileobj is self._woken:
+                return False
+            if key.fileobj is self._listener:
+                self._accept()
+            elif key.data in self._clients:
+                self._go_on(key.data)
+        for client in [c for c in self._clients if c.deadline <= time.monotonic()]:
+            self._drop(client)
+        return True
+
+    def _accept(self) -> None:
+        try:
+            connection, _ = self._listener.accept()
+        except (BlockingIOError, ConnectionAbortedError):
+            return
+        except OSError:
+            time.sleep(_BREATHER_S)
+            return
+        connection.setblocking(False)
+        if len(self._clients) == CONNECTIONS:
+            self._drop(self._clients[0])
+        client = _Client(connection)
+        self._clients.append(client)
+        self._selector.register(connection, selectors.EVENT_READ, client)
+
+    def _go_on(self, client: _Client) -> None:
+        try:
+            events = client.go_on(self._respond)
+        except Exception:  # gone; or whatever it said that nobody thought of costs it its own connection
+            events = 0
+        if events:
+            self._selector.modify(client.socket, events, client)
+        else:
+            self._drop(client)
+
+    def _drop(self, client: _Client) -> None:
+        self._clients.remove(client)
+        self._selector.unregister(client.socket)
+        client.socket.close()
+
+    def _respond(self, heard: bytes) -> bytes:
+        if len(heard) > REQUEST_BYTES:
+            text = f"a request has at most {REQUEST_BYTES} bytes"
+            return line(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, text).message(True)
+        first, _, rest = heard.decode("latin-1").replace("\r\n", "\n").partition("\n")
+        match = _REQUEST.fullmatch(first)
+        if match is None:
+            return line(HTTPStatus.BAD_REQUEST, "this is not HTTP/1.1").message(True)
+        method, path = match[1], match[2].partition("?")[0]
+        if method not in ("GET", "HEAD"):
+            answer = line(HTTPStatus.METHOD_NOT_ALLOWED, "only GET and HEAD")
+        elif self._target.local and not _names_this_machine(rest):
+            answer = line(HTTPStatus.FORBIDDEN, "this is for localhost, asked for by that name")
+        else:
+            answer = self._answer(path)
+        return answer.message(method != "HEAD")
+
+
+@dataclass(eq=False)
+class _Client:
+    """One connection: it asks, takes its answer, and goes."""
+
+    socket: socket.socket
+    deadline: float = field(default_factory=lambda: time.monotonic() + PATIENCE_S)
+    _heard: bytearray = field(default_factory=bytearray)
+    _answer: memoryview | None = None
+
+    def go_on(self, respond: Callable[[bytes], bytes]) -> int:
+        """Selector events to wait for next; 0 where it is over. Raises OSError where the other has gone."""
+        if self._answer is None:
+            return self._listen(respond)
+        if not self._answer:
+            return selectors.EVENT_READ if self.socket.recv(REQUEST_BYTES) else 0
+        self._answer = self._answer[self.socket.send(self._answer) :]
+        if self._answer:
+            return selectors.EVENT_WRITE
+        self.socket.shutdown(socket.SHUT_WR)
+        self.deadline = time.monotonic() + _LEAVE_S
+        return selectors.EVENT_READ
+
+    def _listen(self, respond: Callable[[bytes], bytes]) -> int:
+        more = self.socket.recv(REQUEST_BYTES)
+        self._heard += more
+        if not more:
+            return 0
+        if not re.search(rb"\n\r?\n", self._heard) and len(self._heard) <= REQUEST_BYTES:
+            return selectors.EVENT_READ
+        self._answer = memoryview(respond(bytes(self._heard)))
+        self.deadline = time.monotonic() + PATIENCE_S
+        return selectors.EVENT_WRITE
+
+
+def _parse(address: str) -> Address:
+    try:
+        return parse_address(f"tcp://127.0.0.1:{address}" if address.isdigit() else f"tcp://{address}", True)
+    except UsageError:
+        text = f"'{address}' is not an address to serve on; expected HOST:PORT, such as 127.0.0.1:8080"
+        raise UsageError(text) from None
+
+
+def _listen(target: Address) -> socket.socket:
+    family = socket.AF_INET6 if ":" in target.host else socket.AF_INET
+    try:
+        listener = socket.create_server((target.host, target.port), family=family, backlog=CONNECTIONS)
+    except OSError as error:
+        raise bind_error(target, error.errno, error.strerror or str(error)) from None
+    listener.setblocking(False)
+    return listener
+
+
+def _names_this_machine(headers: str) -> bool:
+    """Whether a request means a name that only this machine has. A web page whose own name was made to lead
+    here (DNS rebinding) would ask for that."""
+    for field_ in headers.split("\n"):
+        name, _, value = field_.partition(":")
+        if name.lower() == "host":
+            return _is_this_machine(value.strip(" \t"))
+    return True
+
+
+def _is_this_machine(host: str) -> bool:
+    """host: a name or an address, perhaps with a port. In time that rises with its length, no faster."""
+    before, colon, port = host.rpartition(":")
+    name = (before if colon and port.isdecimal() else host).strip("[]").lower()
+    return name == "localhost" or Address(name, 0).local

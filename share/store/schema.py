@@ -1,0 +1,106 @@
+"""The tables of a map file, its schema number, and the way from an older schema to this one.
+
+Every row ends in a CRC-32 over its table's name and its other columns: it is known to be whole by
+itself. `about` keeps its form in all schemas: versions tell each other by it which is newer.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Mapping
+
+from share import __version__
+from share.store.rows import insert, is_whole
+
+SCHEMA = 3
+PAGE_BYTES = 8192
+
+TABLES = """
+CREATE TABLE about(number INTEGER PRIMARY KEY, name TEXT UNIQUE, value TEXT, crc INTEGER);
+CREATE TABLE run(number INTEGER PRIMARY KEY, key TEXT UNIQUE, next INTEGER, codec INTEGER, hello BLOB, crc INTEGER);
+CREATE TABLE run_copy(number INTEGER PRIMARY KEY, key TEXT UNIQUE, next INTEGER, codec INTEGER, hello BLOB, crc INTEGER);
+CREATE TABLE stretch(number INTEGER PRIMARY KEY, run TEXT, nth INTEGER, crc INTEGER, UNIQUE(run, nth));
+CREATE TABLE keyframe(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, stretch INTEGER, ordinal INTEGER,
+    codec INTEGER, message BLOB, crc INTEGER, UNIQUE(run, id));
+CREATE TABLE link(number INTEGER PRIMARY KEY, run TEXT, id INTEGER, reference INTEGER, T_ref_body BLOB, cov BLOB,
+    crc INTEGER, UNIQUE(run, id));
+CREATE TABLE loop(number INTEGER PRIMARY KEY, a_run TEXT, a_id INTEGER, b_run TEXT, b_id INTEGER, T_a_b BLOB,
+    cov BLOB, inliers INTEGER, found REAL, crc INTEGER);
+CREATE INDEX loop_a ON loop(a_run, a_id);
+CREATE INDEX loop_b ON loop(b_run, b_id);
+CREATE TABLE poses(number INTEGER PRIMARY KEY, keys BLOB, T_map_body BLOB, crc INTEGER)
+"""  # noqa: E501
+STATEMENTS = tuple(TABLES.strip().split(";\n"))
+
+# From each older schema to the next, in SQL. None leads on from schema 1: its keyframes do not say where
+# their agents took themselves to be; nor from 2: its agents do not say how large their images are.
+STEPS: Mapping[int, tuple[str, ...]] = {}
+
+
+def create(connection: sqlite3.Connection) -> None:
+    """All tables, in an open transaction."""
+    for statement in STATEMENTS:
+        connection.execute(statement)
+    for name, value in (("schema", str(SCHEMA)), ("made by", f"SHARE {__version__}")):
+        insert(connection, "about", (name, value))
+
+
+def version(connection: sqlite3.Connection) -> int | None:
+    """The file's schema; None if the row that says so is not whole. Raises sqlite3.Error."""
+    if "about" not in own_tables(connection):
+        return None
+    found = connection.execute("SELECT number, name, value, crc FROM about NOT INDEXED").fetchall()
+    whole = (row for number, *row in found if is_whole("about", number, tuple(row)))
+    return next((int(value) for name, value, _ in whole if name == "schema" and str(value).isdecimal()), None)
+
+
+def migrate(connection: sqlite3.Connection, found: int, steps: Mapping[int, tuple[str, ...]]) -> None:
+    """From schema `found` to ours, all steps or none. Raises sqlite3.Error, KeyError for a missing step."""
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        for number in range(found, SCHEMA):
+            for statement in steps[number]:
+                connection.execute(statement)
+        connection.execute("DELETE FROM about WHERE name = 'schema'")
+        insert(connection, "about", ("schema", str(SCHEMA)))
+        connection.execute("COMMIT")
+    except BaseException:
+        connection.execute("ROLLBACK")
+        raise
+
+
+def is_ours(connection: sqlite3.Connection) -> bool:
+    """Whether tables and indexes are those of this schema, to the letter."""
+    return _objects(connection) == _objects(_template())
+
+
+def own_tables(connection: sqlite3.Connection) -> set[str]:
+    """Tables that were made as ours are, to the letter. Nothing else of a file is read: a view or a virtual
+    table may compute for ever, a generated column may be of any size. Raises sqlite3.Error."""
+    return {name for kind, name, _, _ in _objects(connection) & _objects(_template()) if kind == "table"}
+
+
+def is_empty(connection: sqlite3.Connection) -> bool:
+    """Whether nothing was ever made in it."""
+    return not _objects(connection)
+
+
+def first_page() -> bytes:
+    """Page 1 of a file of this schema: the header, and where each table begins.
+
+    The number of pages (bytes 28 to 31) is left open: SQLite then goes by the file's length.
+    """
+    page = bytearray(_template().serialize()[:PAGE_BYTES])
+    page[28:32] = bytes(4)
+    return bytes(page)
+
+
+def _template() -> sqlite3.Connection:
+    connection = sqlite3.connect(":memory:", isolation_level=None)
+    connection.execute(f"PRAGMA page_size = {PAGE_BYTES}")
+    create(connection)
+    return connection
+
+
+def _objects(connection: sqlite3.Connection) -> set[tuple[str, ...]]:
+    return set(connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_schema"))

@@ -1,0 +1,115 @@
+"""What a keyframe shows to other agents: ORB features spread over the image, with their depth."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from share.geometry.camera import Rig, rays
+from share.types import F32, F64, U8, Frame, View
+from share.vision import depth as depths
+from share.vision.corners import evenly
+from share.vision.mask import EVEN_DEG, within
+
+_GRID = 8, 6  # cells of the image, over which features are spread
+_BESIDE_PX = 4.0  # of a known point, where nothing measures depth: as deep
+
+
+def measures_depth(frame: Frame, rig: Rig) -> bool:
+    """Whether stereo or a depth camera says how far things are."""
+    return (frame.depth is not None and rig.depth is not None) or (
+        frame.image1 is not None and rig.cam1 is not None
+    )
+
+
+def depth_at(frame: Frame, rig: Rig, px: F32, uv: F64, guess_m: F64 | None = None) -> F64:
+    """Depth (N,) m in cam0 of image points, from whatever the frame carries; NaN where unknown. guess_m (N,):
+    about how far they are, if that is known."""
+    if frame.depth is not None and rig.depth is not None:
+        return depths.from_depth_camera(frame.depth, rig, uv)
+    if frame.image1 is not None and rig.cam1 is not None:
+        return depths.from_stereo(frame.image0, frame.image1, rig, px, uv, guess_m)
+    return np.full(len(px), np.nan)
+
+
+class ViewInSteps:
+    """A view, made in steps that take about equally long, for who cannot wait for all of them at once. known:
+    px (M, 2) and depth (M,) m of points whose neighbours will not be much nearer or further; where the frame
+    measures nothing, only what is right beside them has a depth."""
+
+    def __init__(self, frame: Frame, rig: Rig, count: int, known: tuple[F32, F64] | None = None) -> None:
+        self._frame, self._rig, self._count, self._known = frame, rig, count, known
+        self._keypoints: list[cv2.KeyPoint] | None = None
+        self._described: tuple[F32, U8] | None = None
+
+    def detect(self) -> None:
+        """The first step."""
+        seen = within(self._rig.cam0, EVEN_DEG)
+        self._keypoints = _detected(self._frame.image0, self._count, seen)
+
+    def describe(self) -> None:
+        """The second."""
+        if self._keypoints is None:
+            self.detect()
+        self._described = _described(self._frame.image0, self._keypoints or [])
+
+    def finish(self) -> View:
+        """The third, with those before it where they were not made."""
+        if self._described is None:
+            self.describe()
+        assert self._described is not None
+        px, descriptors = self._described
+        rig, known = self._rig, self._known
+        uv = rig.cam0.normalise(px.astype(np.float64))
+        if known is not None and not measures_depth(self._frame, rig):
+            z = _nearest(px, *known, _BESIDE_PX)
+        else:
+            z = depth_at(self._frame, rig, px, uv, None if known is None else _nearest(px, *known))
+        points = rays(uv) * z[:, None]
+        return View(uv.astype(np.float32), points.astype(np.float32), descriptors)
+
+
+def make_view(frame: Frame, rig: Rig, count: int = 500) -> View:
+    """ORB features (Rublee et al. 2011) of cam0 with 3D points where the frame gives depth."""
+    return ViewInSteps(frame, rig, count).finish()
+
+
+def _nearest(px: F32, known_px: F32, known_m: F64, within_px: float = np.inf) -> F64:
+    """Depth (N,) m of the known point next to each; NaN where there is none within so many px."""
+    if len(known_px) == 0:
+        return np.full(len(px), np.nan)
+    apart = (px**2).sum(axis=1)[:, None] - 2 * px @ known_px.T + (known_px**2).sum(axis=1)
+    out: F64 = np.where(apart.min(axis=1) <= within_px**2, known_m[apart.argmin(axis=1)], np.nan)
+    return out
+
+
+def orb(image: U8, count: int, within: U8 | None = None) -> tuple[F32, U8]:
+    """Up to `count` ORB keypoints (N, 2) px and descriptors (N, 32), strongest first in each cell. within
+    (H, W): a mask of where to look.
+
+    OpenCV's detector alone crowds them on the strongest texture; pose from a crowd is weak.
+    """
+    return _described(image, _detected(image, count, within))
+
+
+def _detected(image: U8, count: int, within: U8 | None = None) -> list[cv2.KeyPoint]:
+    """The `count` that spread best over the image."""
+    keypoints = _detector(3 * count).detect(image, within)
+    if not keypoints:
+        return []
+    px = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32)
+    response = np.array([k.response for k in keypoints])
+    chosen = np.sort(evenly(px, response, image.shape[::-1], _GRID)[:count])
+    return [keypoints[i] for i in chosen]
+
+
+def _described(image: U8, keypoints: list[cv2.KeyPoint]) -> tuple[F32, U8]:
+    if not keypoints:
+        return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
+    kept, descriptors = _detector(len(keypoints)).compute(image, keypoints)
+    px = np.asarray(cv2.KeyPoint.convert(kept), np.float32).reshape(-1, 2)
+    return px, np.asarray(descriptors, np.uint8)
+
+
+def _detector(most: int) -> cv2.ORB:
+    return cv2.ORB.create(nfeatures=most, scaleFactor=1.2, nlevels=6, fastThreshold=10)
