@@ -11,9 +11,9 @@ import pytest
 
 CHILD = """
 import json
-from share import process
+from share import startup
 
-process.prepare()
+startup.prepare()
 
 
 def rss_mb():
