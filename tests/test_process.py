@@ -22,7 +22,7 @@ def rss_mb():
 
 
 kept = [bytearray(2000) for _ in range(30_000)][::100]  # a little of it, scattered
-heap, found = process.Heap(), []
+heap, found = startup.Heap(), []
 for now_s in (0.0, 59.0, 61.0, 62.0):
     heap.tidy(now_s)
     found.append(rss_mb())
