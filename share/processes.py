@@ -19,6 +19,14 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
 
 # ---- Child processes that end with their parent, however it ends: killed, crashed or in good order.
+#
+# Every process that SHARE starts is started through here: one of its own commands with `environment()`, a
+# worker of multiprocessing by `share.processes.SPAWN`, a fork that calls `follow` itself. The first thing
+# that the child does, before it imports anything heavy, is to ask the kernel to be killed when its parent
+# dies (PR_SET_PDEATHSIG), and then to look whether the parent has died meanwhile. The kernel takes the
+# *thread* that started the child for its parent. So a child that was started by another than the main thread,
+# which may end long before its process, and one on a system without that request, looks at its parent's
+# number every 0.2 s instead.
 
 _MARK = "SHARE_PARENT"  # PID:1 if the main thread of that process is the parent, else PID:0
 _PR_SET_PDEATHSIG = 1

@@ -13,6 +13,8 @@ from share.geometry.se3 import angle, inverse
 from share.types import F64
 
 # ---- What a device must have for SHARE, judged from plain facts: what was found, and how to mend it.
+#
+# Nothing here looks at the machine: `share.devices.host` reads the facts.
 
 
 class State(Enum):

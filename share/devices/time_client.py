@@ -13,6 +13,8 @@ from share.net.udp import Host, StampedSocket, clock_precision
 from share.protocol.edge_clock import Exchange
 
 # ---- What answers of a time server say of the own clock: its offset, and how wrong that can be.
+#
+# RFC 5905, sections 8 and 10, for one who asks a few times and then says what it found (SNTP, section 14).
 
 MAX_DRIFT_PPM = 15  # PHI: how fast two clocks may part during an exchange
 

@@ -27,6 +27,9 @@ from share.mapping.segments import Node, Owners, dues
 from share.types import F64, Keyframe
 
 # ---- Fewer keyframes, the same room: those that show what others show as well are taken out.
+#
+# What is left covers the same views; odometry and loops of a keyframe that goes are moved to its neighbour
+# (`share.mapping.graph.updates`), so what was known stays known, a little less surely.
 
 _ROWS = 256
 _ALONE = 1e9  # as unlike as that is who has no other beside it

@@ -56,6 +56,9 @@ class Spacing:
 
 
 # ---- How far the body has moved since the keyframe that others were told of last, as it is known by now.
+#
+# What was told of that keyframe has been corrected since: at first mostly its tilt, by degrees. The
+# difference of what was told would have that as a turn of the body.
 
 _FOUND_COV = np.diag(np.repeat([0.01**2, 0.03**2], 3))  # rad, m: of a place found again by its ORB features
 

@@ -148,6 +148,9 @@ def _put(out: Sought, which: I64, found: patches.Found, good: NDArray[np.bool_],
 
 
 # ---- What the cameras should see of the features, and how that depends on every part of the state.
+#
+# A feature at inverse depth rho on the ray f of its host is q = f + rho p in any frame's homogeneous
+# coordinates: nothing here divides by rho, so a feature may be infinitely far (Civera et al. 2008).
 
 _NEAREST = 0.02  # homogeneous depth below which nothing is seen
 

@@ -26,6 +26,10 @@ from share.odometry.state import EXTRINSIC, State
 from share.types import F64, I64, ImuBatch
 
 # ---- A start for the fit of a single camera's first seconds, from nothing.
+#
+# The IMU carries the first shot's state to all others: they hang on its tilt and velocity and the biases. In
+# these and in depths, that rays meet is nearly linear (Dong-Si and Mourikis 2012): from anywhere, a few
+# rounds of weighted least squares lead there.
 
 SIDE = EXTRINSIC.start  # columns of pose, velocity and biases
 _USUAL_DEPTHS = (

@@ -407,6 +407,12 @@ class InertialTracker:
 
 
 # ---- Where in odom the body is told to be when the filter learns what is up.
+#
+# At rest, a tilt and a bias of the accelerometer cannot be told apart; only turning and speeding up part
+# them. When that comes, the filter turns all it knows about the place where it began: nothing has moved, but
+# a body that has gone 5 m since would be told to jump by 9 cm a degree. So poses are told as if it had turned
+# about the body: up is right at once, and the body stays where it was. What a pose is relative to any other
+# that the filter holds is not touched.
 
 _UP = 2
 

@@ -201,6 +201,11 @@ class ClockFilter:
 
 
 # ---- Whether an agent may say how far the edge's clock is off, and so compare the stamps of two machines.
+#
+# Nothing that is called latency or delay needs it: `track_ms`, `corrected_ms` and the delay of an evaluation
+# are each a difference of two times of the agent's own clock, and a round trip is the agent's time less what
+# the edge's clock says that it kept the question. What begins by one clock and ends by the other, such as the
+# way there alone, is known no better than the offset.
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,9 @@ from share.scheduling.policies import POLICIES
 from share.types import F64
 
 # ---- Which merges are skipped: those whose overlap is small against that of the merges before.
+#
+# P_skip = max(0, 1 - alpha_m V_new / V), V the mean overlap of the last N completed merges. Source: SHARE,
+# IMWUT 10(3) 97, 2026.
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,9 @@ from share.types import AgentKind
 from share.wire.messages import Evaluation
 
 # ---- The delay that an agent has whatever it sends: the least of late.
+#
+# Source: LEDBAT (RFC 6817, 3.4.2 and 4.2), which takes what a delay is above that for a queue's. Minima of
+# single minutes, the newest ten: who has come to a worse network is measured by the better one no longer.
 
 _MINUTE_NS = 60_000_000_000
 _HISTORY = 10  # minutes

@@ -83,6 +83,15 @@ def _squares(theta: F64, sizes: I64) -> F64:
 
 
 # ---- How much Allan variances of one recording scatter, and how alike.
+#
+# A running sum of samples with white noise, flicker noise and a random walk has stationary second
+# differences, whose covariances follow from one function of the lag (a generalised covariance: Matheron 1973)
+#
+#     G(h) = -N^2 |h| / 2  +  B^2 h^2 ln|h| / (2 pi)  +  K^2 |h|^3 / 12
+#
+# and a mean of squares of normal values has the covariance 2 sum R(k)^2 / n^2 (Isserlis). That gives the
+# equivalent degrees of freedom of NIST SP 1065, 5.4, for any mixture of the three, and the covariance between
+# averaging times, which fits usually leave out: neighbours are nearly copies.
 
 _FULL, _NEAR = 65, 33  # lags over all of a sum, and about each of its nine corners
 _SECOND = np.array([1.0, -2.0, 1.0])

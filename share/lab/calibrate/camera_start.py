@@ -129,6 +129,9 @@ def _equations(H: F64) -> tuple[F64, F64]:
 
 
 # ---- Projection of a target's corners by a lens, and all its derivatives.
+#
+# Models and order of the coefficients as in `share.geometry.lens`: fx fy cx cy, then k1 k2 p1 p2 [k3] of
+# radtan, k1 k2 k3 k4 of equidistant.
 
 _RADTAN, _EQUIDISTANT = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")
 

@@ -130,6 +130,9 @@ def _outlying(view_rms: F64) -> NDArray[np.bool_]:
 
 
 # ---- What the views of a target cover, what is missing, and which of many views to take.
+#
+# Intrinsics are told by corners in all of the image, by boards that lean to each side (else focal length and
+# distance are one), and by near and far ones.
 
 GRID = (6, 8)  # rows and columns of cells in which corners are counted
 _NAMES = (
@@ -229,6 +232,10 @@ def _told(view: View, target: Target, size: tuple[int, int]) -> dict[object, flo
 
 
 # ---- How well two cameras agree on where a corner can be, whatever the board is like.
+#
+# A corner of cam0 leaves a line on which cam1 must see it (Hartley and Zisserman, Multiple View Geometry,
+# 9.2). By how much it misses that line says nothing of the board's shape or pose, so pictures that had no
+# part in the calibration are a check of it, too. It is what stereo matching suffers from: rows that are off.
 
 
 def off_line(cam0: Camera, cam1: Camera, T_cam1_cam0: F64, views: Sequence[View]) -> F64:

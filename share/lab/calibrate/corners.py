@@ -211,6 +211,10 @@ def is_saddle(image: U8, px: F64, radii: I64) -> np.ndarray:
 
 # ---- Where corners of a flat board lie by what was found around them: a homography each, of its nearest
 # others.
+#
+# Some of the others may have been found wrongly, so each homography is the least median of squares over
+# homographies of four (Rousseeuw 1984), then least squares over those that it explains. All corners at once:
+# a board has more than a hundred of them, in every picture.
 
 MOST, LEAST = 12, 6  # neighbours
 _FOURS = 64  # where two fifths were found wrongly, one of them is without these, 99 of 100 times

@@ -12,6 +12,9 @@ from share.lab.calibrate.imu_noise import AxisNoise, Figure, fit, together
 from share.types import F64, I64, ImuBatch
 
 # ---- Which part of an IMU's recording is at rest, judged by the sensor's own noise.
+#
+# At rest the means of neighbouring seconds differ by little more than white noise makes them differ; a hand,
+# or a step beside the table, moves them by far more. No figure of the device is needed.
 
 WINDOW_S = 1.0
 LEAST_S = 60.0

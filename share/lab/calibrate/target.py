@@ -141,6 +141,13 @@ def _positive(target: Target, *names: str) -> None:
 
 
 # ---- Calibration targets in YAML, under Kalibr's names; also the `target` of a session.
+#
+# target_type: aprilgrid          target_type: charuco     (ours: Kalibr knows none)
+# tagCols: 6                      squaresX: 9
+# tagRows: 6                      squaresY: 7
+# tagSize: 0.088    # m           squareSize: 0.08         # m
+# tagSpacing: 0.3                 markerSize: 0.06         # m
+#                                 dictionary: DICT_5X5_100
 
 _KEYS: dict[str, tuple[type[Target], dict[str, str]]] = {
     "aprilgrid": (

@@ -143,6 +143,9 @@ class Batch:
 
 
 # ---- Normal equations of a chain of nodes that also shares a few unknowns: a band with a border.
+#
+# The band is factored once (Cholesky), the border is eliminated by its Schur complement: linear in the number
+# of nodes. Source: Golub and Van Loan, *Matrix Computations*, 4th ed., 4.3.5 and 3.2.
 
 
 @dataclass(frozen=True, eq=False)

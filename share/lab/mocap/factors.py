@@ -138,6 +138,10 @@ def _turn(R: F64, v: F64) -> F64:
 
 # ---- IMU preintegration over many intervals at once: what the body did, free of where it stood and how
 # fast.
+#
+# Rate and specific force are linear between samples; each step is a midpoint rule. Source: Forster, Carlone,
+# Dellaert, Scaramuzza, *On-Manifold Preintegration for Real-Time Visual-Inertial Odometry*, TRO 33(1), 2017,
+# eq. 33-38 (increments), 44-45 (derivatives by the bias), 63 (noise).
 
 
 @dataclass(frozen=True, eq=False)

@@ -138,6 +138,9 @@ def keyframes(
 
 
 # ---- What a tracker's keyframes looked like and how wrong it was: one file a run, for training.
+#
+# A NumPy archive (.npz) with a column each and `about`, JSON: of which session and agent, in which room, how
+# it moved, what was spoiled, and by which SHARE.
 
 SCHEMA = 4
 

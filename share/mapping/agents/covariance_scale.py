@@ -51,6 +51,12 @@ def plumb_line(config: MergeConfig, keyframe: Keyframe) -> F64:
 
 # ---- How sure agents are of their odometry, beside each other, by what they say and as far as it is
 # believed.
+#
+# Nothing shows in loops yet when two maps are joined, and who is surest bends the others. So until loops
+# tell, nobody is believed to be much surer than the surest of the others: by variances of its steps over
+# their size, in the median, for position and for turn. The covariances come here as they are believed, with
+# their floors (`share.mapping.agents.covariance_scale`): a claim far below a floor counts as the floor, and
+# is widened from there.
 
 _STEPS = 64  # of each agent: the newest
 _ENOUGH_STEPS = 8

@@ -17,6 +17,9 @@ from share.mapping.graph.edges import Edge
 from share.types import F64
 
 # ---- What is held against two agents: how severe it is, and in which words.
+#
+# A severity of 1 begins a disagreement. Each finding is (severity, of the second agent against the first, of
+# the first against the second).
 
 _SIGMAS = 4.5  # that a difference must have: of thousands of comparisons none by chance
 _TILT = np.radians(1.0)  # rad, less does no harm

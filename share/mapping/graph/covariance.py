@@ -160,6 +160,11 @@ class Roads:
 
 
 # ---- How well poses are known from one of them: an upper bound that hardly exceeds the truth.
+#
+# The exact covariance costs a factorisation of the whole graph. But what is left out of a graph can only have
+# told more, so the covariance in a part of it is an upper bound. The part that says most is that along the
+# surest ways: once found, their edges are made dearer, and the next surest ways are added, until there are
+# enough edges.
 
 _LEAST_WEIGHT = 1e-9  # of a loop that all else speaks against, so that it can be divided by
 _UNKNOWN = 1e6 * np.eye(6)

@@ -155,6 +155,11 @@ def _log(T: F64) -> F64:
 
 
 # ---- Which way is up at a pose, as its agent's IMU knows it: what a plumb line says there.
+#
+# plumb (N, 3): the unit vector against gravity in the body, divided by its sigma (rad), zeros where unknown.
+# z of the map is up, so the whitened residual of a pose with rotation R is what is not vertical of it: the
+# first two rows of R plumb. Of a perturbation Exp(xi) on the right its derivative is -(R [plumb]x). Source:
+# Usenko et al., *Visual-Inertial Mapping with Non-Linear Factor Recovery*, RA-L 2020, the roll-pitch factor.
 
 
 def cost(poses: F64, plumb: F64) -> float:

@@ -22,6 +22,10 @@ from share.mapping.graph.edges import equations as plumb_equations
 from share.types import F64, I64
 
 # ---- Levenberg-Marquardt on re-weighted least squares: the most likely poses of one connected part.
+#
+# Odometry is Gaussian; loops are under a Cauchy kernel, since one false loop must not bend the map. Source:
+# Triggs et al., *Bundle Adjustment: A Modern Synthesis*, 2000; Cauchy against 30 % false loops:
+# docs/edge-map.md.
 
 _FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e8
 _LEAST_CURVATURE = 0.5  # of a loop along its residual, beside that across; 0.3 overshot at times

@@ -18,6 +18,8 @@ from share.types import F32, U8, Footing, TrackState, checked
 from share.vision.corners import cells
 
 # ---- Eight numbers of a keyframe: how its image looks, and how its tracker fares.
+#
+# Source: SHARE, IMWUT 10(3) 97, 2026; what it leaves open is settled in docs/error-model.md.
 
 NAMES = (
     "brightness",
@@ -77,6 +79,9 @@ def _many(count: int) -> float:
 
 
 # ---- Where in the image there is something to hold on to: the point spatial distribution (PSD).
+#
+# A grid over cam0's image with three channels: how strong a corner each cell has, how many features there the
+# pose rests on, and how near they are. Source: SHARE, IMWUT 10(3) 97, 2026; scales: docs/error-model.md.
 
 GRID = (16, 12)  # cells across and down, whatever the camera
 CHANNELS = 3
