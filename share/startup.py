@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from share import processes
+from share import children
 
 _THREADS = (
     "OMP_NUM_THREADS",
@@ -28,7 +28,7 @@ _TIDY_S = 60.0
 def prepare() -> None:
     """Ends with the SHARE process that started it, if one did; thread counts and malloc thresholds. What the
     user set in the environment stays."""
-    processes.follow_starter()
+    children.follow_starter()
     for name in _THREADS:
         os.environ.setdefault(name, "1")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")

@@ -27,7 +27,7 @@ from share.lab.emulate.types import Moment, Room  # noqa: E402
 from share.lab.emulate.world.build import build  # noqa: E402
 from share.lab.emulate.world.files import load_room, save_room  # noqa: E402
 from share.lab.emulate.world.scenes import SCENES, layout  # noqa: E402
-from share.processes import SPAWN  # noqa: E402
+from share.spawning import SPAWN  # noqa: E402
 
 D435I = Camera(640, 480, 383.2, 384.1, 318.7, 242.3)
 EUROC = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019359, 1.76e-05))

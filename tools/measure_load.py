@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from share import processes, startup
+from share import children, startup
 
 startup.prepare()
 
@@ -89,7 +89,7 @@ def carry(agents: int, seconds: float, config: Path | None) -> Row:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            env=processes.environment(),
+            env=children.environment(),
         ) as generator:
             used = _watch(generator, front, status)
             told, _ = generator.communicate("\n")
@@ -109,7 +109,7 @@ def edge(folder: Path, config: Path | None) -> Iterator[tuple[subprocess.Popen[s
     command += ["--map", folder / "map.sqlite", "--out", folder / "out"]
     command += [] if config is None else ["--config", config]
     front = subprocess.Popen(
-        [str(word) for word in command], stderr=subprocess.PIPE, text=True, env=processes.environment()
+        [str(word) for word in command], stderr=subprocess.PIPE, text=True, env=children.environment()
     )
     try:
         assert front.stderr is not None

@@ -32,7 +32,7 @@ from tool_main import exit_code, line  # noqa: E402
 
 from share.errors import UsageError  # noqa: E402
 from share.lab.emulate.recipe import Recipe  # noqa: E402
-from share.processes import SPAWN  # noqa: E402
+from share.spawning import SPAWN  # noqa: E402
 
 KINDS = ("ar", "ar", "robot")
 APART_M = 1000.0  # of rooms

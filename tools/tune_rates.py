@@ -38,7 +38,7 @@ from tool_main import exit_code, line  # noqa: E402
 
 from share.errors import UsageError  # noqa: E402
 from share.lab.emulate.recipe import Recipe  # noqa: E402
-from share.processes import SPAWN  # noqa: E402
+from share.spawning import SPAWN  # noqa: E402
 
 FIGURES = ("AR latency", "robot latency", "AR error", "robot error", "merges")
 USUAL = {"ar": "walk:", "robot": "robot:"}

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
-from share import processes
+from share import children
 from share.files.writing import fresh
 
 
@@ -41,7 +41,7 @@ def _start(sink: IO[bytes], arguments: tuple[str, ...]) -> subprocess.Popen[byte
         stdin=subprocess.DEVNULL,
         stdout=sink,
         stderr=subprocess.STDOUT,
-        env=processes.environment(),
+        env=children.environment(),
         process_group=0,
     )
 

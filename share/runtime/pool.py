@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import TypeVar
 
 from share.errors import ShareError
-from share.processes import SPAWN, held
+from share.spawning import SPAWN, held
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

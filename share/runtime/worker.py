@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from share import startup
-from share.processes import SPAWN
+from share.spawning import SPAWN
 
 Inbox = queue.SimpleQueue[Any]
 Work = Callable[..., None]  # (inbox, answer, *arguments); ends when it takes END from the inbox

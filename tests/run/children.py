@@ -9,7 +9,7 @@ import sys
 import time
 from pathlib import Path
 
-from share.processes import environment
+from share.children import environment
 
 SHARE = [sys.executable, "-m", "share"]
 

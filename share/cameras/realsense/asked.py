@@ -6,7 +6,7 @@ import multiprocessing
 import os
 from multiprocessing.connection import Connection
 
-from share import processes
+from share import children
 from share.cameras.realsense.devices import attached, load_sdk
 from share.devices.camera_check import Sdk
 from share.errors import ShareError
@@ -18,7 +18,7 @@ def ask(patience_s: float = _PATIENCE_S) -> Sdk:
     """Never raises: what went wrong is in `trouble`."""
     context = multiprocessing.get_context("fork")  # a frozen program has no Python to start
     here, there = context.Pipe(duplex=False)
-    child = context.Process(target=_tell, args=(there, os.getpid(), processes.is_main()), daemon=True)
+    child = context.Process(target=_tell, args=(there, os.getpid(), children.is_main()), daemon=True)
     child.start()
     there.close()
     try:
@@ -37,7 +37,7 @@ def ask(patience_s: float = _PATIENCE_S) -> Sdk:
 
 
 def _tell(to: Connection, parent: int, from_main: bool) -> None:
-    processes.follow(parent, from_main)
+    children.follow(parent, from_main)
     to.send(_query())
 
 
