@@ -111,7 +111,7 @@ def gains(state: State, rows: Sight, common: F64 | None = None, exactly: bool = 
         S[both] += (AS_ONE * rows.lasting[left] * rows.lasting[right]).astype(kind)
         S[both[::-1]] = S[both]
     if common is not None:
-        B = (by_host @ se3.adjoint(state.T).astype(kind)).astype(kind)
+        B = by_host @ se3.adjoint(state.T).astype(kind)
         S += B @ common.astype(kind) @ B.T
     poses = HP[:, CORE : state.features_at].reshape(2 * M, -1, 6)
     poses += HP[:, None, POSE]

@@ -213,7 +213,6 @@ def _read_file(path: Path, most: int) -> bytes:
 
 # ---- What a JPEG or PNG says it is, before a decoder sees it. Pure: bytes in, numbers out.
 
-_PNG_HEADER = b"\x89PNG\r\n\x1a\n"
 _SOF = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # frames; the others are tables (ITU T.81, B.1.1.3)
 _BARE = frozenset((0x01, *range(0xD0, 0xD9)))  # markers without a length
 _SEQUENTIAL = frozenset((0xC0, 0xC1))
@@ -234,7 +233,7 @@ class ImageHeader(NamedTuple):
 
 def image_header(data: bytes) -> ImageHeader | None:
     """None where it does not say, or is neither."""
-    return _png(data) if data[:8] == _PNG_HEADER else _jpeg(data) if data[:2] == b"\xff\xd8" else None
+    return _png(data) if data[:8] == _PNG_MAGIC else _jpeg(data) if data[:2] == b"\xff\xd8" else None
 
 
 def _png(data: bytes) -> ImageHeader | None:

@@ -23,7 +23,6 @@ from share.types import F64, View
 from share.vision.matching import Pairs, hamming, mutual, near
 
 _NEAR, _FAR = 0.05, 1000.0  # m; a depth outside says nothing
-_WIDEST = 10.0  # |u|, |v| of a keypoint that a lens can see (84 degrees off the axis)
 
 
 MIN_ITERATIONS = 50  # of each consensus: one wrong place costs more than a millisecond
