@@ -23,7 +23,7 @@ _FOCAL_PX = (1.0, 1e5)  # shorter or longer, and what is divided or multiplied b
 _MOST_PX = 1e6  # the principal point, which may lie outside the image, from its corner
 _MOST_NOISE, _MOST_RATE_HZ = 1e3, 1e5  # of an IMU
 _MOST_GYRO_BIAS, _MOST_ACCEL_BIAS = 0.5, 3.0  # rad/s, m/s^2
-_MOST_APART_M = 100.0  # of what sits on one body
+MOST_APART_M = 1e3  # of what sits on one body, also in millimetres, of which `rig_check` says more
 _RIGID = 1e-6  # what is off by less stays to the last digit
 _MOST_DISTORTION = 1e4  # of a coefficient; k3 of a lens with a narrow view is some hundreds
 
@@ -216,11 +216,11 @@ class ImuBias:
 def _extrinsics(name: str, value: F64) -> F64:
     """As `checked_pose`, of what sits on one body. A calibration may be rounded to three digits, whose
     products and inverses are no rigid transforms: it is the nearest one."""
-    T = checked_pose(name, value, _MOST_APART_M)
+    T = checked_pose(name, value, MOST_APART_M)
     R = T[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() <= _RIGID:
         return T
-    return checked_pose(name, se3.orthonormal(T), _MOST_APART_M)
+    return checked_pose(name, se3.orthonormal(T), MOST_APART_M)
 
 
 @dataclass(frozen=True, eq=False)

@@ -93,5 +93,5 @@ def test_a_calibration_that_was_rounded_is_the_nearest_rigid_one():
 
 
 def test_what_sits_on_one_body_is_near_it():
-    with pytest.raises(ValueError, match="T_body_cam0: is more than 100 m away"):
-        Rig(PLAIN, se3.exp(np.array([0, 0, 0, 150.0, 0, 0])))
+    with pytest.raises(ValueError, match="T_body_cam0: is more than 1000 m away"):
+        Rig(PLAIN, se3.exp(np.array([0, 0, 0, 1500.0, 0, 0])))
