@@ -254,6 +254,9 @@ class MergeConfig:
     scale_tolerance: float = 0.015  # agents whose depths or ways differ by more (1.5 %) keep apart
     drop_chi2: float = 1000.0  # a solved graph at odds with a loop by more than this drops it
 
+    def __post_init__(self) -> None:
+        _require_positive(self, "min_loop_gap", "most_loops", "max_pending")
+
 
 STREAMED = "streamed"
 POLICIES = ("share", "covins-g", "linear", "equal", "random", STREAMED)  # see `share.scheduling.policies`

@@ -119,6 +119,7 @@ def agent(
     click.echo(json.dumps(run.report) if as_json else _summary(run))
     if (missing := _unacknowledged(run, hello.name, settings.agent.finish_s)) is not None:
         line.say(missing)
+        line.end()
     if not run.report["protocol"]["edge_sessions"]:
         if (refusal := run.report["protocol"]["refusal"]) is not None:
             raise ShareError(f"the edge at {address} refuses '{hello.name}': {refusal}")

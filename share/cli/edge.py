@@ -13,6 +13,7 @@ from share.config import POLICIES, STREAMED
 from share.errors import UsageError
 
 if TYPE_CHECKING:
+    from share.cli.saying import Stderr
     from share.net.keys import EdgeKeys
     from share.store.map_store import MapStore
 
@@ -56,6 +57,7 @@ def edge(
     from contextlib import ExitStack, closing
     from dataclasses import replace
 
+    from share.cli.saying import Stderr
     from share.net.transport import bind as bind_link
     from share.net.transport import parse_address
     from share.runtime.edge import EdgeRun
@@ -73,22 +75,23 @@ def edge(
     folder = None if out is None else Path(out)
     runs: list[EdgeRun] = []
     with ExitStack() as stack:
+        stderr = stack.enter_context(closing(Stderr()))
         link = stack.enter_context(closing(bind_link(bind, with_keys, most)))
         status = None
         if http is not None:  # before any process is started: the port may be in use
             status = stack.enter_context(
-                closing(StatusServer(http, lambda: runs[0].report() if runs else {}))
+                closing(StatusServer(http, lambda: runs[0].report() if runs else {}, stderr.tell))
             )
-        store = None if map_file is None else stack.enter_context(_open_map(Path(map_file)))
+        store = None if map_file is None else stack.enter_context(_open_map(stderr, Path(map_file)))
         run = stack.enter_context(
-            closing(EdgeRun(settings, link, folder, lambda e: _tell(e, verbose), store))
+            closing(EdgeRun(settings, link, folder, lambda e: _tell(stderr, e, verbose), store))
         )
         runs.append(run)
         with on_stop(run.stop):
-            click.echo(f"listening on {link.endpoint}, policy {settings.edge.policy}", err=True)
-            _say_keys(with_keys)
+            stderr.tell(f"listening on {link.endpoint}, policy {settings.edge.policy}")
+            _say_keys(stderr, with_keys)
             if status is not None:
-                click.echo(f"status at http://{status.endpoint}/", err=True)
+                stderr.tell(f"status at http://{status.endpoint}/")
             report = run.go()
     click.echo(json.dumps(report) if as_json else _summary(report))
 
@@ -102,25 +105,25 @@ def _keys(folder: str | None, local: bool) -> EdgeKeys | None:
     return edge_keys(None if folder is None else Path(folder))
 
 
-def _open_map(path: Path) -> MapStore:
+def _open_map(stderr: Stderr, path: Path) -> MapStore:
     """Says what is in it, and what is wrong with it. Raises UsageError, ShareError."""
     from share.store.map_store import MapStore
 
     store = MapStore.open(path)
     kept = store.peek()
     for complaint in kept.complaints:
-        click.echo(f"map {path}: {complaint}", err=True)
+        stderr.tell(f"map {path}: {complaint}")
     if not store.writable:
-        click.echo(f"map {path}: {store.reason}; what is in it is used, nothing new is kept", err=True)
+        stderr.tell(f"map {path}: {store.reason}; what is in it is used, nothing new is kept")
     counts = f"{len(kept.keyframes)} keyframes of {len(kept.runs)} runs, {len(kept.loops)} loops"
-    click.echo(f"map {path}: {counts}", err=True)
+    stderr.tell(f"map {path}: {counts}")
     return store
 
 
-def _say_keys(keys: EdgeKeys | None) -> None:
+def _say_keys(stderr: Stderr, keys: EdgeKeys | None) -> None:
     if keys is not None:
         names = ", ".join(sorted(keys.allowed.names().values()))
-        click.echo(f"public key '{keys.own.public}'; authorized: {names or 'nobody yet'}", err=True)
+        stderr.tell(f"public key '{keys.own.public}'; authorized: {names or 'nobody yet'}")
 
 
 _NEWS = {"joined the edge", "left", "back", "silent", "refused"}
@@ -136,10 +139,10 @@ _NEWS |= {
 _NEWS |= {"odometry doubted", "map", "tracking lost"}
 
 
-def _tell(event: dict[str, Any], verbose: bool) -> None:
+def _tell(stderr: Stderr, event: dict[str, Any], verbose: bool) -> None:
     if verbose or event["event"] in _NEWS:
         agent = f" {event['agent']}:" if event["agent"] else ""
-        click.echo(f"{event['t_s']:9.3f} s {event['event']}:{agent} {event['reason']}", err=True)
+        stderr.tell(f"{event['t_s']:9.3f} s {event['event']}:{agent} {event['reason']}")
 
 
 def _summary(report: dict[str, Any]) -> str:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 
 import click
+
+from share.cli.saying import Stderr
 
 
 @contextmanager
@@ -22,32 +24,31 @@ def progress(total: int, label: str) -> Iterator[Callable[[int], None]]:
 
 class LiveLine:
     """One line on a terminal that is written over, cut where that ends; where stderr is none, nothing. A
-    terminal that is gone ends nothing."""
+    terminal that is gone or held ends and delays nothing."""
 
     def __init__(self) -> None:
-        self.seen, self._shown = sys.stderr.isatty(), False
+        self._stderr = Stderr()
+        self.seen, self._shown = self._stderr.is_terminal, False
 
     def write(self, text: str) -> None:
         if self.seen:
-            _tell("\r\x1b[K" + text[: _columns()], nl=False)
+            self._stderr.tell("\r\x1b[K" + text[: _columns()], nl=False)
             self._shown = True
 
     def end(self) -> None:
-        """Leaves the line as it is; what follows begins on a new one."""
-        if self._shown:
-            _tell("")
-        self._shown = False
+        """Leaves the line as it is; what follows begins on a new one. Waits a moment until all is written."""
+        self._leave()
+        self._stderr.flush()
 
     def say(self, text: str) -> None:
         """A line of its own on stderr, terminal or not."""
-        self.end()
-        _tell(text)
+        self._leave()
+        self._stderr.tell(text)
 
-
-def _tell(text: str, nl: bool = True) -> None:
-    """To whoever still reads stderr."""
-    with suppress(OSError):
-        click.echo(text, err=True, nl=nl)
+    def _leave(self) -> None:
+        if self._shown:
+            self._stderr.tell("")
+        self._shown = False
 
 
 def _columns() -> int | None:

@@ -65,6 +65,7 @@ def track(
     wanted = _targets(named, source)
     truth = opened.truth()  # if it is damaged, better now than after tracking
     run = _tracked(opened, settings, line)
+    line.end()
     options.say_losses(opened)
     if not len(run.trajectory.stamps_ns):
         raise DataError(
@@ -109,9 +110,7 @@ def _tracked(opened: Source, settings: Config, line: LiveLine) -> TrackRun:
         with progress(opened.images_count, "tracking") as bar:
             return track(opened, settings, lambda result: bar(1), say)
     with on_stop(opened.stop):
-        run = track(opened, settings, live.Shown(opened.feed, line), say)
-    line.end()
-    return run
+        return track(opened, settings, live.Shown(opened.feed, line), say)
 
 
 def _waited(report: dict[str, Any]) -> list[str]:

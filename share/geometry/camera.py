@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from share.geometry import se3
 from share.geometry.lens import COUNTS, EQUIDISTANT, RADTAN, Equidistant, Radtan, lens
 from share.types import F64, checked, checked_pose
 
@@ -22,6 +23,8 @@ _FOCAL_PX = (1.0, 1e5)  # shorter or longer, and what is divided or multiplied b
 _MOST_PX = 1e6  # the principal point, which may lie outside the image, from its corner
 _MOST_NOISE, _MOST_RATE_HZ = 1e3, 1e5  # of an IMU
 _MOST_GYRO_BIAS, _MOST_ACCEL_BIAS = 0.5, 3.0  # rad/s, m/s^2
+MOST_APART_M = 1e3  # of what sits on one body, also in millimetres, of which `rig_check` says more
+_RIGID = 1e-6  # what is off by less stays to the last digit
 _MOST_DISTORTION = 1e4  # of a coefficient; k3 of a lens with a narrow view is some hundreds
 
 
@@ -210,6 +213,16 @@ class ImuBias:
             raise ValueError("IMU: a bias is never known exactly")
 
 
+def _extrinsics(name: str, value: F64) -> F64:
+    """As `checked_pose`, of what sits on one body. A calibration may be rounded to three digits, whose
+    products and inverses are no rigid transforms: it is the nearest one."""
+    T = checked_pose(name, value, MOST_APART_M)
+    R = T[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() <= _RIGID:
+        return T
+    return checked_pose(name, se3.orthonormal(T), MOST_APART_M)
+
+
 @dataclass(frozen=True, eq=False)
 class Rig:
     """All cameras of one agent in its body frame (the IMU's; cam0's where there is no IMU).
@@ -236,7 +249,7 @@ class Rig:
         for name in ("T_body_cam0", "T_cam1_cam0", "T_depth_cam0"):
             T = getattr(self, name)
             if T is not None:
-                object.__setattr__(self, name, checked_pose(name, T))
+                object.__setattr__(self, name, _extrinsics(name, T))
         if self.T_cam1_cam0 is not None and not BASELINE_M[0] <= self.baseline <= BASELINE_M[1]:
             raise ValueError(
                 f"T_cam1_cam0: the cameras are {self.baseline:g} m apart, not {BASELINE_M[0]:g} to "

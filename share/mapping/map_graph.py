@@ -264,7 +264,10 @@ class Chart:
 
     def name(self, stretch: int) -> str:
         """Of the map that this stretch is in."""
-        return self.trails.stretches[self.founder[stretch]].name
+        lost = stretch >= len(
+            self.founder
+        )  # of a damaged file that has none of its keyframes, nor later ones
+        return self.trails.stretches[stretch if lost else self.founder[stretch]].name
 
     def named(self, map_id: str) -> int:
         """The founder of a map. Raises ValueError if there is none of that name."""

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from edge_sim import Person, walls
+from hellos import hello_of
 
 from share.config import Config
 from share.geometry import se3
@@ -167,3 +168,11 @@ def test_a_join_that_poses_were_not_kept_of_is_not_told_as_it_was_before(tmp_pat
         kept = store.load()
     assert len(kept.loops) > 0
     assert [run.finding for run in known_runs(kept, 0.05)] == [None, None]
+
+
+def test_runs_whose_keyframes_a_damaged_file_has_lost_are_reported():
+    mapper = Mapper(Config())
+    run = KeepRun("ann-1234", hello_of("ann", 1))
+    mapper.restore(Kept(runs=(run,), stretches=("ann-1234/0",)))
+    assert mapper.report()["agents"]["ann-1234"]["map_id"] == "ann-1234/0"
+    assert not mapper.report()["maps"]

@@ -2,6 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
+from share.geometry import se3
 from share.geometry.camera import Camera, Rig
 
 EUROC = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019359, 1.76e-05))
@@ -79,3 +80,18 @@ def test_a_baseline_that_is_not_in_metres_is_refused(metres: float) -> None:
     T[0, 3] = -metres
     with pytest.raises(ValueError, match=r"T_cam1_cam0: the cameras are .* m apart.*in metres"):
         Rig(camera, np.eye(4), camera, T)
+
+
+def test_a_calibration_that_was_rounded_is_the_nearest_rigid_one():
+    """Else products of it are none, and no loop of that agent could be believed."""
+    exact = se3.exp(np.array([0.4, -1.1, 0.7, 0.02, 0.01, -0.03]))
+    held = Rig(PLAIN, np.round(exact, 3)).T_body_cam0
+    assert np.abs(held[:3, :3] @ held[:3, :3].T - np.eye(3)).max() < 1e-12
+    assert np.abs(held - exact).max() < 1e-3
+    as_printed = np.round(exact, 9)
+    assert Rig(PLAIN, as_printed).T_body_cam0.tobytes() == as_printed.tobytes()
+
+
+def test_what_sits_on_one_body_is_near_it():
+    with pytest.raises(ValueError, match="T_body_cam0: is more than 1000 m away"):
+        Rig(PLAIN, se3.exp(np.array([0, 0, 0, 1500.0, 0, 0])))

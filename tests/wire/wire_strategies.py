@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from share.geometry import se3
-from share.geometry.camera import BASELINE_M, MOST_TIMESHIFT_S, Camera, ImuNoise, Rig
+from share.geometry.camera import BASELINE_M, MOST_APART_M, MOST_TIMESHIFT_S, Camera, ImuNoise, Rig
 from share.names import checked_name
 from share.types import (
     MAX_ID,
@@ -117,9 +117,9 @@ def tracked(draw: st.DrawFn) -> m.Tracked:
 def rigs(draw: st.DrawFn) -> Rig:
     beside = poses(BASELINE_M[1] / 2).filter(lambda T: np.linalg.norm(T[:3, 3]) > BASELINE_M[0])
     cam1 = draw(st.none() | st.tuples(cameras, beside)) or (None, None)
-    depth = draw(st.none() | st.tuples(cameras, poses())) or (None, None)
+    depth = draw(st.none() | st.tuples(cameras, poses(MOST_APART_M))) or (None, None)
     shift_s = draw(st.floats(-MOST_TIMESHIFT_S, MOST_TIMESHIFT_S))
-    return Rig(draw(cameras), draw(poses()), *cam1, *depth, draw(st.none() | imus), shift_s)
+    return Rig(draw(cameras), draw(poses(MOST_APART_M)), *cam1, *depth, draw(st.none() | imus), shift_s)
 
 
 messages = st.one_of(
