@@ -17,17 +17,18 @@ from share.types import F64, Correction
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """Which stored keyframes look like this one?"""
+    """Which stored keyframes look like this one? aside: see `PlaceIndex.query`."""
 
     index: PlaceIndex
     number: int
     sight: Sight
     limit: int
     exclude: tuple[int, ...]
+    aside: tuple[int, ...] = ()
     kind: str = "place"
 
     def run(self) -> list[Candidate]:
-        return self.index.query(self.sight.view.descriptors, self.limit, self.exclude)
+        return self.index.query(self.sight.view.descriptors, self.limit, self.exclude, self.aside)
 
 
 @dataclass(frozen=True, eq=False)
