@@ -19,7 +19,7 @@ TOOLS = Path(__file__).resolve().parents[2] / "tools"
 STEPS = 48
 SEEDS = range(1, 11)
 COSTS = 1.10  # what a lie may cost the others, as a part of their error: of all rooms together
-AT_MOST = 1.25  # the same, in any one room: what chance does to a room of two is up to 1.11 (a third elsewhere)
+AT_MOST = 1.25  # the same, in any one room: an honest third in another place costs up to 1.11 there
 LIES = {  # and what is said of it
     "scale 0.99 sure 10": "agrees",
     "scale 1.02 sure 10": "set apart",
