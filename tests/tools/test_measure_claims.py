@@ -161,8 +161,8 @@ def test_noise_of_who_is_too_sure_parts_nobody(tool):
 
 
 def test_a_lie_is_found_out_before_it_moves_anybody(tool, monkeypatch):
-    """The others come together as they do without it, at the fifth second; by then it is set apart, and looked
-    up after them, if at all."""
+    """The others come together as they do without it, at the fifth second; by then it is set apart, and
+    looked up after them, if at all."""
     short, asked, run = room(1, 21), [], Query.run
     config = tool.configured(['edge.policy="covins-g"'])
     monkeypatch.setattr(Query, "run", lambda query: asked.append(query) or run(query))
