@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -32,31 +32,21 @@ class Effort(NamedTuple):
 
 
 class Search:
-    """For the place of keyframe `number`; candidates: best first. What comes to wait meanwhile hurries it.
-    aside: those of them that are of agents that are kept apart from its own: they come last, whether or not
-    one of the others was it, and no more of them than would be enough of the others."""
+    """For the place of keyframe `number`; candidates: best first. What comes to wait meanwhile hurries it."""
 
-    def __init__(
-        self, number: int, candidates: Iterable[int], effort: Effort, aside: Collection[int] = ()
-    ) -> None:
+    def __init__(self, number: int, candidates: Iterable[int], effort: Effort) -> None:
         self.number = number
-        self._left, self._aside, self._effort = deque[int](), deque[int](), effort
-        last = set(aside)
-        for candidate in candidates:
-            (self._aside if candidate in last else self._left).append(candidate)
-        self._tried = self._verified = self._tried_aside = 0
+        self._left, self._effort = deque(candidates), effort
+        self._tried = self._verified = 0
 
     def next(self, in_a_hurry: bool) -> int | None:
         """The candidate to try now; None when there are no more, or enough."""
         most = self._effort.hurried if in_a_hurry else self._tried + 1
         enough = 1 if in_a_hurry else self._effort.enough
-        if self._left and self._tried < most and self._verified < enough:
-            self._tried += 1
-            return self._left.popleft()
-        if self._aside and self._tried_aside < enough:
-            self._tried_aside += 1
-            return self._aside.popleft()
-        return None
+        if not self._left or self._tried >= most or self._verified >= enough:
+            return None
+        self._tried += 1
+        return self._left.popleft()
 
     def verified(self) -> None:
         """The last one is it."""

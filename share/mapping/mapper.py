@@ -251,15 +251,15 @@ class Mapper:
     # ------------------------------------------------------------------ steps
 
     def _ask(self, number: int) -> Query:
-        near, aside = self._atlas.neighbours(number), self._atlas.kept_apart(number)
+        near = self._atlas.neighbours(number)
         if number % _LOOK_AGAIN:  # what is kept apart is looked up seldom: it may agree by now
-            near, aside = near + aside, ()
-        return Query(self._index, number, self._sights[number], self._config.place.candidates, near, aside)
+            near += self._atlas.kept_apart(number)
+        return Query(self._index, number, self._sights[number], self._config.place.candidates, near)
 
     def _begin_search(self, query: Query, found: list[int]) -> None:
         if self._lookups.in_a_hurry:
             found = self._atlas.promising_first(query.number, [n for n in found if n in self._sights])
-        self._query, self._search = query, Search(query.number, found, self._effort, query.aside)
+        self._query, self._search = query, Search(query.number, found, self._effort)
 
     def _next_verify(self) -> Verify | None:
         """Those that have been taken out meanwhile are passed over."""

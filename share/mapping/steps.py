@@ -17,18 +17,17 @@ from share.types import F64, Correction
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """Which stored keyframes look like this one? aside: see `PlaceIndex.query`."""
+    """Which stored keyframes look like this one?"""
 
     index: PlaceIndex
     number: int
     sight: Sight
     limit: int
     exclude: tuple[int, ...]
-    aside: tuple[int, ...] = ()
     kind: str = "place"
 
     def run(self) -> list[Candidate]:
-        return self.index.query(self.sight.view.descriptors, self.limit, self.exclude, self.aside)
+        return self.index.query(self.sight.view.descriptors, self.limit, self.exclude)
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,11 +38,3 @@ def test_who_comes_meanwhile_ends_it():
 def test_the_settings_say_how_many():
     config = Config()
     assert Effort.of(config) == (config.place.enough, config.edge.hurry_candidates)
-
-
-def test_agents_kept_apart_cost_the_others_no_try_and_are_tried_all_the_same():
-    """Of every two candidates the better is kept apart."""
-    apart = [0, 2, 4, 6]
-    assert tried(Search(9, range(8), EFFORT, apart), [False] * 20, set()) == [1, 3, 5, 7, 0, 2, 4]
-    assert tried(Search(9, range(8), EFFORT, apart), [True] * 20, set()) == [1, 3, 0]
-    assert tried(Search(9, range(8), EFFORT, apart), [True] * 20, {1}) == [1, 0]

@@ -38,16 +38,6 @@ def test_excluded_ones_stay_out_and_the_limit_holds() -> None:
     assert not {1004, 1000} & set(ids)
 
 
-def test_those_aside_come_last_and_take_no_place() -> None:
-    rng = np.random.default_rng(1)
-    index, places = filled(20, rng)
-    usual = [c.id for c in index.query(places[4], limit=5)]
-    aside = usual[:2]
-    found = [c.id for c in index.query(places[4], limit=5, aside=aside)]
-    assert found[:5] == [c.id for c in index.query(places[4], limit=5, exclude=aside)]
-    assert found[5:] == aside
-
-
 def test_what_is_everywhere_says_nothing() -> None:
     rng = np.random.default_rng(2)
     common = rng.integers(0, 256, (150, 32), np.uint8)

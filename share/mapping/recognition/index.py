@@ -86,11 +86,8 @@ class PlaceIndex:
                 return
         raise KeyError(f"keyframe {id} is not in the index")
 
-    def query(
-        self, descriptors: U8, limit: int, exclude: Collection[int] = (), aside: Collection[int] = ()
-    ) -> list[Candidate]:
-        """Up to `limit` stored keyframes that share words with descriptors (N, 32), best first; then up to as
-        many of those aside, which take no place from the others.
+    def query(self, descriptors: U8, limit: int, exclude: Collection[int] = ()) -> list[Candidate]:
+        """Up to `limit` stored keyframes that share words with descriptors (N, 32), best first.
 
         A shared word counts log(n / df).
         """
@@ -102,10 +99,8 @@ class PlaceIndex:
         ids, sizes, votes = (np.concatenate(column) for column in zip(*parts, strict=True))
         scores = votes / np.sqrt(np.maximum(1, sizes))
         scores[np.isin(ids, list(exclude))] = 0.0
-        ranked = np.argsort(-scores, kind="stable")
-        last = np.isin(ids[ranked], list(aside))
-        some = (*ranked[~last][:limit], *ranked[last][:limit])
-        return [Candidate(int(ids[i]), float(scores[i])) for i in some if scores[i] > 0]
+        ranked = np.argsort(-scores, kind="stable")[:limit]
+        return [Candidate(int(ids[i]), float(scores[i])) for i in ranked if scores[i] > 0]
 
     def _weighted(self, descriptors: U8) -> tuple[I64, F64]:
         """The view's distinct words that may be read, and what each counts for."""
