@@ -83,6 +83,25 @@ def test_a_turned_camera_is_measured():
     assert found.turn.significance > 4.5
 
 
+def test_noise_of_who_is_too_sure_is_no_turn_once_its_claims_are_widened():
+    """By ten loops, of ways that are ten times as noisy as claimed."""
+    found, as_claimed = [], []
+    for seed in range(20):
+        few = loops(np.random.default_rng(seed), drift=10.0)[:10]
+        as_claimed.append(compare(few).turn)
+        found.append(compare(few, (1.0, 100.0)).turn)
+    assert max(turn.significance for turn in as_claimed) > 4.5
+    assert max(turn.significance for turn in found) < 3
+
+
+def test_claims_that_are_widened_hide_neither_a_turned_camera_nor_a_longer_way():
+    wide = compare(loops(np.random.default_rng(4), turn=np.radians(4.0)), (1.0, 4.0))
+    assert np.degrees(wide.turn.value) == pytest.approx(4.0, abs=1.0)
+    assert wide.turn.significance > 4.5
+    long = loops(np.random.default_rng(3), scale=1.03)
+    assert compare(long, (1.0, 100.0)).path == compare(long).path
+
+
 def test_drift_beyond_its_covariances_is_seen():
     """Beyond the loops' own noise: 6 cm a step. What is less than that noise, no loop can tell."""
     assert compare(loops(np.random.default_rng(5), drift=30.0, sure=0.01)).nis > 3

@@ -13,12 +13,22 @@ import pytest
 from edge_sim import Person, walls
 
 from share.geometry import se3
+from share.mapping.steps import Query
 from share.types import AgentKind, Keyframe
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
 STEPS = 48
-COSTS = 1.10  # what a lie may cost the others, as a part of their error
-LIES = ["scale 0.99 sure 10", "scale 1.02 sure 10", "scale 0.97 sure 100"]
+SEEDS = range(1, 11)
+COSTS = 1.10  # what a lie may cost the others, as a part of their error: of all rooms together
+AT_MOST = 1.25  # the same, in any one room: an honest third in another place costs up to 1.11 there
+LIES = {  # and what is said of it
+    "scale 0.99 sure 10": "agrees",
+    "scale 1.02 sure 10": "set apart",
+    "scale 0.97 sure 100": "set apart",
+    "way 1.05 sure 10": "set apart",
+    "camera 5 deg sure 10": "set apart",
+    "sure 10": "agrees",
+}
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +39,7 @@ def tool():
 
 
 @cache
-def room(seed: int):
+def room(seed: int, steps: int = STEPS):
     """As a `KeyframeSet`: two headsets and a robot walk round, 0.2 m and 250 ms from keyframe to keyframe."""
     place, agents = walls(seed), {}
     for n, (name, kind) in enumerate(
@@ -37,7 +47,7 @@ def room(seed: int):
     ):
         person = Person(name, place, 1.5 * n, 1000 * seed + 11 * (n + 1), kind)
         keyframes = []
-        for k in range(STEPS):
+        for k in range(steps):
             T, view = person.step()
             before = se3.inverse(person.T_odom_body[k - 1]) if k else np.eye(4)
             keyframes.append(
@@ -52,6 +62,26 @@ def room(seed: int):
 
 def played(tool, seed: int, lie):
     return tool.played(room(seed), lie, tool.configured(['edge.policy="covins-g"']))
+
+
+@cache
+def alone(tool, seed: int):
+    """The two others without the third."""
+    return played(tool, seed, None)
+
+
+@cache
+def honest(tool, seed: int, sure: float):
+    """With a third that is right, but for its sureness."""
+    return played(tool, seed, tool.Lie(sure=sure))
+
+
+def costs(told, without, error: str) -> list[float]:
+    return [getattr(a, error) / getattr(b, error) for a, b in zip(told, without, strict=True)]
+
+
+def geometric_mean(ratios: list[float]) -> float:
+    return float(np.exp(np.mean(np.log(ratios))))
 
 
 def test_a_lie_is_told_of_the_way_the_depths_the_sureness_and_the_camera(tool):
@@ -103,13 +133,42 @@ def test_honest_agents_are_never_kept_apart(tool, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lie", LIES)
-def test_a_lie_costs_the_others_little(tool, lie):
-    """Of three rooms together, against the same where it is as much too sure, and else right."""
-    seeds = range(1, 4)
-    told = [played(tool, seed, tool.LIES[lie]) for seed in seeds]
-    right = [played(tool, seed, tool.Lie(sure=tool.LIES[lie].sure)) for seed in seeds]
-    ratios = [a.final / b.final for a, b in zip(told, right, strict=True)]
-    print(f"{lie}: {ratios} {told}")
-    assert np.mean(ratios) <= COSTS
+@pytest.mark.parametrize(("lie", "is_said"), LIES.items())
+def test_a_lie_costs_the_others_little(tool, lie, is_said):
+    """Against the same rooms without it: who is set apart helps nobody either. Who is let in has to help as
+    much as one that is as much too sure, and else right."""
+    told = [played(tool, seed, tool.LIES[lie]) for seed in SEEDS]
+    without = [alone(tool, seed) for seed in SEEDS]
+    for error in ("final", "causal"):
+        ratios = costs(told, without, error)
+        print(f"{lie}: {error} {geometric_mean(ratios):.3f}, {ratios}")
+        assert geometric_mean(ratios) <= COSTS
+        assert max(ratios) <= AT_MOST
+    assert {outcome.liar for outcome in told} == {is_said}
     assert not any(outcome.wronged for outcome in told)
+    assert all(outcome.together is not None for outcome in told)
+    if is_said == "agrees":
+        right = [honest(tool, seed, tool.LIES[lie].sure) for seed in SEEDS]
+        assert geometric_mean(costs(told, right, "final")) <= COSTS
+
+
+@pytest.mark.slow
+def test_noise_of_who_is_too_sure_parts_nobody(tool):
+    """In this room it looked like a camera that is turned by 1.6 degrees."""
+    outcome = played(tool, 30, tool.LIES["sure 10"])
+    assert not outcome.said
+    assert outcome.together is not None
+
+
+def test_a_lie_is_found_out_before_it_moves_anybody(tool, monkeypatch):
+    """The others come together as they do without it, at the fifth second; by then it is set apart, and
+    looked up after them, if at all."""
+    short, asked, run = room(1, 21), [], Query.run
+    config = tool.configured(['edge.policy="covins-g"'])
+    monkeypatch.setattr(Query, "run", lambda query: asked.append(query) or run(query))
+    outcome = tool.played(short, tool.LIES["scale 0.97 sure 100"], config)
+    assert any(query.aside for query in asked)
+    assert outcome.liar == "set apart"
+    assert not outcome.wronged
+    assert outcome.together is not None
+    assert outcome.final <= COSTS * tool.played(short, None, config).final

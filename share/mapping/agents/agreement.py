@@ -248,7 +248,7 @@ class Agreement:
         pair.points = _pooled(scales)
         pair.newest = _pooled(list(pair.scales)[-_NEW_POINTS:]) if len(scales) > _NEW_POINTS else None
         pair.gauge = _pooled(pair.scales)
-        ways = _compared_ways(met)
+        ways = _compared_ways(met, (self._sureness.claims(names[0]), self._sureness.claims(names[1])))
         found = [*self._by_points(pair), *by_gravity(every), *by_gravity(met.loops[-_ENOUGH_PATH:])]
         for one in pair.met.values():
             found += [*self._by_ways(one.ways), *self._by_ways(one.newest)]
@@ -350,16 +350,17 @@ class Agreement:
         return {name: (float(x[i]), float(sigma[i])) for name, i in at.items()}
 
 
-def _compared_ways(met: _Met) -> Equations | None:
-    """Of all of its loops; None where they are too few, or absurd numbers leave no solution."""
+def _compared_ways(met: _Met, widths: tuple[float, float]) -> Equations | None:
+    """Of all of its loops; None where they are too few, or absurd numbers leave no solution. widths: by what
+    either's claims alone are widened, see `solved`."""
     met.ways = met.newest = None
     if len(met.loops) < _ENOUGH_PATH:
         return None
     with suppress(np.linalg.LinAlgError):
         tell = equations(met.loops)
-        met.ways = solved(tell)
+        met.ways = solved(tell, widths)
         if len(met.loops) > _NEW_PATH:
-            met.newest = compare(met.loops[-_NEW_PATH:])
+            met.newest = compare(met.loops[-_NEW_PATH:], widths)
         return tell
     return None
 

@@ -18,7 +18,7 @@ Source: Barfoot, *State Estimation for Robotics* (2017), chapters 5 and 8.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,6 +35,7 @@ _PRIOR = np.array([0.2, 0.1, 0.1, 0.1])  # log scale, rad: only so that two loop
 _MAD = 0.6745  # median of |x| of a standard normal distribution
 _OUTSIDE = 0.3  # weight of a loop below which it does not fit
 _SCALE_FLOOR = 0.004  # of the log scale of one loop's points, beside what it says: occlusions, pixels
+_AS_CLAIMED = (1.0, 1.0)
 _ALIKE = 0.003  # of honest agents' log scales: no two are calibrated better
 
 
@@ -131,9 +132,9 @@ def points_scale(scales: Sequence[Scale]) -> Estimate:
     return Estimate(mean, float(np.hypot(max(told.sum() ** -0.5, spread), _ALIKE)), len(log))
 
 
-def compare(loops: Sequence[Witness]) -> Comparison:
-    """Of at least three loops between the same two stretches."""
-    return solved(equations(loops))
+def compare(loops: Sequence[Witness], widths: tuple[float, float] = _AS_CLAIMED) -> Comparison:
+    """Of at least three loops between the same two stretches. widths: see `solved`."""
+    return solved(equations(loops), widths)
 
 
 def equations(loops: Sequence[Witness]) -> Equations:
@@ -177,10 +178,18 @@ def _columns(T_b: F64) -> F64:
     return out
 
 
-def solved(e: Equations) -> Comparison:
-    """What the agents are wrong about. Raises LinAlgError where absurd numbers leave no solution."""
+def solved(e: Equations, widths: tuple[float, float] = _AS_CLAIMED) -> Comparison:
+    """What the agents are wrong about. widths: by what the variances of either walk are multiplied where the
+    camera's turn is told, for the noise of an agent that is too sure passes for one at few places. Its way it
+    is held to as it claims: one that is too long and too sure bends the others, and is found out sooner so.
+    Raises LinAlgError where absurd numbers leave no solution."""
+    told = _solved(e, _AS_CLAIMED)
+    return told if widths == _AS_CLAIMED else replace(told, turn=_solved(e, widths).turn)
+
+
+def _solved(e: Equations, widths: tuple[float, float]) -> Comparison:
     xi, J, n = e.xi, e.J, len(e.xi)
-    walk, own = _SURER**2 * (e.walk_a + e.walk_b), _LOOP_SURER**2 * e.own
+    walk, own = _SURER**2 * (widths[0] * e.walk_a + widths[1] * e.walk_b), _LOOP_SURER**2 * e.own
     rows, prior = J.reshape(6 * n, 10), np.zeros((10, 10))
     prior[range(6, 10), range(6, 10)] = _PRIOR**-2
     information, weight = np.linalg.inv(own), np.ones(n)

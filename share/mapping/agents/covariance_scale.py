@@ -158,6 +158,10 @@ class Sureness:
         if self._claims.add(agent, T_ref_body, cov):
             self._settle()
 
+    def claims(self, agent: str) -> float:
+        """See `Claims.least`."""
+        return self._claims.least(agent)
+
     def met(self, one: str, other: str) -> None:
         """There is a loop between these agents."""
         self._claims.met(one, other)
