@@ -167,6 +167,8 @@ class Keyframes:
         made = self._newest_made = _Making(frame, number, scene.taken())
         features: Slice = [(step, made) for step in (self._recall, self._corners, self._admit)]
         view: Slice = [(step, made) for step in (self._detect, self._describe)] if to_show else []
+        if view and self._at_a_time(frame) == 1:
+            view[-1] = (self._describe_more, made)
         if to_show:
             self._offer(scene)
         if not urgent:
@@ -215,16 +217,22 @@ class Keyframes:
         done, self._unsettled = self._unsettled, None
         if done is not None:
             self._shown.told(scene.state, done.keyframe)  # not before: making its candidate might have failed
+        slices = self._at_a_time(frame)
         if self._showing is not None:
             self._showing.ago += 1
             if self._showing.is_due:  # others have it, or nobody asked
                 self._showing = None
-        since_ns, self._settled_ns = frame.stamp_ns - self._settled_ns, frame.stamp_ns
-        for _ in range(max(1, since_ns // _SLICE_NS)):
+                slices -= 1  # to show it was one
+        self._settled_ns = frame.stamp_ns
+        for _ in range(max(1, slices)):
             if not self._slices:
                 break
             self._work(scene, frame, rate)
         return done
+
+    def _at_a_time(self, frame: Frame) -> int:
+        """How many slices there is time for after the frame just tracked."""
+        return int(max(1, (frame.stamp_ns - self._settled_ns) // _SLICE_NS))
 
     def forget(self) -> None:
         """The filter begins anew, and numbers its keyframes anew. What is left to do is void."""
@@ -241,13 +249,13 @@ class Keyframes:
     def _recall(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
         woken = scene.wake(last, rate)
         made.taken = np.concatenate([made.taken, woken])
+        scene.forget((self._shown.keyframe, -1 if self._showing is None else self._showing.number))
 
     def _corners(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
         made.corners = scene.corners(made.frame, made.taken)
 
     def _admit(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
-        held = self._shown.keyframe, -1 if self._showing is None else self._showing.number
-        scene.admit(made.frame, made.number, made.corners, held)
+        scene.admit(made.frame, made.number, made.corners)
         self._newest.features = len(scene.state.ids)
 
     def _detect(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
@@ -258,3 +266,8 @@ class Keyframes:
         if made.view is not None:
             made.view.describe()
             made.is_due = True
+
+    def _describe_more(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
+        self._describe(made, scene, last, rate)
+        if made.view is not None:
+            made.view.measure_half()

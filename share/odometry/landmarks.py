@@ -202,12 +202,11 @@ class Scene:
         more = self._config.features if self._room() else 0
         return corners.detect(frame.image0, taken, more, self._config.spacing_px, within(self._rig.cam0))
 
-    def admit(self, frame: Frame, keyframe: int, px: F32, held: tuple[int, ...] = ()) -> None:
+    def admit(self, frame: Frame, keyframe: int, px: F32) -> None:
         """New features at px (N, 2) of the frame that is the keyframe with that id; the last frame may be a
-        later one. Keyframes that nothing is left of make room, but for those with ids in `held`."""
+        later one."""
         host, room = filter.number_of(self.state, keyframe), self._room()
         self._add_features(frame, host, px[:room])
-        self._forget(held)
 
     def _room(self) -> int:
         """For so many features more."""
@@ -293,7 +292,7 @@ class Scene:
         """What is out of sight was remembered for nothing."""
         self._memory = Memory()
 
-    def _forget(self, held: tuple[int, ...]) -> None:
+    def forget(self, held: tuple[int, ...] = ()) -> None:
         """Keyframes whose features are all gone, and, where there are too many, the most redundant ones.
         Never the newest two, nor those with ids in `held`: others are told of the motion between them."""
         s = self.state
