@@ -17,7 +17,7 @@ from share.odometry.features import Looks
 from share.odometry.measurement import Prediction, Sought
 from share.odometry.state import State
 from share.types import F32, F64, I64, U8, Footing, Frame
-from share.vision import corners, epipolar, patches
+from share.vision import corners, epipolar
 from share.vision.depth import disparity_px, from_depth_camera, from_stereo
 from share.vision.mask import within
 from share.vision.orb import measures_depth
@@ -70,8 +70,7 @@ class Scene:
         self._shun(left.px[left.astray])
         self._wary = _WARY_FRAMES if left.astray.sum() >= _CROWD else max(self._wary - 1, 0)
         now = np.flatnonzero(seen & (features.turn(self.looks) % _SLANT_EVERY == 0))
-        error = patches.unexplained(self.looks.patch.take(now), left.samples[now], left.shift[now])
-        features.learn_slant(self.looks, now, error, left.along[now])
+        features.learn_slant(self.looks, now, left.samples[now], left.along[now])
         self._memory.sleep(self.state, self.looks, np.flatnonzero(~left.found))
         self.keep(seen)
         self._last = left, seen, self.state.ids

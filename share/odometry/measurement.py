@@ -35,7 +35,7 @@ class Sought:
     """Of all N features in cam0: px (N, 2) and whether each was found, and, for others to say, went its own
     way; expected (N, 2) px and uv (N, 2) normalised, NaN behind the camera; what patches look like there,
     warp (N, 2, 2) px by px, and by how many px of its first image a feature moves for one unit more of
-    inverse depth, along (N, 2). samples (N, S), shift (N, 2): see `patches.Found`. right: in cam1."""
+    inverse depth, along (N, 2). samples (N, S): see `patches.Found`. right: in cam1."""
 
     px: F32
     found: NDArray[np.bool_]
@@ -45,7 +45,6 @@ class Sought:
     warp: F64
     along: F64
     samples: F32
-    shift: F32
     right: Right | None = None
 
     def due(self, camera: Camera) -> int:
@@ -121,8 +120,8 @@ def _nothing(n: int, which: I64, expected: F64, aim: Aim, warp: F64) -> Sought:
     warps[which], along[which] = warp, _along(aim)
     no, s = np.zeros(n, bool), len(patches.OFFSETS)
     px = np.where(np.isnan(where), -1e6, where).astype(np.float32)
-    samples, shift = np.zeros((n, s), np.float32), np.zeros((n, 2), np.float32)
-    return Sought(px, no, no.copy(), where, uv, warps, along, samples, shift)
+    samples = np.zeros((n, s), np.float32)
+    return Sought(px, no, no.copy(), where, uv, warps, along, samples)
 
 
 def _along(aim: Aim) -> F64:
@@ -144,7 +143,7 @@ def _good(found: patches.Found, px: F64, config: InertialConfig, reach_px: float
 
 def _put(out: Sought, which: I64, found: patches.Found, good: NDArray[np.bool_], part: slice) -> None:
     out.px[which], out.found[which] = found.px[part], good[part]
-    out.samples[which], out.shift[which] = found.samples[part], found.shift[part]
+    out.samples[which] = found.samples[part]
 
 
 # ---- What the cameras should see of the features, and how that depends on every part of the state.
