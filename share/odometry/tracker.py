@@ -239,9 +239,8 @@ class InertialTracker:
             measurement.rescue(
                 self._last.image0, frame.image0, self._rig.cam0, scene.looks, sought, self._config
             )
-        uv = scene.measured(sought)
-        scene.mark_movers(sought, uv, self._rate)
-        return sought, self._update(frame, scene, sought, uv)
+        scene.mark_movers(sought, self._rate)
+        return sought, self._update(frame, scene, sought)
 
     def _heard(self, frame: Frame, s: State) -> ImuBatch | None:
         """What the IMU said until the image was taken; None if it was silent."""
@@ -281,12 +280,12 @@ class InertialTracker:
         """When the image was taken, IMU time."""
         return frame.stamp_ns + round(s.offset_s * 1e9)
 
-    def _update(self, frame: Frame, scene: Scene, sought: measurement.Sought, uv: F64) -> NDArray[np.bool_]:
-        """Which features (N,) were seen and believed. uv (N, 2): where cam0 shows them."""
+    def _update(self, frame: Frame, scene: Scene, sought: measurement.Sought) -> NDArray[np.bool_]:
+        """Which features (N,) were seen and believed."""
         s = scene.state
 
         def rows_now() -> filter.Sight:
-            return scene.heard(sought, uv, self._rate)
+            return scene.heard(sought, self._rate)
 
         seen, self._surprise = sought.found & ~sought.astray, np.zeros(0)
         rows = rows_now()
