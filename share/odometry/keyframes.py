@@ -24,7 +24,7 @@ from share.odometry import filter
 from share.odometry.initialisation import tilt
 from share.odometry.landmarks import Scene
 from share.odometry.state import State
-from share.types import F32, F64, Frame, View
+from share.types import F32, F64, Footing, Frame, View
 from share.vision.orb import ViewInSteps
 
 # ---- When a frame is far enough from the newest keyframe to be the next one.
@@ -117,7 +117,8 @@ class Unsettled(NamedTuple):
 @dataclass(eq=False)
 class _Making:
     """Of the keyframe with id `number`, whose frame this is: px (N, 2) near which nothing new is sought, and
-    of new corners; `ago` frames have been settled since. view: if others are to be told of it."""
+    of new corners; `ago` frames have been settled since. view, and what its pose rested on: if others are to
+    be told of it."""
 
     frame: Frame
     number: int
@@ -125,6 +126,7 @@ class _Making:
     corners: F32 = field(default_factory=lambda: np.zeros((0, 2), np.float32))
     ago: int = 0
     view: ViewInSteps | None = None
+    footing: Footing | None = None
     is_due: bool = False  # what it shows is for the next who asks
 
 
@@ -187,7 +189,7 @@ class Keyframes:
     def _offer(self, scene: Scene) -> _Making:
         made = self._showing = self._newest_made
         assert made is not None
-        self._shown_ns = made.frame.stamp_ns
+        self._shown_ns, made.footing = made.frame.stamp_ns, scene.footing()
         made.view = ViewInSteps(made.frame, self._rig, self._view_features, scene.depths(made.frame))
         return made
 
@@ -199,6 +201,11 @@ class Keyframes:
     def is_due(self) -> bool:
         """Whether there is one that others are to be told of now."""
         return self._showing is not None and self._showing.is_due
+
+    @property
+    def footing(self) -> Footing | None:
+        """What the pose of the one that is due rested on; None where none is."""
+        return self._showing.footing if self._showing is not None and self._showing.is_due else None
 
     def show(self, scene: Scene, new_stretch: bool) -> Showing:
         """The one that is due. Raises ValueError where none is."""

@@ -139,9 +139,10 @@ class InertialTracker:
             self._places.set_view(done.view)
 
     def footing(self) -> Footing:
-        """Of the frame just tracked, one with a pose."""
+        """Of the frame that the keyframe which is due was; where none is, of the frame just tracked, one with a
+        pose."""
         assert self._scene is not None
-        return self._scene.footing()
+        return self._keyframes.footing or self._scene.footing()
 
     def give_up(self, frame: Frame) -> None:
         """Something failed in or after `frame`, the last: the filter may be in any state."""
