@@ -88,6 +88,8 @@ def seek(
     for camera, part in zip(cameras, (slice(0, ahead), slice(ahead, None)), strict=False):
         if camera.fisheye:  # whose pixels are not as much of (x/z, y/z) a few px on
             at[part] = camera.normalise(found.px[part].astype(np.float64), aim.uv[todo[part]])
+        elif camera.distortion:
+            at[part] += _solved(jacobian[todo[part]], found.px[part] - camera.distort(at[part]))
         if camera.bounded:  # it may have strayed to where there is no ray
             good[part] &= camera.knows(found.px[part].astype(np.float64))
     _put(out, which[todo[:ahead]], found, at[:ahead], good[:ahead], slice(0, ahead))

@@ -11,7 +11,7 @@ from share.geometry.se3 import angle, compose_cov, position_sigma
 from share.metrics.local_error import WINDOW_S
 from share.types import F64, Candidate, TrackState
 
-MOST_AGO = 16  # frames, of a keyframe that is told of: those that are kept to know its own
+MOST_AGO = 8  # frames, of a keyframe that is told of: those that are kept to know its own
 
 
 class Fared(NamedTuple):
