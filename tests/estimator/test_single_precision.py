@@ -1,4 +1,4 @@
-"""What an update takes from the covariance in single precision leaves poses where double precision has them."""
+"""Gains in single precision leave poses where double precision has them."""
 
 import numpy as np
 import pytest
@@ -16,9 +16,7 @@ def apart(one: Run, other: Run) -> float:
     return float(np.abs(se3.log(se3.inverse(a) @ b)).max())
 
 
-@pytest.mark.parametrize(
-    ("seconds", "features"), [(1.0, 20), pytest.param(60.0, 60, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("seconds", "features"), [(1.0, 20), pytest.param(60.0, 60, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("mono", [False, True])
 def test_poses_do_not_drift_apart(seconds, features, mono, monkeypatch):
     setup = Setup(seconds=seconds, features=features, mono=mono)
