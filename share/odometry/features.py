@@ -50,9 +50,9 @@ def looks(image: U8, camera: Camera, px: F32, ray: F64, rho: F64) -> Looks:
     return Looks(patches.cut(image, px), spread, nothing, 1 / sigma**2, px, nothing.copy(), age)
 
 
-def learn_slant(looks: Looks, which: I64, error: F32, along: F64) -> None:
+def learn_slant(looks: Looks, which: I64, samples: F32, along: F64) -> None:
     """From how the patches of features `which` (M,) look where they were found: see `patches.slanted`."""
-    information, step = patches.slanted(looks.patch.take(which), error, along)
+    information, step = patches.slanted(looks.patch.take(which), samples, along)
     information, step = information / _NOISE**2, step / _NOISE**2
     prior = looks.upright[which, None]
     total = information + prior[:, :, None] * np.eye(2)

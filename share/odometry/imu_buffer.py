@@ -107,6 +107,8 @@ class Samples:
 def unclipped(imu: ImuBatch, axes: NDArray[np.bool_], rate: F64) -> ImuBatch:
     """Gyro axes (3,) that are at the end of their scale turn on as they did, rate (3,) rad/s as a gyro says
     it, if that is more."""
+    if not axes.any():
+        return imu
     more = axes & (np.abs(rate) > np.abs(imu.gyro)) & (rate * imu.gyro > 0)
     return replace(imu, gyro=np.where(more, rate, imu.gyro))
 

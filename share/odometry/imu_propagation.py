@@ -184,6 +184,8 @@ def _fourth_differences(x: F64, by: int) -> F64:
 
 def without(imu: ImuNoise, coasting: ImuNoise, axes: NDArray[np.bool_]) -> ImuNoise:
     """Of an IMU of whose axes (6,), gyro then accelerometer, some say nothing."""
+    if not axes.any():
+        return imu
     return replace(
         imu,
         gyro_density=coasting.gyro_density if axes[:3].any() else imu.gyro_density,

@@ -24,7 +24,7 @@ from share.odometry import filter
 from share.odometry.initialisation import tilt
 from share.odometry.landmarks import Scene
 from share.odometry.state import State
-from share.types import F32, F64, Frame, View
+from share.types import F32, F64, Footing, Frame, View
 from share.vision.orb import ViewInSteps
 
 # ---- When a frame is far enough from the newest keyframe to be the next one.
@@ -117,7 +117,8 @@ class Unsettled(NamedTuple):
 @dataclass(eq=False)
 class _Making:
     """Of the keyframe with id `number`, whose frame this is: px (N, 2) near which nothing new is sought, and
-    of new corners; `ago` frames have been settled since. view: if others are to be told of it."""
+    of new corners; `ago` frames have been settled since. view, and what its pose rested on: if others are to
+    be told of it."""
 
     frame: Frame
     number: int
@@ -125,6 +126,7 @@ class _Making:
     corners: F32 = field(default_factory=lambda: np.zeros((0, 2), np.float32))
     ago: int = 0
     view: ViewInSteps | None = None
+    footing: Footing | None = None
     is_due: bool = False  # what it shows is for the next who asks
 
 
@@ -167,6 +169,8 @@ class Keyframes:
         made = self._newest_made = _Making(frame, number, scene.taken())
         features: Slice = [(step, made) for step in (self._recall, self._corners, self._admit)]
         view: Slice = [(step, made) for step in (self._detect, self._describe)] if to_show else []
+        if view and self._at_a_time(frame) == 1:
+            view[-1] = (self._describe_more, made)
         if to_show:
             self._offer(scene)
         if not urgent:
@@ -185,7 +189,7 @@ class Keyframes:
     def _offer(self, scene: Scene) -> _Making:
         made = self._showing = self._newest_made
         assert made is not None
-        self._shown_ns = made.frame.stamp_ns
+        self._shown_ns, made.footing = made.frame.stamp_ns, scene.footing()
         made.view = ViewInSteps(made.frame, self._rig, self._view_features, scene.depths(made.frame))
         return made
 
@@ -197,6 +201,11 @@ class Keyframes:
     def is_due(self) -> bool:
         """Whether there is one that others are to be told of now."""
         return self._showing is not None and self._showing.is_due
+
+    @property
+    def footing(self) -> Footing | None:
+        """What the pose of the one that is due rested on; None where none is."""
+        return self._showing.footing if self._showing is not None and self._showing.is_due else None
 
     def show(self, scene: Scene, new_stretch: bool) -> Showing:
         """The one that is due. Raises ValueError where none is."""
@@ -215,16 +224,22 @@ class Keyframes:
         done, self._unsettled = self._unsettled, None
         if done is not None:
             self._shown.told(scene.state, done.keyframe)  # not before: making its candidate might have failed
+        slices = self._at_a_time(frame)
         if self._showing is not None:
             self._showing.ago += 1
             if self._showing.is_due:  # others have it, or nobody asked
                 self._showing = None
-        since_ns, self._settled_ns = frame.stamp_ns - self._settled_ns, frame.stamp_ns
-        for _ in range(max(1, since_ns // _SLICE_NS)):
+                slices -= 1  # to show it was one
+        self._settled_ns = frame.stamp_ns
+        for _ in range(max(1, slices)):
             if not self._slices:
                 break
             self._work(scene, frame, rate)
         return done
+
+    def _at_a_time(self, frame: Frame) -> int:
+        """How many slices there is time for after the frame just tracked."""
+        return int(max(1, (frame.stamp_ns - self._settled_ns) // _SLICE_NS))
 
     def forget(self) -> None:
         """The filter begins anew, and numbers its keyframes anew. What is left to do is void."""
@@ -241,13 +256,13 @@ class Keyframes:
     def _recall(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
         woken = scene.wake(last, rate)
         made.taken = np.concatenate([made.taken, woken])
+        scene.forget((self._shown.keyframe, -1 if self._showing is None else self._showing.number))
 
     def _corners(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
         made.corners = scene.corners(made.frame, made.taken)
 
     def _admit(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
-        held = self._shown.keyframe, -1 if self._showing is None else self._showing.number
-        scene.admit(made.frame, made.number, made.corners, held)
+        scene.admit(made.frame, made.number, made.corners)
         self._newest.features = len(scene.state.ids)
 
     def _detect(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
@@ -258,3 +273,8 @@ class Keyframes:
         if made.view is not None:
             made.view.describe()
             made.is_due = True
+
+    def _describe_more(self, made: _Making, scene: Scene, last: Frame, rate: F64) -> None:
+        self._describe(made, scene, last, rate)
+        if made.view is not None:
+            made.view.measure_half()

@@ -17,7 +17,7 @@ from share.odometry.features import Looks
 from share.odometry.measurement import Prediction, Sought
 from share.odometry.state import State
 from share.types import F32, F64, I64, U8, Footing, Frame
-from share.vision import corners, epipolar, patches
+from share.vision import corners, epipolar
 from share.vision.depth import disparity_px, from_depth_camera, from_stereo
 from share.vision.mask import within
 from share.vision.orb import measures_depth
@@ -70,8 +70,7 @@ class Scene:
         self._shun(left.px[left.astray])
         self._wary = _WARY_FRAMES if left.astray.sum() >= _CROWD else max(self._wary - 1, 0)
         now = np.flatnonzero(seen & (features.turn(self.looks) % _SLANT_EVERY == 0))
-        error = patches.unexplained(self.looks.patch.take(now), left.samples[now], left.shift[now])
-        features.learn_slant(self.looks, now, error, left.along[now])
+        features.learn_slant(self.looks, now, left.samples[now], left.along[now])
         self._memory.sleep(self.state, self.looks, np.flatnonzero(~left.found))
         self.keep(seen)
         self._last = left, seen, self.state.ids
@@ -111,23 +110,16 @@ class Scene:
         """No new feature near px (N, 2) for a while: there goes somebody."""
         self._shunned = [*self._shunned[-_SHUN_FRAMES:], px]
 
-    def measured(self, sought: Sought) -> F64:
-        """uv (N, 2) where cam0 shows the features; NaN where they were not found."""
-        out, found = np.full((len(sought.found), 2), np.nan), sought.found
-        out[found] = self._rig.cam0.normalise(sought.px[found].astype(np.float64), sought.uv[found])
-        return out
-
-    def mark_movers(self, sought: Sought, uv: F64, rate: F64) -> None:
-        """What moves by itself is astray; looked for only where the IMU alone does not explain the image. uv
-        (N, 2): of `measured`."""
+    def mark_movers(self, sought: Sought, rate: F64) -> None:
+        """What moves by itself is astray; looked for only where the IMU alone does not explain the image."""
         which = np.flatnonzero(sought.found)
         camera, config = self._rig.cam0, self._config
-        residual = camera.evened(uv[which]) - camera.evened(sought.uv[which])
+        residual = camera.evened(sought.at[which]) - camera.evened(sought.uv[which])
         if len(which) == 0 or outliers.as_expected(
             residual * camera.focal, config.sigma_px, config.lasting_px
         ):
             return
-        rows = self.sight(uv, which, rate)
+        rows = self.sight(sought.at, which, rate)
         fixed = outliers.of_the_room(self.state, rows, sought.px[which], self.proven(which), camera)
         sought.astray[which[~fixed]] = True
 
@@ -135,18 +127,16 @@ class Scene:
         """Rows for the filter of features `which` (M,) of those at uv (N, 2) in cam0."""
         return self._rows(which, uv[which], None, rate)
 
-    def heard(self, sought: Sought, uv: F64, rate: F64) -> filter.Sight:
-        """Rows of all that was seen in a frame's images, sorted by host; as the state is now. uv (N, 2): of
-        `measured`."""
+    def heard(self, sought: Sought, rate: F64) -> filter.Sight:
+        """Rows of all that was seen in a frame's images, sorted by host; as the state is now."""
         heard = sought.found & ~sought.astray
         which, right = np.flatnonzero(heard), None
-        at = uv[which]
-        if (there := sought.right) is not None and self._rig.cam1 is not None:
+        at = sought.at[which]
+        if (there := sought.right) is not None:
             both = heard[there.which]
             more = there.which[both]
-            seen = self._rig.cam1.normalise(there.px[both].astype(np.float64), there.uv[both])
             right = np.arange(len(which) + len(more)) >= len(which)
-            which, at = np.concatenate([which, more]), np.concatenate([at, seen])
+            which, at = np.concatenate([which, more]), np.concatenate([at, there.at[both]])
         order = np.argsort(self.state.host[which], kind="stable")
         right = None if right is None else right[order]
         return self._with_doubt(self._rows(which[order], at[order], right, rate))
@@ -174,7 +164,9 @@ class Scene:
 
     def _with_doubt(self, rows: filter.Sight) -> filter.Sight:
         """While somebody moves in the view, what is new in it counts little."""
-        unproven = (self._wary > 0) & ~self.proven(rows.which)
+        if self._wary == 0:
+            return rows
+        unproven = ~self.proven(rows.which)
         times = np.where(unproven, _UNPROVEN, 1.0)
         return replace(rows, sigma=times * rows.sigma, lasting=times * rows.lasting)
 
@@ -202,12 +194,11 @@ class Scene:
         more = self._config.features if self._room() else 0
         return corners.detect(frame.image0, taken, more, self._config.spacing_px, within(self._rig.cam0))
 
-    def admit(self, frame: Frame, keyframe: int, px: F32, held: tuple[int, ...] = ()) -> None:
+    def admit(self, frame: Frame, keyframe: int, px: F32) -> None:
         """New features at px (N, 2) of the frame that is the keyframe with that id; the last frame may be a
-        later one. Keyframes that nothing is left of make room, but for those with ids in `held`."""
+        later one."""
         host, room = filter.number_of(self.state, keyframe), self._room()
         self._add_features(frame, host, px[:room])
-        self._forget(held)
 
     def _room(self) -> int:
         """For so many features more."""
@@ -276,7 +267,7 @@ class Scene:
         """Of features from number `fresh` on, those that are found where they should be; all others."""
         sought = measurement.seek(frame, self._rig, self.state, self.looks, self._config, fresh)
         self.looks.px[sought.found] = sought.px[sought.found]
-        rows = self.sight(self.measured(sought), np.flatnonzero(sought.found), rate)
+        rows = self.sight(sought.at, np.flatnonzero(sought.found), rate)
         good = np.arange(len(self.state.ids)) < fresh
         if len(rows.which):
             _, S = filter.gains(self.state, rows)
@@ -293,7 +284,7 @@ class Scene:
         """What is out of sight was remembered for nothing."""
         self._memory = Memory()
 
-    def _forget(self, held: tuple[int, ...]) -> None:
+    def forget(self, held: tuple[int, ...] = ()) -> None:
         """Keyframes whose features are all gone, and, where there are too many, the most redundant ones.
         Never the newest two, nor those with ids in `held`: others are told of the motion between them."""
         s = self.state

@@ -23,21 +23,22 @@ _MANY = 0.15  # of the features in view that are not found: then they are follow
 
 @dataclass(frozen=True, eq=False)
 class Right:
-    """Features number which (M,) in cam1: px (M, 2) where found; uv (M, 2) normalised, as expected."""
+    """Features number which (M,) in cam1, and where each was found: at (M, 2), normalised."""
 
     which: I64
-    px: F32
-    uv: F64
+    at: F64
 
 
 @dataclass(frozen=True, eq=False)
 class Sought:
-    """Of all N features in cam0: px (N, 2) and whether each was found, and, for others to say, went its own
-    way; expected (N, 2) px and uv (N, 2) normalised, NaN behind the camera; what patches look like there,
+    """Of all N features in cam0: where each was found, px (N, 2) and at (N, 2) normalised, NaN elsewhere, and
+    whether it was, and, for others to say, went its own way; expected (N, 2) px and uv (N, 2) normalised, NaN
+    behind the camera; what patches look like there,
     warp (N, 2, 2) px by px, and by how many px of its first image a feature moves for one unit more of
-    inverse depth, along (N, 2). samples (N, S), shift (N, 2): see `patches.Found`. right: in cam1."""
+    inverse depth, along (N, 2). samples (N, S): see `patches.Found`. right: in cam1."""
 
     px: F32
+    at: F64
     found: NDArray[np.bool_]
     astray: NDArray[np.bool_]
     expected: F64
@@ -45,7 +46,6 @@ class Sought:
     warp: F64
     along: F64
     samples: F32
-    shift: F32
     right: Right | None = None
 
     def due(self, camera: Camera) -> int:
@@ -81,18 +81,23 @@ def seek(
     if len(todo) == 0:
         return out
     ahead = int(np.searchsorted(todo, first))
-    at = expected[todo]
-    found = patches.align(images, ahead, looks.patch.probe[which[todo]], at, warp[todo])
-    good = _good(found, at, config, config.reach_px)
+    px = expected[todo]
+    found = patches.align(images, ahead, looks.patch.probe[which[todo]], px, warp[todo])
+    good = _good(found, px, config, config.reach_px)
+    at = aim.uv[todo] + _solved(jacobian[todo], found.px - px)
     for camera, part in zip(cameras, (slice(0, ahead), slice(ahead, None)), strict=False):
+        if camera.fisheye:  # whose pixels are not as much of (x/z, y/z) a few px on
+            at[part] = camera.normalise(found.px[part].astype(np.float64), aim.uv[todo[part]])
+        elif camera.distortion:
+            at[part] += _solved(jacobian[todo[part]], found.px[part] - camera.distort(at[part]))
         if camera.bounded:  # it may have strayed to where there is no ray
             good[part] &= camera.knows(found.px[part].astype(np.float64))
-    _put(out, which[todo[:ahead]], found, good, slice(0, ahead))
+    _put(out, which[todo[:ahead]], found, at[:ahead], good[:ahead], slice(0, ahead))
     if len(cameras) == 1:
         return out
-    seen, where = todo[ahead:], np.flatnonzero(good[ahead:] & out.found[which[todo[ahead:]]])
-    there = Right(which[seen[where]], found.px[ahead:][where], aim.uv[seen[where]])
-    return replace(out, right=there)
+    number = which[todo[ahead:]]
+    where = np.flatnonzero(good[ahead:] & out.found[number])
+    return replace(out, right=Right(number[where], at[ahead:][where]))
 
 
 def rescue(
@@ -105,32 +110,43 @@ def rescue(
         return
     guess = sought.expected[todo].astype(np.float32)
     px, ok = optical_flow.follow(before, image, looks.px[todo], guess, window=15, levels=2, back_check_px=1.0)
-    todo, at = todo[ok], px[ok].astype(np.float64)
+    todo, about = todo[ok], px[ok].astype(np.float64)
     if len(todo) == 0:
         return
-    found = patches.align((image,), len(todo), looks.patch.probe[todo], at, sought.warp[todo])
-    good = _good(found, at, config, _AGREE_PX) & camera.knows(found.px.astype(np.float64))
-    _put(sought, todo, found, good, slice(None))
+    found = patches.align((image,), len(todo), looks.patch.probe[todo], about, sought.warp[todo])
+    at = camera.normalise(found.px.astype(np.float64))
+    good = _good(found, about, config, _AGREE_PX) & np.isfinite(at).all(axis=1)
+    _put(sought, todo, found, at, good, slice(None))
 
 
 def _nothing(n: int, which: I64, expected: F64, aim: Aim, warp: F64) -> Sought:
     """Of n features, where `which` (M,) are to be looked for."""
-    where, uv = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
-    where[which], uv[which] = expected, aim.uv
-    warps, along = np.zeros((n, 2, 2)), np.zeros((n, 2))
-    warps[which], along[which] = warp, _along(aim)
-    no, s = np.zeros(n, bool), len(patches.OFFSETS)
+    where, uv, along = expected, aim.uv, _along(aim)
+    if len(which) < n:
+        where, uv, along = (_spread(value, which, np.full((n, 2), np.nan)) for value in (where, uv, along))
+        warp = _spread(warp, which, np.zeros((n, 2, 2)))
+    no, samples = np.zeros(n, bool), np.zeros((n, len(patches.OFFSETS)), np.float32)
     px = np.where(np.isnan(where), -1e6, where).astype(np.float32)
-    samples, shift = np.zeros((n, s), np.float32), np.zeros((n, 2), np.float32)
-    return Sought(px, no, no.copy(), where, uv, warps, along, samples, shift)
+    return Sought(px, np.full((n, 2), np.nan), no, no.copy(), where, uv, warp, along, samples)
+
+
+def _spread(values: F64, which: I64, into: F64) -> F64:
+    into[which] = values
+    return into
+
+
+def _solved(J: F64, b: F64) -> F64:
+    """x (N, 2) with J x = b of (N, 2, 2) and (N, 2); not finite where J has no inverse."""
+    (p, q), (r, s) = np.moveaxis(J, 0, 2)
+    x, y = b.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out: F64 = np.stack([s * x - q * y, p * y - r * x], axis=1) / (p * s - q * r)[:, None]
+    return out
 
 
 def _along(aim: Aim) -> F64:
     """px (N, 2) of the first image by which a feature moves for one unit more of inverse depth."""
-    (a, b), (c, d) = np.moveaxis(aim.warp, 0, 2)
-    x, y = aim.by_rho.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        out = np.stack([d * x - b * y, a * y - c * x], axis=1) / (a * d - b * c)[:, None]
+    out = _solved(aim.warp, aim.by_rho)
     return np.where(np.isfinite(out), out, 0.0)
 
 
@@ -142,9 +158,11 @@ def _good(found: patches.Found, px: F64, config: InertialConfig, reach_px: float
     return out
 
 
-def _put(out: Sought, which: I64, found: patches.Found, good: NDArray[np.bool_], part: slice) -> None:
-    out.px[which], out.found[which] = found.px[part], good[part]
-    out.samples[which], out.shift[which] = found.samples[part], found.shift[part]
+def _put(
+    out: Sought, which: I64, found: patches.Found, at: F64, good: NDArray[np.bool_], part: slice
+) -> None:
+    out.px[which], out.found[which], out.samples[which] = found.px[part], good, found.samples[part]
+    out.at[which[good]] = at[good]
 
 
 # ---- What the cameras should see of the features, and how that depends on every part of the state.

@@ -34,6 +34,7 @@ from share.odometry.keyframes import Keyframes
 from share.odometry.landmarks import Scene
 from share.odometry.mono_initialisation import Window, window_for, without_force
 from share.odometry.outliers import Agreement, Straying, trusted
+from share.odometry.pivot import Pivot
 from share.odometry.relocalisation import LocalMap
 from share.odometry.result import TrackResult, median, typical
 from share.odometry.state import State
@@ -139,9 +140,10 @@ class InertialTracker:
             self._places.set_view(done.view)
 
     def footing(self) -> Footing:
-        """Of the frame just tracked, one with a pose."""
+        """Of the own frame of the keyframe that is due; where none is, of the frame just tracked, one with a
+        pose."""
         assert self._scene is not None
-        return self._scene.footing()
+        return self._keyframes.footing or self._scene.footing()
 
     def give_up(self, frame: Frame) -> None:
         """Something failed in or after `frame`, the last: the filter may be in any state."""
@@ -239,9 +241,8 @@ class InertialTracker:
             measurement.rescue(
                 self._last.image0, frame.image0, self._rig.cam0, scene.looks, sought, self._config
             )
-        uv = scene.measured(sought)
-        scene.mark_movers(sought, uv, self._rate)
-        return sought, self._update(frame, scene, sought, uv)
+        scene.mark_movers(sought, self._rate)
+        return sought, self._update(frame, scene, sought)
 
     def _heard(self, frame: Frame, s: State) -> ImuBatch | None:
         """What the IMU said until the image was taken; None if it was silent."""
@@ -281,12 +282,12 @@ class InertialTracker:
         """When the image was taken, IMU time."""
         return frame.stamp_ns + round(s.offset_s * 1e9)
 
-    def _update(self, frame: Frame, scene: Scene, sought: measurement.Sought, uv: F64) -> NDArray[np.bool_]:
-        """Which features (N,) were seen and believed. uv (N, 2): where cam0 shows them."""
+    def _update(self, frame: Frame, scene: Scene, sought: measurement.Sought) -> NDArray[np.bool_]:
+        """Which features (N,) were seen and believed."""
         s = scene.state
 
         def rows_now() -> filter.Sight:
-            return scene.heard(sought, uv, self._rate)
+            return scene.heard(sought, self._rate)
 
         seen, self._surprise = sought.found & ~sought.astray, np.zeros(0)
         rows = rows_now()
@@ -404,58 +405,3 @@ class InertialTracker:
         turn = self._turns.next(sorted(self._places.keyframes, reverse=True))
         chosen = [self._places.keyframes[n] for n in turn]
         return relocalisation.find(chosen, frame, self._rig, self._places_config, self._seed)
-
-
-# ---- Where in odom the body is told to be when the filter learns what is up.
-#
-# At rest, a tilt and a bias of the accelerometer cannot be told apart; only turning and speeding up part
-# them. When that comes, the filter turns all it knows about the place where it began: nothing has moved, but
-# a body that has gone 5 m since would be told to jump by 9 cm a degree. So poses are told as if it had turned
-# about the body: up is right at once, and the body stays where it was. What a pose is relative to any other
-# that the filter holds is not touched.
-
-_UP = 2
-
-
-class Pivot:
-    """shift (3,) m: added to the filter's positions, whatever its keyframes are by now."""
-
-    def __init__(self) -> None:
-        self.shift = np.zeros(3)
-        self._about = np.zeros(3)
-        self._keyframes, self._R = np.zeros(0, np.int64), np.zeros((0, 3, 3))
-
-    def begin(self, s: State, about: F64, anew: bool) -> None:
-        """Poses are told from `s` on, by a filter that began at `about` (3,). anew: so does odom."""
-        self.shift = np.zeros(3) if anew else self.shift
-        self._about = about
-        self._remember(s)
-
-    def after(self, s: State) -> None:
-        """Whatever has been learnt since the last call."""
-        R, before = s.poses[:, :3, :3], self._R
-        if not np.array_equal(self._keyframes, s.keyframes):
-            _, was, now = np.intersect1d(self._keyframes, s.keyframes, return_indices=True)
-            R, before = R[now], before[was]
-        if len(R):
-            turned = _small_turn((R @ before.swapaxes(1, 2)).mean(axis=0))
-            turned[_UP] = 0.0  # about the vertical nothing is ever learnt; what turns keeps its place
-            arm = s.T[:3, 3] - self._about
-            self.shift = self.shift - (arm - se3.so3_exp(-turned) @ arm)
-        self._remember(s)
-
-    def told(self, T: F64) -> F64:
-        """T_odom_body (4, 4), as others are told it, of a pose by the filter."""
-        out = T.copy()
-        out[:3, 3] += self.shift
-        return out
-
-    def _remember(self, s: State) -> None:
-        self._keyframes, self._R = s.keyframes, s.poses[:, :3, :3]
-
-
-def _small_turn(R: F64) -> F64:
-    """rad (3,) of a rotation R (3, 3) by less than a right angle: half of what R - R' has is its sine."""
-    sines = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
-    sine = float(np.linalg.norm(sines))
-    return sines * (np.arcsin(min(sine, 1.0)) / sine) if sine > 1e-9 else sines

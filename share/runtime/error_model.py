@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -13,7 +14,7 @@ import numpy as np
 from share.metrics.frame_log import summary
 from share.metrics.local_error import LocalError
 from share.odometry.error_model.features import features
-from share.odometry.error_model.history import Fared, Lately, Odometer
+from share.odometry.error_model.history import MOST_AGO, Fared, Lately, Odometer
 from share.odometry.error_model.model import Estimate, Network, estimate
 from share.odometry.result import TrackResult
 from share.rates import History
@@ -89,16 +90,19 @@ class AtOnce(Unknown):
 
     def __init__(self, network: Network) -> None:
         self._network, self._odometer = network, Odometer()
+        self._seen: deque[tuple[int, U8]] = deque(maxlen=MOST_AGO)  # stamps, images
         self._newest: Estimate | None = None
 
     def after(self, frame: Frame, result: TrackResult) -> float | None:
         self._odometer.frame(fared(frame, result))
+        self._seen.append((frame.stamp_ns, frame.image0))
         newest = self._newest
         return None if newest is None or result.T_odom_body is None else newest.error_cm
 
     def keyframe(self, frame: Frame, tracker: Tracker) -> Candidate:
         footing, candidate = tracker.footing(), tracker.keyframe(frame)
-        self._take(_Job(frame.image0, footing, self._odometer.keyframe(frame.stamp_ns, candidate)))
+        stamp_ns, image = self._seen[-1 - candidate.frames_ago]
+        self._take(_Job(image, footing, self._odometer.keyframe(stamp_ns, candidate)))
         return candidate
 
     def _take(self, job: _Job) -> None:

@@ -41,6 +41,7 @@ class ViewInSteps:
         self._frame, self._rig, self._count, self._known = frame, rig, count, known
         self._keypoints: list[cv2.KeyPoint] | None = None
         self._described: tuple[F32, U8] | None = None
+        self._measured = np.zeros((0, 2), np.float32), np.zeros((0, 3), np.float32)
 
     def detect(self) -> None:
         """The first step."""
@@ -53,20 +54,31 @@ class ViewInSteps:
             self.detect()
         self._described = _described(self._frame.image0, self._keypoints or [])
 
+    def measure_half(self) -> None:
+        """Half of the third, for who has the time now. After `describe`."""
+        assert self._described is not None
+        px, _ = self._described
+        self._measured = self._points(px[: len(px) // 2])
+
     def finish(self) -> View:
         """The third, with those before it where they were not made."""
         if self._described is None:
             self.describe()
         assert self._described is not None
         px, descriptors = self._described
+        uv, points = self._points(px[len(self._measured[0]) :])
+        uv, points = np.concatenate([self._measured[0], uv]), np.concatenate([self._measured[1], points])
+        return View(uv, points, descriptors)
+
+    def _points(self, px: F32) -> tuple[F32, F32]:
+        """Of px (N, 2): normalised coordinates (N, 2), and where they are (N, 3) m, NaN unknown."""
         rig, known = self._rig, self._known
         uv = rig.cam0.normalise(px.astype(np.float64))
         if known is not None and not measures_depth(self._frame, rig):
             z = _nearest(px, *known, _BESIDE_PX)
         else:
             z = depth_at(self._frame, rig, px, uv, None if known is None else _nearest(px, *known))
-        points = rays(uv) * z[:, None]
-        return View(uv.astype(np.float32), points.astype(np.float32), descriptors)
+        return uv.astype(np.float32), (rays(uv) * z[:, None]).astype(np.float32)
 
 
 def make_view(frame: Frame, rig: Rig, count: int = 500) -> View:

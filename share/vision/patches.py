@@ -27,15 +27,18 @@ _MOST_ROWS = 30_000  # of what cv2.remap gives at a time (SHRT_MAX)
 
 @dataclass(frozen=True, eq=False)
 class Patches(Columns):
-    """N patches of S samples. contrast (N,): the norm that gray levels had;
-    slope (N, 2, S): derivatives by x and y less what gain and bias explain, in gray levels a pixel;
-    inverse (N, 2, 2): of their normal matrix. probe (N, 3, S): `gray`, and what gives the shift: times
-    samples of zero mean and unit norm, how alike they are and how far off, px."""
+    """N patches of S samples. contrast (N,): the norm that gray levels had; inverse (N, 2, 2): of the normal
+    matrix of their derivatives. probe (N, 3, S): `gray`, and what gives the shift: times samples of zero mean
+    and unit norm, how alike they are and how far off, px. bend (N, 4, S): gray levels that come of a patch's
+    sides moving apart, less what a shift explains: along x the more, the further right and the further down
+    in it, then along y. rigid (N, 4, 4): products of these with each other; at_rest (N, 4): with `gray`."""
 
     contrast: F32
-    slope: F32
     inverse: F32
     probe: F32
+    bend: F32
+    rigid: F32
+    at_rest: F32
 
     def __len__(self) -> int:
         return len(self.probe)
@@ -54,7 +57,7 @@ class Patches(Columns):
 
 def empty() -> Patches:
     s = len(OFFSETS)
-    shapes = ((0,), (0, 2, s), (0, 2, 2), (0, 3, s))
+    shapes = ((0,), (0, 2, 2), (0, 3, s), (0, 4, s), (0, 4, 4), (0, 4))
     return Patches(*(np.zeros(shape, np.float32) for shape in shapes))
 
 
@@ -75,20 +78,23 @@ def cut(image: U8, px: F32) -> Patches:
     normal = slope @ slope.transpose(0, 2, 1) + np.float32(1e-3) * np.eye(2, dtype=np.float32)
     inverse = np.linalg.inv(normal)
     probe = np.concatenate([gray[:, None], contrast[:, None, None] * (inverse @ slope)], axis=1)
-    return Patches(contrast, slope, inverse, probe)
+    bend = (slope[:, :, None] * OFFSETS.T).reshape(len(px), 4, -1)
+    bend -= bend.mean(axis=2, keepdims=True)
+    bend -= bend @ slope.transpose(0, 2, 1) @ inverse @ slope
+    at_rest = (bend @ gray[:, :, None])[:, :, 0]
+    return Patches(contrast, inverse, probe, bend, bend @ bend.transpose(0, 2, 1), at_rest)
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
     """px (N, 2) where the patches are; alike (N,): normalised correlation there, 1 at best; step (N,): px
-    of the last correction, small where it settled. What was last seen: samples (N, S), zero mean, unit norm;
-    shift (N, 2), px of the patch, from there."""
+    of the last correction, small where it settled. samples (N, S): what was last seen, zero mean, unit
+    norm."""
 
     px: F32
     alike: F32
     step: F32
     samples: F32
-    shift: F32
 
 
 def align(
@@ -106,7 +112,7 @@ def align(
     n, every = len(probe), probe
     at, W = px.astype(np.float32), warp.astype(np.float32)
     alike, step = np.zeros(n, np.float32), np.full(n, np.inf, np.float32)
-    samples, shift = np.zeros((n, len(OFFSETS)), np.float32), np.zeros((n, 2), np.float32)
+    samples = np.zeros((n, len(OFFSETS)), np.float32)
     x, y = W[:, 0] @ OFFSETS.T, W[:, 1] @ OFFSETS.T
     todo = np.arange(n)
     for _ in range(most):
@@ -120,13 +126,13 @@ def align(
         seen = _sampled(images, int(np.searchsorted(todo, first)), X + here[:, :1], Y + here[:, 1:])
         seen, _ = _normed(seen)
         told = np.einsum("nks,ns->nk", probe, seen)
-        alike[todo], samples[todo], shift[todo] = told[:, 0], seen, told[:, 1:]
+        alike[todo], samples[todo] = told[:, 0], seen
         move = np.einsum("nij,nj->ni", W[todo], told[:, 1:])
         at[todo] -= move
         far = np.hypot(move[:, 0], move[:, 1])
         step[todo] = far
         todo = todo[(far > settled_px) & np.isfinite(far)]
-    return Found(at, alike, step, samples, shift)
+    return Found(at, alike, step, samples)
 
 
 def _sampled(images: tuple[U8, ...], first: int, x: F32, y: F32) -> F32:
@@ -138,25 +144,16 @@ def _sampled(images: tuple[U8, ...], first: int, x: F32, y: F32) -> F32:
     return np.concatenate([sample(images[0], x[:first], y[:first]), sample(images[1], x[first:], y[first:])])
 
 
-def unexplained(patches: Patches, samples: F32, shift: F32) -> F32:
-    """Gray levels (N, S) that no shift explains of what `align` saw last."""
-    error = (samples - patches.gray) * patches.contrast[:, None]
-    out: F32 = error - (shift[:, None, :] @ patches.slope)[:, 0]
-    return out
-
-
-def slanted(patches: Patches, error: F32, along: F64) -> tuple[F64, F64]:
-    """What a patch says of the slant of its surface: information (N, 2, 2) and its product with the step
+def slanted(patches: Patches, samples: F32, along: F64) -> tuple[F64, F64]:
+    """What patches say of the slant of their surfaces: information (N, 2, 2) and its product with the step
     (N, 2), for one gray level of noise. along (N, 2): px of the patch by which its middle moves for one
-    unit more of inverse depth; the step is the change of inverse depth by px of the patch. error (N, S):
-    `unexplained`."""
-    moved = (along.astype(np.float32)[:, None, :] @ patches.slope)[:, 0]  # gray levels for a unit
-    S = moved[:, None, :] * OFFSETS.T
-    S = S - S.mean(axis=2, keepdims=True)
-    explained = patches.inverse @ (patches.slope @ S.transpose(0, 2, 1))
-    S = S - explained.transpose(0, 2, 1) @ patches.slope
-    information = (S @ S.transpose(0, 2, 1)).astype(np.float64)
-    return information, -(S @ error[:, :, None])[:, :, 0].astype(np.float64)
+    unit more of inverse depth; the step is the change of inverse depth by px of the patch. samples (N, S):
+    what `align` saw last."""
+    n = len(along)
+    by = np.zeros((n, 2, 4))  # of px across and px down, through px along x and y
+    by[:, 0, 0::2] = by[:, 1, 1::2] = along
+    error = ((patches.bend @ samples[:, :, None])[:, :, 0] - patches.at_rest) * patches.contrast[:, None]
+    return by @ patches.rigid @ by.transpose(0, 2, 1), -(by @ error[:, :, None])[:, :, 0]
 
 
 def sample(image: U8, x: F32, y: F32) -> F32:

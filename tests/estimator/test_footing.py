@@ -20,7 +20,7 @@ Walk = tuple[list[Frame], list[tuple[Frame, Footing, TrackResult]]]
 
 @pytest.fixture(scope="module", params=["inertial", "visual"])
 def walk(request, plain_session):
-    """Rig, and of each keyframe: the frame, its footing and what the tracker said of it."""
+    """Rig, and of each keyframe: its own frame, its footing and what the tracker said of it."""
     source = open_source(f"{plain_session}/ar1")
     rig = source.rig
     tracker = (
@@ -28,13 +28,14 @@ def walk(request, plain_session):
         if request.param == "inertial"
         else VisualTracker(rig, TrackerConfig())
     )
-    told = []
+    told, tracked = [], []
     for frame in frames_of(source, Config(), SequencerCounters()):
         result = tracker.track(frame)
+        tracked.append((frame, result))
         if result.keyframe:
-            told.append((frame, tracker.footing(), result))
             before = tracker.footing()
-            tracker.keyframe(frame)
+            own, its_result = tracked[-1 - tracker.keyframe(frame).frames_ago]
+            told.append((own, before, its_result))
             again = tracker.footing()  # what joined since is not what the pose rests on
             if request.param == "inertial":
                 assert again.px.tobytes() == before.px.tobytes()

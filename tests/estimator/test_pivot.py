@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from share.geometry import se3
-from share.odometry.tracker import Pivot
+from share.odometry.pivot import Pivot
 
 BEGAN = np.array([1.0, 0.0, 0.0])
 

@@ -23,6 +23,7 @@ def test_those_that_others_are_told_of_stay(plain_session, held):
     scene = Scene(state, source.rig, dataclasses.replace(InertialConfig(), max_keyframes=2))
     for _ in range(6):  # all at one place
         keyframe = scene.add_keyframe(STILL)
-        scene.admit(frame, keyframe, scene.corners(frame, scene.taken())[:10], held)
+        scene.admit(frame, keyframe, scene.corners(frame, scene.taken())[:10])
+        scene.forget(held)
     assert set(held) | {4, 5} <= set(state.keyframes.tolist())
     assert len(state.keyframes) == max(2, len(held) + 2)

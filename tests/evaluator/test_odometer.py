@@ -75,3 +75,14 @@ def test_a_stretch_that_begins_is_sure_of_itself_and_forgets_what_was_before_it(
         odometer.frame(fared(k * S))
         lately = odometer.keyframe(k * S, candidate(AHEAD, 0.0, 1.0, new=k != 1))
     assert lately == ((fared(2 * S),), 0.0, 0.0, (0.0,))
+
+
+def test_what_came_after_a_keyframe_that_is_told_late_is_not_of_it():
+    odometer = Odometer(5.0)
+    odometer.keyframe(-S, candidate(np.eye(4), 0.0, 0.0, new=True))
+    for k in range(8):
+        odometer.frame(fared(k * S))
+    lately = odometer.keyframe(5 * S, candidate(AHEAD, 0.0, 0.001))
+    assert [frame.stamp_ns // S for frame in lately.frames] == [1, 2, 3, 4, 5]
+    lately = odometer.keyframe(7 * S, candidate(AHEAD, 0.0, 0.001))
+    assert [frame.stamp_ns // S for frame in lately.frames] == [3, 4, 5, 6, 7]

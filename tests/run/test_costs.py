@@ -7,7 +7,7 @@ import pytest
 
 from share.errors import DataError, ShareError, UsageError
 from share.lab.evaluate.virtual import costs_of
-from share.lab.evaluate.world import Cost, Costs
+from share.lab.evaluate.world import Cost, Costs, Sampled
 
 
 def spread(p50: float, p95: float, n: int = 10) -> dict[str, float | None]:
@@ -15,7 +15,7 @@ def spread(p50: float, p95: float, n: int = 10) -> dict[str, float | None]:
 
 
 def run(folder: Path, solved: int = 10) -> Path:
-    """Two agents, twice as slow as usual, and an edge that verifies in half the usual time."""
+    """Two agents, slower than usual, and an edge that verifies in half the usual time."""
     edge = {
         "place_ms": spread(6.0, 9.0),
         "verify_ms": spread(2.0, 5.0),
@@ -38,7 +38,9 @@ def test_what_was_measured_and_the_rest_in_proportion(tmp_path):
     assert costs.query == Cost(6.0, 9.0)
     assert costs.accepted == costs.refused == Cost(2.0, 5.0)
     assert costs.solve == Cost(20.0, 50.0)
-    assert costs.keyframe == Cost(2 * usual.keyframe.p50, 2 * usual.keyframe.p95)
+    slower = 20.0 / usual.frame.p50
+    assert costs.keyframe == Cost(slower * usual.keyframe.p50, slower * usual.keyframe.p95)
+    assert costs.settle == Sampled(tuple(slower * ms for ms in usual.settle.ms))
     for name in ("front", "add", "judge", "apply"):
         assert getattr(costs, name).p50 == pytest.approx(0.5 * getattr(usual, name).p50)
 

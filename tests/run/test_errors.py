@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -126,3 +127,17 @@ def test_in_virtual_time_it_has_answered_at_once():
     keyframe(errors, 7)
     assert errors.after(frame(1), TRACKED) == pytest.approx(7)
     assert errors.after(frame(1), LOST) is None
+
+
+def test_a_keyframe_that_is_told_late_is_judged_by_its_own_picture():
+    class Late(Tracker):
+        def keyframe(self, frame):
+            return replace(CANDIDATE, frames_ago=2)
+
+    network = Network()
+    network.may.set()
+    errors = AtOnce(network)
+    for brightness in (3, 40, 90):
+        errors.after(frame(brightness), TRACKED)
+    errors.keyframe(frame(90), Late())
+    assert network.seen == [3.0]

@@ -26,7 +26,7 @@ from share.files.yaml_file import read_settings
 from share.geometry.camera import Rig
 from share.lab.evaluate.play import Progress, Terms
 from share.lab.evaluate.together import Together
-from share.lab.evaluate.world import Cost, Costs, Seen, World
+from share.lab.evaluate.world import Cost, Costs, Sampled, Seen, World
 from share.metrics.local_error import LocalError
 from share.net.emulated import Links
 from share.odometry.error_model.network import error_model
@@ -185,8 +185,8 @@ _USUAL = Costs()
 def costs_of(run: Path) -> Costs:
     """By the reports in `run`, a folder by `share evaluate run`: frames, queries, verifications, solutions.
 
-    What is not measured, a keyframe at the agent and the edge's small steps, is as much slower or quicker
-    than usual as frames and verifications are. Raises UsageError or DataError.
+    What is not measured, keyframes' work at the agent and the edge's small steps, is as much slower or
+    quicker than usual as frames and verifications are. Raises UsageError or DataError.
     """
     edge, agents = run / "edge" / "edge.json", sorted(run.glob("*/report.json"))
     if not edge.is_file() or not agents:
@@ -206,7 +206,7 @@ def _costs(edge: Path, agents: Sequence[Path]) -> Costs:
         Costs(**{name: _times(getattr(_USUAL, name), there) for name in ("front", "add", "judge", "apply")}),
         frame=frame,
         keyframe=_times(_USUAL.keyframe, here),
-        settle=_times(_USUAL.settle, here),
+        settle=_slower(_USUAL.settle, here),
         query=query,
         accepted=verify,
         refused=verify,
@@ -225,3 +225,7 @@ def _cost(summaries: Sequence[Mapping[str, Any]], where: Path) -> Cost:
 
 def _times(cost: Cost, factor: float) -> Cost:
     return Cost(factor * cost.p50, factor * cost.p95)
+
+
+def _slower(cost: Cost | Sampled, factor: float) -> Cost | Sampled:
+    return _times(cost, factor) if isinstance(cost, Cost) else Sampled(tuple(factor * ms for ms in cost.ms))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zlib
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from share.lab.evaluate.campaign import check_names
 from share.lab.train.spoil import KINDS, Spell, draw, spoiled
 from share.metrics.local_error import WINDOW_S, LocalError
 from share.odometry.error_model.features import SHAPES, Features, features, kind_of
-from share.odometry.error_model.history import Odometer
+from share.odometry.error_model.history import MOST_AGO, Odometer
 from share.recordings.session import Session, read_session
 from share.runtime.error_model import fared
 from share.runtime.pipeline import check_trackable, frames_of, tracker_of
@@ -30,7 +31,7 @@ from share.runtime.pool import Pool
 from share.runtime.source import Source, open_source
 from share.sensors.sequencer import SequencerCounters
 from share.startup import prepare
-from share.types import F32, I64, U8, ImuBatch
+from share.types import F32, I64, U8, Frame, ImuBatch
 
 _MOST_KINDS = 3  # that come together in one run
 _AS = {True: "", False: "-without-imu"}
@@ -115,7 +116,7 @@ def _make(work: tuple[Job, Config]) -> None:
 def keyframes(
     source: Source, config: Config, spells: Sequence[Spell] = (), seed: int = 0, imu: bool = True
 ) -> Iterator[tuple[int, float, Features]]:
-    """Of each keyframe of our own tracker: its stamp, how wrong the tracker is by then (cm, NaN unknown),
+    """Of each keyframe of our own tracker: its stamp, how wrong the tracker was then (cm, NaN unknown),
     and what the error model is told. imu: False plays it as if there were none. Raises UsageError without a
     truth, or where no tracker fits."""
     truth = source.truth()
@@ -125,16 +126,19 @@ def keyframes(
     rig = source.rig if imu else replace(source.rig, imu=None)
     check_trackable(source.name, rig)
     tracker, error, odometer = tracker_of(rig, config), LocalError(truth), Odometer()
+    lately: deque[tuple[Frame, float | None]] = deque(maxlen=MOST_AGO)
     for frame in spoiled(frames_of(source, config, SequencerCounters()), spells, seed, rig):
         frame = frame if imu else replace(frame, imu=ImuBatch.empty())
         result = tracker.track(frame)
         error_cm = error.after(frame.stamp_ns, result.T_odom_body, result.new_stretch)
         odometer.frame(fared(frame, result))
+        lately.append((frame, error_cm))
         if result.keyframe:
-            footing = tracker.footing()
-            lately = odometer.keyframe(frame.stamp_ns, tracker.keyframe(frame))
-            told = float("nan") if error_cm is None else error_cm
-            yield frame.stamp_ns, told, features(frame.image0, footing, lately)
+            footing, candidate = tracker.footing(), tracker.keyframe(frame)
+            own, own_cm = lately[-1 - candidate.frames_ago]
+            told = float("nan") if own_cm is None else own_cm
+            fares = odometer.keyframe(own.stamp_ns, candidate)
+            yield own.stamp_ns, told, features(own.image0, footing, fares)
 
 
 # ---- What a tracker's keyframes looked like and how wrong it was: one file a run, for training.

@@ -11,6 +11,8 @@ from share.geometry.se3 import angle, compose_cov, position_sigma
 from share.metrics.local_error import WINDOW_S
 from share.types import F64, Candidate, TrackState
 
+MOST_AGO = 8  # frames, of a keyframe that is told of: those that are kept to know its own
+
 
 class Fared(NamedTuple):
     """How a tracker fared with a frame: whether an IMU was heard, its state, how many features it found and
@@ -52,17 +54,20 @@ class Odometer:
     def frame(self, fared: Fared) -> None:
         """Another one, with a pose or without."""
         self._frames.append(fared)
-        while self._frames[0].stamp_ns <= fared.stamp_ns - self._window_ns:
+        while self._frames[0].stamp_ns <= fared.stamp_ns - 2 * self._window_ns:  # a keyframe may be told late
             self._frames.popleft()
 
     def keyframe(self, stamp_ns: int, candidate: Candidate) -> Lately:
-        """The last frame has become one."""
+        """The frame with this stamp, the last one or one shortly before, has become one."""
+        begun_ns = stamp_ns - self._window_ns + 1
         if candidate.new_stretch or not self._sigmas:  # no keyframe yet to go on from
             self._motions.clear()
             self._sigmas.clear()
-            self._frames = deque(list(self._frames)[-1:])
+            begun_ns = stamp_ns
         else:
             self._motions.append((stamp_ns, candidate.T_last_body, candidate.cov))
+        while self._frames and self._frames[0].stamp_ns < begun_ns:
+            self._frames.popleft()
         for past in (self._motions, self._sigmas):
             while past and past[0][0] <= stamp_ns - self._window_ns:
                 past.popleft()
@@ -73,4 +78,5 @@ class Odometer:
             turn += float(angle(T[:3, :3]))
             cov = compose_cov(T, cov, more)
         self._sigmas.append((stamp_ns, 100 * position_sigma(cov)))
-        return Lately(tuple(self._frames), way, turn, tuple(sigma for _, sigma in self._sigmas))
+        frames = tuple(fared for fared in self._frames if fared.stamp_ns <= stamp_ns)
+        return Lately(frames, way, turn, tuple(sigma for _, sigma in self._sigmas))
